@@ -202,13 +202,14 @@ def test_a_second_caller_in_one_solver_is_turned_away(library):
 
 
 @pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
-def test_to_count_memory_no_array_is_read(library, form, method):
+def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, method):
     # Addresses that nothing may be read from: whoever does ends this process.
     problem, options, room = Problem(), library.options(method), ct.c_uint64()
+    ptr = np.arange(0, 39, 3, dtype=np.int32)
     library.c.lav_default_problem(form, ct.byref(problem))
     for key, kind in Problem._fields_:
         if kind is ct.c_void_p:
-            setattr(problem, key, 8)
+            setattr(problem, key, ptr.ctypes.data if (form, key) == (2, "block_ptr") else 8)
     problem.n_rows, problem.n_blocks, problem.n_bodies, problem.n_joints = 30, 12, 5, 2
     problem.n_velocities, problem.n_entries, problem.n_mass_entries = 30, 60, 40
     assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0

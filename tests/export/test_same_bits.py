@@ -160,6 +160,21 @@ def test_orders_of_a_sweep(library, order):
     assert solver.impulse().tobytes() == found.impulse.tobytes()
 
 
+@pytest.mark.parametrize("method", ["sequential_impulses", "pgs", "anderson", "nncg", "jacobi"])
+def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
+    looked = 0
+    for given in GIVEN:
+        problem, options, room = library.problem(given), library.options(method), ct.c_uint64()
+        if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
+            continue
+        assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+        solver = library.open(problem, options)
+        needed = library.c.lav_needed(solver.at)
+        assert needed <= room.value <= 1.05 * needed + 8192, (given.m, given.n_blocks)
+        looked += 1
+    assert looked >= 3
+
+
 @pytest.mark.parametrize("options", [{"memory": 2}, {"sweep": 2}, {"convex": 5}])
 def test_options_of_accelerated_sweeps(library, options):
     given = self_test_problem()

@@ -208,8 +208,9 @@ LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-
 /* Whether a method takes a problem of this form, law and kinds, which are read; LAV_OK or LAV_ERROR_UNSUPPORTED. */
 LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options);
 
-/* Bytes for a solver of problems with at most these counts; arrays are not read and may be null. What a factor fills and
- * which columns M's trees join is guessed: `lav_set` tells when it is more. */
+/* Bytes for a solver of problems with at most these counts. Arrays may be null; block_ptr alone is read, where there are
+ * joints: it tells their rows from those of contacts. What a factor fills and which columns M's trees join is guessed:
+ * `lav_set` tells when it is more. */
 LAV_API int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
 LAV_API int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options,
                          lav_solver **out);

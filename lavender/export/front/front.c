@@ -24,7 +24,7 @@ struct lav_solver {
   int32_t ready;    /* a problem is set */
   int32_t begun;    /* its method has run */
   char *base;
-  uint64_t bytes, used, begin, needed; /* of memory: all, taken, taken by `kept`, asked for */
+  uint64_t bytes, used, peak, begin, needed; /* of memory: all, taken, at most, by `kept`, asked for */
   lav_options options;
   kept_t kept;
   int32_t form, has_keys, is_short, n_v; /* n_v: numbers of v */

@@ -280,8 +280,8 @@ static int32_t prepare_admm(lav_solver *s) {
 /* -- auto: one method after the other, each for its share ------------------------------------------------------------- */
 
 /* Turns of the library's own, by form, size and what the blocks are; returns how many. */
-static int32_t usual_turns(const lav_problem *q, int32_t *turns) {
-  const int32_t few = q->n_rows <= FEW_ROWS, rows = are_rows(q);
+static int32_t usual_turns(const lav_problem *q, int32_t rows, int32_t *turns) {
+  const int32_t few = q->n_rows <= FEW_ROWS;
   int32_t n = 0;
   if (q->form == LAV_VELOCITIES) turns[n++] = LAV_NEWTON, turns[n++] = 200;
   else if (rows && few) turns[n++] = LAV_DIRECT, turns[n++] = 100;
@@ -307,7 +307,7 @@ static int32_t prepare_auto(lav_solver *s, const lav_problem *q) {
   int32_t i, kept = 0, code = LAV_ERROR_UNSUPPORTED;
   s->n_turns = s->options.n_turns;
   if (s->n_turns > 0) COPY(s->turns, s->given_turns, 2 * s->n_turns);
-  else s->n_turns = usual_turns(q, s->turns);
+  else s->n_turns = usual_turns(q, are_rows(q), s->turns);
   s->chosen = TAKE(s, double, s->p.n_rows);
   s->common = s->used;
   for (i = 0; i < s->n_turns; i++) { /* those that take it */

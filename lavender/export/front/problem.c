@@ -4,6 +4,7 @@
 static void *take(lav_solver *s, int64_t count, size_t size) {
   const uint64_t at = (s->used + 15) & ~(uint64_t)15;
   s->used = at + (uint64_t)(count + 1) * size; /* one more than none, so that every array has an address */
+  if (s->used > s->peak) s->peak = s->used;
   if (s->used <= s->bytes) return s->base + at;
   s->is_short = 1;
   return NULL;
@@ -41,7 +42,7 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->impulse = TAKE(s, double, m);
   s->order = TAKE(s, int32_t, k);
   s->empty = TAKE(s, int32_t, m);
-  s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * (n + nv) + 16); /* scratch */
+  s->marks = TAKE(s, int32_t, 4 * ((int64_t)s->kept.most_blocks + k) + m + 2 * n + 4 * nv + 16); /* scratch */
   s->score_room = TAKE(s, double, 3 * m);
   s->watch.w = TAKE(s, double, m);
   s->watch.e = TAKE(s, double, m);
@@ -53,11 +54,22 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
 }
 
+/* Rows of joints, and of contacts, of bodies: as block_ptr says, else so many at most. */
+static int32_t joint_rows(const lav_problem *q) {
+  const int32_t most = q->n_rows - (q->n_blocks - q->n_joints);
+  if (q->n_joints == 0) return 0;
+  return q->block_ptr && q->block_ptr[q->n_joints] >= q->n_joints && q->block_ptr[q->n_joints] < most ? q->block_ptr[q->n_joints]
+                                                                                                      : most;
+}
+
+static int32_t contact_rows(const lav_problem *q) {
+  const int64_t most = 6 * ((int64_t)q->n_blocks - q->n_joints), left = q->n_rows - (q->block_ptr ? joint_rows(q) : q->n_joints);
+  return (int32_t)(left < most ? left : most);
+}
+
 static void take_form(lav_solver *s, const lav_problem *q) {
   const int64_t m = q->n_rows, k = q->n_blocks, n = q->n_bodies, c = k - q->n_joints, nv = q->n_velocities;
-  const int32_t is_known = s->bytes > 0 && q->form == LAV_BODIES; /* who only counts reads no array */
-  const int64_t mj = is_known ? (q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints) : q->n_joints > 0 ? m - c : 0;
-  const int64_t mc = is_known ? m - mj : m - q->n_joints < 6 * c ? m - q->n_joints : 6 * c; /* at most */
+  const int64_t mj = q->form == LAV_BODIES ? joint_rows(q) : 0, mc = q->form == LAV_BODIES ? contact_rows(q) : 0;
   s->r.compliance = s->g.compliance = NULL;
   if (q->form == LAV_MATRIX) {
     s->a.indptr = TAKE(s, int32_t, m + 1);
@@ -201,37 +213,49 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
 }
 
 #ifndef LAV_SWEEPS_ONLY
-/* M = L^T D L and Y of J and M. */
-static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
-  const int32_t n = q->n_velocities, m = q->n_rows, k = q->n_blocks;
+/* M = L^T D L; its own rows stand behind L only until then. */
+static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
+  const int32_t n = q->n_velocities;
   const int64_t most = (int64_t)n * n / 2 + 1;
-  int32_t *mptr, *midx, *mark, *columns = NULL, *pcol, *pval, *home, count, n_columns = 0, i, j;
-  double *mval, *lval, *b = (double *)(uintptr_t)s->p.b, *pivot = (double *)(uintptr_t)s->g.root, values = 0.0;
+  const uint64_t begin = s->used;
+  int32_t *mptr = TAKE(s, int32_t, n + 1), *midx = TAKE(s, int32_t, q->n_mass_entries), *columns = NULL, *lidx, count, i;
+  double *mval = TAKE(s, double, q->n_mass_entries), *pivot = (double *)(uintptr_t)s->g.root, *values, *lval;
+  const uint64_t from = s->used;
   int64_t room = (int64_t)q->n_mass_entries + 1;
-  uint64_t from;
-  mptr = TAKE(s, int32_t, n + 1);
-  midx = TAKE(s, int32_t, q->n_mass_entries);
-  mval = TAKE(s, double, q->n_mass_entries);
-  mark = TAKE(s, int32_t, 4 * (int64_t)n + 4);
   if (s->is_short) return LAV_ERROR_ROOM;
-  fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, q->n_entries, 0);
   fill_matrix(mptr, midx, mval, q->mass_ptr, q->mass_index, q->mass_value, n, n, q->n_mass_entries, 1);
-  for (from = s->used;; room = 2 * room < most ? 2 * room : most) {
+  for (;; room = 2 * room < most ? 2 * room : most) {
     s->used = from;
     columns = TAKE(s, int32_t, room);
     if (s->is_short) return LAV_ERROR_ROOM;
     count = core_generalized_tree_pattern(n, mptr, midx, (int32_t)room, (int32_t *)(uintptr_t)s->g.lptr, columns,
-                                          (int32_t *)(uintptr_t)s->g.parent, mark, mark + n, mark + 2 * n);
+                                          (int32_t *)(uintptr_t)s->g.parent, s->marks, s->marks + n, s->marks + 2 * n);
     if (count >= 0) break;
     if (room >= most) return LAV_ERROR_MASS;
   }
-  s->g.lidx = columns;
-  s->g.lval = lval = TAKE(s, double, count);
+  values = TAKE(s, double, count);
   if (s->is_short) return LAV_ERROR_ROOM;
-  if (core_generalized_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, lval, pivot,
+  if (core_generalized_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, values, pivot,
                                    (double *)(uintptr_t)s->g.inv_pivot) >= 0)
     return LAV_ERROR_MASS;
   for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);
+  s->used = begin; /* L to where M was */
+  s->g.lidx = lidx = TAKE(s, int32_t, count);
+  s->g.lval = lval = TAKE(s, double, count);
+  memmove(lidx, columns, (size_t)count * sizeof *lidx);
+  memmove(lval, values, (size_t)count * sizeof *lval);
+  return LAV_OK;
+}
+
+/* L of M and Y of J and M. */
+static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
+  const int32_t n = q->n_velocities, m = q->n_rows, k = q->n_blocks;
+  int32_t *columns, *pcol, *pval, *home, n_columns = 0, i, j;
+  double *b = (double *)(uintptr_t)s->p.b, values = 0.0;
+  int64_t room = (int64_t)q->n_entries + 64;
+  uint64_t from;
+  fill_matrix(s->g.jptr, s->g.jidx, s->g.jval, q->index_ptr, q->index, q->value, m, n, q->n_entries, 0);
+  GIVE_BACK(factor_mass(s, q));
   copy_or(s->g.compliance, q->compliance, m, 0.0);
   copy_or(s->v_free, q->velocity, n, 0.0);
   for (i = 0; i < m; i++)
@@ -240,17 +264,19 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
   s->g.pcol = pcol = TAKE(s, int32_t, k + 1);
   s->g.pval = pval = TAKE(s, int32_t, k + 1);
   s->g.home = home = TAKE(s, int32_t, k);
-  for (from = s->used, room = 2 * (int64_t)q->n_entries + 64;; room *= 2) {
+  for (from = s->used;; room *= 2) {
     s->used = from;
     s->g.cols = columns = TAKE(s, int32_t, room);
     if (s->is_short) return LAV_ERROR_ROOM;
-    s->g.n_panels = core_generalized_panel_pattern(&s->g, k, s->p.ptr, mark, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
+    s->g.n_panels = core_generalized_panel_pattern(&s->g, k, s->p.ptr, s->marks, (int32_t *)(uintptr_t)s->g.prow, pcol, pval,
                                                    columns, room < 2147483647 ? (int32_t)room : 2147483647, &n_columns,
                                                    &values);
     if (s->g.n_panels >= 0) break;
     if (room >= 2147483647) return LAV_ERROR_COUNT;
   }
   if (values >= 2147483647.0) return LAV_ERROR_COUNT;
+  s->used = from;
+  s->g.cols = TAKE(s, int32_t, n_columns); /* where it is, no longer than it must be */
   s->g.y = TAKE(s, double, (int64_t)values);
   if (s->is_short) return LAV_ERROR_ROOM;
   for (i = j = 0; i < k; i++) {
@@ -258,7 +284,7 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
     home[i] = j;
   }
   k_general_diagonal(&s->p, &s->g, (double *)(uintptr_t)s->p.d, (double *)(uintptr_t)s->p.nu,
-                     (double *)(uintptr_t)s->p.step, s->empty, mark, (double *)(uintptr_t)s->g.y);
+                     (double *)(uintptr_t)s->p.step, s->empty, s->marks, (double *)(uintptr_t)s->g.y);
   return LAV_OK;
 }
 #endif

@@ -148,7 +148,7 @@ static int32_t prepare_accelerated(lav_solver *s);
 static int32_t prepare_newton(lav_solver *s);
 static int32_t prepare_pivots(lav_solver *s);
 static int32_t prepare_admm(lav_solver *s);
-static int32_t usual_turns(const lav_problem *q, int32_t *turns);
+static int32_t usual_turns(const lav_problem *q, int32_t rows, int32_t *turns);
 static int32_t prepare_auto(lav_solver *s, const lav_problem *q);
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
@@ -275,25 +275,26 @@ static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out)
 
 #ifndef LAV_SWEEPS_ONLY
 /* Numbers that a method has beside the problem; what depends on arrays is guessed. */
-static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, int32_t n_v) {
+static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t method, int32_t n_v) {
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
-  const int32_t c = q->n_blocks - q->n_joints, mj = q->n_joints > 0 ? q->n_rows - c : 0; /* rows of joints at most */
-  const int32_t mc = q->n_rows - q->n_joints < 6 * (int64_t)c ? q->n_rows - q->n_joints : 6 * c;
+  const int32_t bodies = q->form == LAV_BODIES, mj = bodies ? joint_rows(q) : 0, mc = bodies ? contact_rows(q) : 0;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
-  const int64_t pairs = q->form == LAV_BODIES ? sweep_packed_room_for(q->n_joints, mj, c, mc, q->n_bodies) : 0;
+  const int64_t memory = method == LAV_NNCG ? 0 : o->memory, prepared = 9 * m + 26 * k; /* of exact blocks */
+  const int64_t pairs = bodies && k >= PACK_FROM ? sweep_packed_room_for(q->n_joints, mj, k - q->n_joints, mc, q->n_bodies) : 0;
   struct driver_driver_view_t view;
   struct driver_driver_asked_t asked;
   struct driver_driver_room_t room;
-  int64_t numbers = 0, band = m < 64 ? m : 64;
+  int64_t numbers = 0, band = q->form == LAV_MATRIX && m > 0 && q->n_entries / m > 64 ? q->n_entries / m : 64;
   csr_t none = {NULL, NULL, NULL};
   switch (method) {
-    case LAV_ANDERSON: case LAV_NNCG: /* with exact blocks */
-      return pairs + CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * (int64_t)memory) * m + 64 + 9 * m + 26 * k;
+    case LAV_ANDERSON: case LAV_NNCG:
+      numbers = CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * memory) * m + 64;
+      return numbers + (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE ? prepared : o->convex > 0 ? pairs + prepared : pairs);
     case LAV_SEQUENTIAL_IMPULSES: return pairs;
-    case LAV_BLOCK_GAUSS_SEIDEL: return 9 * m + 26 * k;
+    case LAV_BLOCK_GAUSS_SEIDEL: return prepared;
     case LAV_NEWTON:
-      if (q->form == LAV_VELOCITIES) return 70 * m + 50 * nv + 18 * k + 2 * (nv < 64 ? nv * nv : 64 * nv) + 2048;
-      if (q->form == LAV_BODIES) return 130 * m + 12 * k + 300 * n + 2048;
+      if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
+      if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * n + 2048;
       memset(&view, 0, sizeof view);
       memset(&asked, 0, sizeof asked);
       view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
@@ -302,9 +303,9 @@ static int64_t numbers_of(const lav_problem *q, int32_t method, int32_t memory, 
       return room.n_index / 2 + room.n_real + 16;
     default: break;
   }
-  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 20 * m + (method == LAV_LEMKE ? 4 * m * m + 12 * m : m * band);
-  if (method == LAV_ADMM) numbers = m * m + (10 + 2 * (int64_t)memory) * m + CONTROL + GRAM;
-  return numbers + (q->form == LAV_BODIES ? 90 * m + 6 * k + n : 0) + 64;
+  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 20 * m + (method == LAV_LEMKE ? 4 * m * m + 12 * m : m * (m < band ? m : band));
+  if (method == LAV_ADMM) numbers = m * m + (10 + 2 * memory) * m + CONTROL + GRAM;
+  return numbers + (bodies ? 90 * m + 6 * k + n : 0) + 64;
 }
 #endif
 
@@ -323,9 +324,9 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
   take_blocks(&s, problem);
   take_form(&s, problem);
   numbers = 0;
-  if (problem->form == LAV_VELOCITIES) { /* M, its factor without fill, Y with what ancestors add */
-    numbers += 6 * nv + 4 * (int64_t)problem->n_mass_entries + 4 * k + 4 * (int64_t)problem->n_entries + 256;
-    numbers += m * nv < 4 * (int64_t)problem->n_entries + 256 ? m * nv : 4 * (int64_t)problem->n_entries + 256;
+  if (problem->form == LAV_VELOCITIES) { /* M's factor without fill, Y with a quarter more than J, its columns once a block */
+    const int64_t filled = (int64_t)problem->n_entries + problem->n_entries / 4 + 256;
+    numbers += nv + 2 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
 #ifndef LAV_SWEEPS_ONLY
   {
@@ -333,13 +334,10 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     int64_t most = 0;
     turns[0] = options->method;
     if (options->method == LAV_AUTO && options->n_turns > 0) COPY(turns, options->turns, 2 * (count = options->n_turns));
-    else if (options->method == LAV_AUTO) {
-      lav_problem bare = *problem; /* no array is read: as if it were rows alone, which has most turns */
-      bare.kind = NULL;
-      count = usual_turns(&bare, turns);
-    }
+    else if (options->method == LAV_AUTO) /* kinds are not read: rows alone, unless contacts have tangents */
+      count = usual_turns(problem, problem->form != LAV_BODIES || contact_rows(problem) <= k - problem->n_joints, turns);
     for (i = 0; i < count; i++) {
-      const int64_t here = numbers_of(problem, turns[2 * i], options->memory, s.n_v);
+      const int64_t here = numbers_of(problem, options, turns[2 * i], s.n_v);
       if (here > most) most = here;
     }
     numbers += most + (options->method == LAV_AUTO ? m : 0);
@@ -395,7 +393,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   GIVE_BACK(check_problem(q));
   GIVE_BACK(takes(q, &s->options));
   if (q->n_blocks > s->kept.most_blocks || q->n_rows > s->kept.most_rows) return LAV_ERROR_ROOM;
-  s->used = s->begin;
+  s->used = s->peak = s->begin;
   s->is_short = 0;
   take_blocks(s, q);
   take_form(s, q);
@@ -434,7 +432,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
     if (lav_room(problem, &solver->options, &wanted) != LAV_OK) wanted = 0;
     if (solver->used + solver->used / 2 > wanted) wanted = solver->used + solver->used / 2; /* what comes after is not known yet */
   }
-  solver->needed = code == LAV_ERROR_ROOM ? wanted + 32 : solver->used + 32;
+  solver->needed = code == LAV_ERROR_ROOM ? wanted + 32 : solver->peak + 32;
   return leave(solver, code);
 }
 
