@@ -49,6 +49,18 @@ SHAPES = ("disk", "box")
 LEAST_SHARE = 2.0**-60
 
 
+# Of each kind of contact: least and most rows, what it is called, and what it may have.
+SIZES = {
+    CONTACT: (1, 3, "a contact", "a normal and up to two tangents are known, and one spin row of CONTACT_SPIN"),
+    CONTACT_SPIN: (2, 4, "a contact with spin", "a normal, up to two tangents and one spin row are known"),
+    ROUND: (4, 6, "a round cone", "a normal and up to five tangents (two slide, one spins, two roll) are known"),
+    CONTACT_BOX: (3, 3, "a box", "a normal and two tangents are known"),
+    CONTACT_ROLLING: (5, 6, "a contact with rolling",
+                      "a normal, two tangents, perhaps spin, and two that roll are needed: 5 rows or 6"),
+    CONTACT_ELLIPSE: (3, 3, "an ellipse", "a normal and two tangents are needed"),
+}  # fmt: skip
+
+
 def check_shape(name: str, shape: Any) -> str:
     """A shape of friction, one of SHAPES.
 
@@ -151,41 +163,7 @@ class Cones:
                 "known"
             )
         size = np.diff(ptr)
-        if np.any(kind == ROUND):
-            flat = (kind == ROUND) & (size <= 3)
-            if flat.any():  # with up to two tangents it is a contact
-                kind = np.where(flat, CONTACT, kind).astype(np.int32)
-                kind.flags.writeable = False
-            bad = np.flatnonzero((kind == ROUND) & (size > 6))
-            if len(bad):
-                raise InputError(
-                    f"block {bad[0]} is a round cone of {size[bad[0]]} rows; a normal and up to five tangents "
-                    "(two slide, one spins, two roll) are known"
-                )
-        if np.any(kind == CONTACT_BOX):
-            flat = (kind == CONTACT_BOX) & (size <= 2)
-            if flat.any():  # one tangent is bounded by itself in a contact, too
-                kind = np.where(flat, CONTACT, kind).astype(np.int32)
-                kind.flags.writeable = False
-            bad = np.flatnonzero((kind == CONTACT_BOX) & (size != 3))
-            if len(bad):
-                raise InputError(
-                    f"block {bad[0]} is a box of {size[bad[0]]} rows; a normal and two tangents are known"
-                )
-        bad = np.flatnonzero((kind == CONTACT_ROLLING) & (size != 5) & (size != 6))
-        if len(bad):
-            raise InputError(
-                f"block {bad[0]} is a contact with rolling of {size[bad[0]]} rows; a normal, two tangents, perhaps "
-                "spin, and two that roll are needed: 5 rows or 6"
-            )
-        plain = (kind == CONTACT) | (kind == CONTACT_SPIN)
-        bad = np.flatnonzero(plain & ((size < kind) | (size > kind + 2)))
-        if len(bad):
-            raise InputError(
-                f"block {bad[0]} is a contact of {size[bad[0]]} rows; a contact has a normal, up to "
-                "two tangents, "
-                "and one spin row if it is CONTACT_SPIN"
-            )
+        kind = _fitting(kind, size)
         lower = as_array("lower", self.lower, (m,), finite=False, unit="N s")
         upper = as_array("upper", self.upper, (m,), finite=False, unit="N s")
         check_not_nan("lower", lower)
@@ -210,11 +188,11 @@ class Cones:
         radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
         check_not_negative("patch_radius", radius)
         wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
-        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & ((size != 3) | wide))
+        bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & wide)
         if len(bad):
             raise InputError(
-                f"block {bad[0]} is an ellipse of {size[bad[0]]} rows with mu_2 / mu_1 = {radius[bad[0]]:g}; a normal, "
-                "two tangents and mu_2 / mu_1 from 1e-18 to 1e18 in the place of the patch radius are needed"
+                f"block {bad[0]} is an ellipse with mu_2 / mu_1 = {radius[bad[0]]:g} in the place of the patch radius; "
+                "1e-18 to 1e18 is needed"
             )
         with np.errstate(over="ignore"):
             second = np.where(np.isin(kind, (CONTACT_BOX, CONTACT_ELLIPSE)), mu * radius, 0.0)
@@ -505,6 +483,19 @@ class Cones:
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
         return type(self), self._blocks.arrays
+
+
+def _fitting(kind: IntArray, size: IntArray) -> IntArray:
+    """The kinds, checked by their rows; a round cone of up to two tangents, or a box of one, is a contact."""
+    flat = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
+    if flat.any():
+        kind = np.where(flat, CONTACT, kind).astype(np.int32)
+        kind.flags.writeable = False
+    for known, (least, most, name, needed) in SIZES.items():
+        bad = np.flatnonzero((kind == known) & ((size < least) | (size > most)))
+        if len(bad):
+            raise InputError(f"block {bad[0]} is {name} of {size[bad[0]]} rows; {needed}")
+    return kind
 
 
 def _sides(mu: Any) -> tuple[Any, FloatArray]:

@@ -18,7 +18,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import check_budget, of_batch, solve, solve_few
+from lavender.solve import check_budget, of_batch, solve, solve_small
 from lavender.solvers._newton import general
 from lavender_ext.few.many import Batch
 
@@ -86,7 +86,7 @@ def solve_many(
     short = spec.few is not None and spec.own and plain
 
     def alone(i: int) -> None:
-        made[i] = solve_few(given[i], spec, starts[i], tol) if short else None
+        made[i] = solve_small(given[i], spec, starts[i], tol) if short else None
         if made[i] is None:
             made[i] = solve(given[i], solver, impulse=starts[i], **more)
 

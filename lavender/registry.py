@@ -32,7 +32,7 @@ __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "regist
 
 
 # Modules whose SPECS are registered first, by name: they import this one.
-FEW = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
+SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
 TABLES = ("lavender.solvers", "lavender.external")
 
 

@@ -103,7 +103,7 @@ def solve(
     spec = get(solver)
     plain = max_iter is None and time_limit is None and callback is None
     if plain and spec.few is not None and spec.own and not (options or history):
-        made = solve_few(problem, spec, impulse, tol)
+        made = solve_small(problem, spec, impulse, tol)
         if made is not None:
             return made
     return Prepared(problem, spec, options).solve(
@@ -204,7 +204,7 @@ class Prepared:
             _check_records(self.spec, history, callback)
             self._refresh(problem)
             if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
-                made = solve_few(
+                made = solve_small(
                     self._given, self.spec, impulse, tol
                 )  # nothing was prepared that it would need
                 if made is not None:
@@ -463,7 +463,7 @@ def next_count(n: int) -> int:
     return n + max(1, n >> 3)
 
 
-def solve_few(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
+def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
     """What the solver makes of few rows in one compiled call, judged there; None where it leaves that to `Prepared`.
 
     Claim, counts and residual are put in words when somebody asks for them.

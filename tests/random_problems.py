@@ -172,6 +172,41 @@ def box_stack(n, mass_ratio=1.0):
     return lv.Problem.from_rows(rows, name=f"box stack {n}, mass ratio {mass_ratio:g}")
 
 
+def dragged(seed, contacts, mu=None, shape="disk", friction="coulomb"):
+    """J and M of contacts alone, pressed on and dragged; two coefficients each are drawn where none are given."""
+    rng = np.random.default_rng(seed)
+    m, nv = 3 * contacts, 3 * contacts + 3
+    mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
+    target = rng.normal(size=m)
+    target[::3] += 1.0
+    cones = lv.Cones.contacts(mu, shape=shape, count=contacts if np.ndim(mu) == 0 else None)
+    return lv.Problem.from_jacobian(
+        rng.normal(size=(m, nv)),
+        np.eye(nv),
+        rng.normal(size=nv),
+        target=target,
+        cones=cones,
+        friction=friction,
+    )
+
+
+def without_solution(seed, m):
+    """A symmetric LCP, with y >= 0, A y = 0 and b.y > 0 put in by hand."""
+    rng = np.random.default_rng(seed)
+    y = np.maximum(rng.uniform(-0.5, 1.0, m), 0.0)
+    y[0] = 1.0
+    g = rng.normal(size=(m, m))
+    g -= np.outer(y, y @ g) / (y @ y)
+    a = g @ g.T
+    b = rng.normal(size=m)
+    return lv.Problem.lcp(0.5 * (a + a.T), b + y * (0.5 - b @ y) / (y @ y))
+
+
+def good(solution, tol=1e-12):
+    """Within tol, or twice what rounding lambda to float64 costs, and not contradicted."""
+    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
+
+
 def spd(n, seed=0):
     a = np.random.default_rng(seed).normal(size=(n, n))
     return a @ a.T / n + np.eye(n), np.random.default_rng(seed + 1).normal(size=n)

@@ -159,3 +159,13 @@ def sweep(problem, a, lam, blocks):
             size = np.linalg.norm(y)
             lam[t] = y if size <= bound * lam[j] else y * (bound * lam[j] / size)
     given[:] = s * lam
+
+
+def block_diagonal(system, values):
+    """The small matrices of the elements of Newton's method as one block diagonal matrix."""
+    sc = system.sc
+    out = np.zeros((sc.m, sc.m))
+    for i, q in enumerate(sc.wptr[:-1]):
+        j, end = sc.ptr[i], sc.ptr[i + 1]
+        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
+    return out

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.auto.curves import Curve
 from lavender.problem import Problem
-from lavender.registry import FEW
+from lavender.registry import SMALL_ROWS
 from lavender.solvers._plan import READ, Costs
 from lavender.solvers._structure import Structure
 
@@ -46,7 +46,7 @@ def gathered(curves: Iterable[Curve], problem_of: Callable[[str], Problem]) -> l
     """
     found: dict[str, dict[str, Curve]] = {}
     for curve in curves:
-        if curve.rows > FEW:  # others are mostly solved in one compiled call
+        if curve.rows > SMALL_ROWS:  # others are mostly solved in one compiled call
             found.setdefault(curve.case, {})[curve.candidate] = curve
     return [(Structure(problem_of(case)), made) for case, made in found.items()]
 

@@ -18,8 +18,9 @@ last step, by key; MuJoCo at its own tolerance.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter, thread_time
 from typing import Any
@@ -28,6 +29,7 @@ import numpy as np
 
 from lavender.bench.running.sequences import carry
 from lavender.io import mujoco as adapter
+from lavender.io.recording import drive_of
 from lavender.many import solve_many
 from lavender.problem import Problem
 from lavender.residuals import judged, reference, residual
@@ -157,16 +159,20 @@ def next_step(problem: Problem, impulse: Any, reference_impulse: Any) -> tuple[f
     )
 
 
+def _steps(mj: Any, model: Any, steps: int, seed: int) -> Iterator[tuple[int, Any]]:
+    """Number of each step under random controls, and the data after it."""
+    data, drive = mj.MjData(model), drive_of(model, "random", seed)
+    for step in range(steps):
+        data.ctrl[:] = drive(data, step)
+        mj.mj_step(model, data)
+        yield step, data
+
+
 def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[Step]:
     """Steps of one model under random controls; those without constraints or nothing to do are left out."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
-    data = mj.MjData(model)
-    rng = np.random.default_rng(seed)
     out: list[Step] = []
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
-    for step in range(20 * steps * every):
-        data.ctrl[:] = rng.uniform(low, high)
-        mj.mj_step(model, data)
+    for step, data in _steps(mj, model, 20 * steps * every, seed):
         if (step + 1) % every:
             continue
         mj.mj_forward(model, data)
@@ -236,20 +242,15 @@ def measure_warm(mj: Any, path: Path, steps: int, seed: int = 0) -> list[WarmSte
     """Consecutive steps of one model under random controls, each solved warm by both sides."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
-    data = mj.MjData(model)
-    rng = np.random.default_rng(seed)
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
     out: list[WarmStep] = []
     before: tuple[Problem, Any] | None = None
-    for step in range(steps):
-        data.ctrl[:] = rng.uniform(low, high)
-        mj.mj_step(model, data)
+    for step, data in _steps(mj, model, steps, seed):
         mj.mj_forward(model, data)
         if int(data.nefc) == 0:
             before = None
             continue
         problem = adapter.from_mujoco(model, data, name=f"{path.stem} {step}")
-        engine = least(lambda: mj.mj_fwdConstraint(model, data))
+        engine = least(partial(mj.mj_fwdConstraint, model, data))
         start = problem.start() if before is None else carry(*before, problem)
         ours = np.inf
         for _ in range(REPEATS):

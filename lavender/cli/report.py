@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,24 +90,18 @@ __all__ = ["report"]
 @click.pass_context
 def report(
     context: click.Context,
+    /,
     files: tuple[str, ...],
     asked: Asked,
     out: Path,
-    sequence: bool | None,
     campaign: bool,
-    seeds: range,
-    workers: int,
-    backend: str,
     compare: Path | None,
     time_budgets: tuple[float, ...],
     peers: Path | None,
-    steps: int,
-    every: int,
-    controls: str,
     tables: bool,
-    fresh: bool,
     paper: bool,
     no_figures: bool,
+    **given: Any,
 ) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
 
@@ -132,11 +127,11 @@ def report(
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     _refuse_unused(context, files, asked.solvers)
     taken: set[Path] = set()
-    files = tuple(_recorded(f, out, steps, every, controls, fresh, taken) for f in files)
+    how = {name: given[name] for name in ("steps", "every", "controls")}
+    files = tuple(_recorded(f, out, taken, given["fresh"], how) for f in files)
     old = None if compare is None else bench.read(compare)
     rivals = None if peers is None else read_peers(peers)
-    named = partial(was_given, context)
-    sweeps = asked.budgets if named("budgets") else ()
+    sweeps = asked.budgets if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
     again = [f for f in files if f.endswith(".jsonl")]
     if again:
@@ -144,11 +139,12 @@ def report(
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
         done = Measured(bench.read(again[0]), False)
     elif campaign:
-        words = bench.seeds(files, len(seeds), seeds.start)
-        done = run_campaign(words, asked, path, workers=workers, backend=backend)
+        words = bench.seeds(files, len(given["seeds"]), given["seeds"].start)
+        done = run_campaign(words, asked, path, workers=given["workers"], backend=given["backend"])
     else:
         plan = asked.plan(files, time_budgets, sweeps)
-        done = measure(files, asked, plan, path, sequence, fresh, given=named, lines=True)
+        more = {"sequence": given["sequence"], "fresh": given["fresh"], "given": partial(was_given, context)}
+        done = measure(files, asked, plan, path, lines=True, **more)
     engines = [] if campaign else contestants(files, done.records.latest())
     shown: dict[str, Any] = {"old": old, "times": time_budgets, "sweeps": sweeps}
     print_report(done.records, console(), whole=tables, **shown)
@@ -205,10 +201,8 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     refuse_idle(context, solvers)
 
 
-def _recorded(
-    word: str, out: Path, steps: int, every: int, controls: str, fresh: bool, taken: set[Path]
-) -> str:
-    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way.
+def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[str, Any]) -> str:
+    """A model's file as the folder of its recorded steps, recorded now unless that was done in the same way, `how`.
 
     The folder is named by the model's own folder and file: many are called scene.xml. `taken` are those of the models
     before it.
@@ -225,23 +219,13 @@ def _recorded(
         n += 1
         folder = first.with_name(f"{first.name}-{n}")
     taken.add(folder)
-    how = folder / "how.json"
-    asked = json.dumps(
-        {
-            "model": model,
-            "changed": _age(path),
-            "steps": steps,
-            "every": every,
-            "controls": controls,
-        }
-    )
-    if fresh or not how.is_file() or how.read_text(encoding="utf-8") != asked:
-        console().print(
-            str(record_file(path, folder, steps, every=every, control=controls, replace=True)),
-            highlight=False,
-            markup=False,
-        )
-        write_text(how, asked)
+    kept = folder / "how.json"
+    asked = json.dumps({"model": model, "changed": _age(path), **how})
+    if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
+        more = {"steps": how["steps"], "every": how["every"], "control": how["controls"]}
+        told = str(record_file(path, folder, **more, replace=True))
+        console().print(told, highlight=False, markup=False)
+        write_text(kept, asked)
     return str(folder)
 
 

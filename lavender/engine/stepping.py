@@ -48,7 +48,7 @@ SOLVER_FIELDS = (
 NEWTON = NEWTON_SPEC.factory
 TOL = 1e-6  # of lavender.solve
 INSIDE = "this simulation is inside a step; a solver or callback may not use it until the step has ended"
-AT_ONCE = 256  # compiled substeps between two looks for Ctrl-C
+CHUNK = 256  # compiled substeps between two looks for Ctrl-C
 HALF = "a step ended between its substeps"
 LAST_STEP = 2**31 - 1  # head's count of substeps begins again after it
 P = ParamSpec("P")
@@ -300,7 +300,7 @@ class Stepping:
     def _sweep_substeps(self) -> None:
         left = self._parameters.substeps
         while True:
-            status, done = self._state.kernel.substeps(min(left, AT_ONCE))
+            status, done = self._state.kernel.substeps(min(left, CHUNK))
             left -= done
             if status == NEED_ROOM:
                 self._state = self._state.grown()

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,10 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
-from lavender._lu import sparse_lu
 from lavender.cones import CONTACT, CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
+from lavender.io.condensed import ENTRY, condensed
 from lavender.io.npz import compressed
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
 from lavender.problem import Problem
@@ -36,8 +36,11 @@ __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_cont
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
 ROLLING = "_rolling"  # behind either
 ROLLING_ROWS = 5  # normal, two tangents, two that roll
-CONDENSE_CHUNK = 2**23  # numbers of M^-1 H, or of H^T M^-1 H, held dense at a time: 64 MiB
-ENTRY = 16  # bytes of an entry of a sparse matrix: number and index
+# Shapes of what a form holds: m rows of c contacts, p equations, n velocities.
+PARTS = {
+    LOCAL: {"W": "mm", "V": "mp", "R": "pp", "q": "m", "s": "p", "mu": "c", "mu_r": "c"},
+    GLOBAL: {"H": "nm", "M": "nn", "G": "np", "f": "n", "w": "m", "b": "p", "mu": "c", "mu_r": "c"},
+}
 BLOCK = 64  # bytes of the bounds of a row: Cones, b
 CHUNK_OF_ONE = 2**17  # most numbers in the chunk of a single number
 
@@ -143,21 +146,8 @@ class Contents:
         jt, offset = self._columns(), self._offset()
         if self.M.shape[0] == 0:
             return sp.csr_array((len(offset), len(offset))), -offset
-        label = csgraph.connected_components(self.M, directed=False)[1]
-        budget.spend(ENTRY * _most_entries(label, jt), "A = H^T M^-1 H")
-        solve = _factor(self.M, label, budget)
-        m = jt.shape[1]
-        step = max(1, CONDENSE_CHUNK // max(1, *jt.shape))
-        columns = sp.csc_array(jt)
-        j = sp.csr_array(jt.T)
-        parts = [
-            sp.csr_array(j @ solve(columns[:, k : min(k + step, m)].toarray())) for k in range(0, m, step)
-        ]
-        a = sp.csr_array(sp.hstack(parts)) if parts else sp.csr_array((0, 0))
-        gap = self.M - self.M.T
-        if gap.nnz == 0 or not np.any(gap.data):
-            a = sp.csr_array(0.5 * (a + a.T))  # what the order of additions left, where M is symmetric
-        return a, -(offset + j @ solve(np.asarray(self.f)))
+        a, pushed = condensed(self.M, jt, np.asarray(self.f), budget)
+        return a, -(offset + pushed)
 
     def _impulse(self, point: Mapping[str, FloatArray]) -> FloatArray:
         return np.concatenate([point["r"], point["l"]]) if "l" in point else point["r"]
@@ -171,42 +161,6 @@ class Contents:
         if "u" not in self.solution:
             return None
         return np.concatenate([self.solution["u"], np.zeros(len(self.solution.get("l", ())))])
-
-
-def _most_entries(label: np.ndarray, jt: sp.csr_array) -> int:
-    """At most so many entries has J M^-1 J^T; `label` (n,) says which parts of M hang together.
-
-    A row of J that touches a part meets there every row that touches it: a part with r rows makes at most r^2.
-    """
-    m = jt.shape[1]
-    part = np.repeat(label.astype(np.int64), np.diff(jt.indptr))
-    touched = np.unique(part * m + jt.indices) // m if len(part) else part
-    rows = np.bincount(touched, minlength=1).astype(float)
-    return int(min(rows @ rows, float(m) ** 2))
-
-
-def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable[[np.ndarray], np.ndarray]:
-    """x = M^-1 y by LU factors whose size is bounded beforehand.
-
-    A part of n unknowns has at most n^2 entries in its factors. Where that is too much, the order is one of small
-    bandwidth: with l below and u above the diagonal, L and U with row exchanges stay within n (2 l + u + 1).
-    """
-    n = matrix.shape[0]
-    size = np.bincount(label).astype(float)
-    dense = ENTRY * int(size @ size)
-    try:
-        if dense <= budget.left:
-            return sparse_lu(matrix).solve
-        order = csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
-        permuted = sp.coo_array(matrix[order][:, order])
-        off = permuted.row.astype(np.int64) - permuted.col
-        width = 2 * int(off.max(initial=0)) - int(off.min(initial=0)) + 1
-        budget.spend(ENTRY * n * min(width, n), "the factors of M")
-        factor = sparse_lu(permuted, permc_spec="NATURAL")
-    except RuntimeError as error:
-        raise InputError(f"M cannot be factorised ({error}); an invertible M is needed") from None
-    back = np.argsort(order)
-    return lambda y: factor.solve(y[order])[back]
 
 
 # -- reading --------------------------------------------------------------------------------------
@@ -281,7 +235,7 @@ class _Reader:
         for path in paths:
             data = self.node(path)
             if isinstance(data, self.h5py.Dataset) and data.shape is not None:
-                chunk = math.prod(data.chunks) * data.dtype.itemsize if data.chunks else 0
+                chunk = _chunk(data) * data.dtype.itemsize
                 self.budget.spend(data.size * max(NUMBER, data.dtype.itemsize) + chunk, path)
 
     def dataset(self, path: str, kinds: str, count: int | None = None) -> Any:
@@ -304,8 +258,8 @@ class _Reader:
 
     def whole(self, path: str) -> int:
         data = self.dataset(path, "iu", 1)
-        if data.chunks and math.prod(data.chunks) > CHUNK_OF_ONE:  # the whole chunk would be unpacked
-            raise InputError(f"{path} is one number in a chunk of {math.prod(data.chunks)}")
+        if _chunk(data) > CHUNK_OF_ONE:
+            raise InputError(f"{path} is one number in a chunk of {_chunk(data)}")
         value = int(np.asarray(data[()]).reshape(-1)[0])
         if not -(2**31) <= value < 2**31:
             raise InputError(f"{path} is {value}, beyond 32 bits")
@@ -318,7 +272,7 @@ class _Reader:
         data = self.node(path)
         if not isinstance(data, self.h5py.Dataset) or data.size != 1 or data.nbytes > 2**20:
             return ""
-        if data.chunks and math.prod(data.chunks) > CHUNK_OF_ONE:
+        if _chunk(data) > CHUNK_OF_ONE:
             return ""
         value = data[()]
         value = value.flat[0] if isinstance(value, np.ndarray) else value
@@ -352,6 +306,11 @@ class _Reader:
             raise InputError(f"{path}: {error}") from None
         as_array(f"{path}/x", a.data, (None,), copy=False)
         return a
+
+
+def _chunk(data: Any) -> int:
+    """Numbers that are unpacked at a time, however few are read."""
+    return math.prod(data.chunks) if data.chunks else 0
 
 
 def _triplets(p: np.ndarray, i: np.ndarray, x: np.ndarray, nz: int, m: int, n: int) -> sp.csr_array:
@@ -390,35 +349,29 @@ def _read_file(r: _Reader) -> Contents:
         raise InputError(f"{group}/W is {first[0]} x {m}; a square matrix is needed")
     if m % spacedim:
         raise InputError(f"{m} rows are not a multiple of spacedim = {spacedim}")
-    length = {"q": m, "s": p, "f": n, "w": m, "b": p, "mu": m // spacedim, "mu_r": m // spacedim}
-    wanted: dict[str, tuple[int, int]] = {"W": (m, m)} if local else {"H": (n, m), "M": (n, n)}
-    if has_equations:
-        wanted |= {"V": (m, p), "R": (p, p)} if local else {"G": (n, p)}
-    names = [
-        "q" if local else "f",
-        *([] if local else ["w"]),
-        *([("s" if local else "b")] if p else []),
-        "mu",
-        *(["mu_r"] if rolling else []),
-    ]
+    size = {"m": m, "n": n, "p": p, "c": m // spacedim}
+    absent = [*("" if has_equations else "VRG"), *("" if p else "sb"), *([] if rolling else ["mu_r"])]
+    parts = {name: shape for name, shape in PARTS[LOCAL if local else GLOBAL].items() if name not in absent}
+    shapes: dict[str, Any] = {name: tuple(size[x] for x in shape) for name, shape in parts.items()}
+    matrices, names = ([name for name in shapes if len(shapes[name]) == k] for k in (2, 1))
     for name in names:  # lengths, then bytes, then numbers
-        r.dataset(f"{vectors}/{name}", "iuf", length[name])
+        r.dataset(f"{vectors}/{name}", "iuf", shapes[name][0])
     r.budget.spend(BLOCK * (m + p), f"{m + p} rows")
-    for name, shape in wanted.items():
-        r.budget.spend(NUMBER * (shape[0] + 1), f"{group}/{name}")
+    for name in matrices:
+        r.budget.spend(NUMBER * (shapes[name][0] + 1), f"{group}/{name}")
         r.spend(f"{group}/{name}/{part}" for part in ("p", "i", "x"))
     r.spend(f"{vectors}/{name}" for name in names)
     guesses = _guesses(r)
     r.spend(f"{point}/{name}" for point in ("solution", *guesses) for name in "ruvl")
-    parts: dict[str, Any] = {name: r.matrix(f"{group}/{name}", shape) for name, shape in wanted.items()}
-    parts |= {name: r.vector(f"{vectors}/{name}", length[name]) for name in names}
+    values: dict[str, Any] = {name: r.matrix(f"{group}/{name}", shapes[name]) for name in matrices}
+    values |= {name: r.vector(f"{vectors}/{name}", shapes[name][0]) for name in names}
     return Contents(
         spacedim,
         solution=_point(r, "solution", n, m, p) if r.has("solution") else {},
         guesses=tuple(_point(r, guess, n, m, p) for guess in guesses),
         info={name: r.text(f"{group}/info/{name}") for name in ("title", "description", "math_info")},
         compare=r.text("reference/compare"),
-        **parts,
+        **values,
     )
 
 
@@ -497,23 +450,12 @@ def contents(
     solution = points[0] if impulse is not None else {}
     guesses = tuple(points[-1:]) if problem.guess is not None else ()
     if form == "local":
-        return Contents(
-            spacedim, mu, mu_r, W=problem.csr, q=-problem.b, solution=solution, guesses=guesses, info=info
-        )
-    mass, v = _mass(problem)
-    jac = problem.jacobian
-    return Contents(
-        spacedim,
-        mu,
-        mu_r,
-        M=mass,
-        H=sp.csr_array(jac.T),
-        f=mass @ v,
-        w=-(problem.b + jac @ v),
-        solution=solution,
-        guesses=guesses,
-        info=info,
-    )
+        parts: dict[str, Any] = {"W": problem.csr, "q": -problem.b}
+    else:
+        mass, v = _mass(problem)
+        jac = problem.jacobian
+        parts = {"M": mass, "H": sp.csr_array(jac.T), "f": mass @ v, "w": -(problem.b + jac @ v)}
+    return Contents(spacedim, mu, mu_r, solution=solution, guesses=guesses, info=info, **parts)
 
 
 def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
@@ -604,13 +546,13 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 def _write_file(out: Any, file: Contents) -> None:
     group = out.create_group(file.group)
     group["spacedim"] = np.array([file.spacedim], np.int32)
-    for name in ("W", "V", "R", "M", "H", "G"):
-        if getattr(file, name) is not None:
-            _write_matrix(group.create_group(name), getattr(file, name))
     vectors = group.create_group("vectors")
-    for name in ("q", "s", "f", "w", "b", "mu", "mu_r"):
-        if getattr(file, name) is not None:
-            vectors[name] = getattr(file, name)
+    for name, shape in PARTS[LOCAL if file.form == "local" else GLOBAL].items():
+        part = getattr(file, name)
+        if part is not None and len(shape) == 2:
+            _write_matrix(group.create_group(name), part)
+        elif part is not None:
+            vectors[name] = part
     if any(file.info.values()):
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):

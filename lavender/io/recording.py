@@ -96,7 +96,7 @@ def record(
     steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
-    drive = _drive(model, control, seed)
+    drive = drive_of(model, control, seed)
     folder = folder_for_steps(folder, replace)
     files: list[str] = []
     left_out: list[str] = []
@@ -179,7 +179,8 @@ def _controls(path: str) -> Any:
     return found
 
 
-def _drive(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], FloatArray | None]:
+    """What sets the controls of (data, step); see `record`."""
     n = int(model.nu)
     if callable(control):
         call: Callable[[Any, Any, int], Any] = control

@@ -121,7 +121,7 @@ class Builders(Operators):
         A : (m, m) 1/kg, array or sparse
         b : (m,) m/s
         lower, upper : scalar or (m,) N s
-            Where findex < 0; where it is not, upper is mu [-].
+            Where findex < 0; where it is not, upper is mu [-] and lower, there -mu, is not read, as in these engines.
         findex : (m,) int
             Row of the normal whose impulse bounds this one, |lambda_i| <= upper_i lambda_findex; -1: constant bounds.
 

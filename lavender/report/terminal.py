@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["print_report"]
 
 BY_MOTION = "\n[bold]By motion error[/] (how wrong the body moves that is furthest off)"
-FEW = 20  # lines: a report that has no more is printed whole
+SHORT = 20  # lines: a report that has no more is printed whole
 
 
 def print_report(
@@ -65,15 +65,15 @@ def print_report(
             console.print("\n[bold]By sweeps[/]", highlight=False)
             print_table(console, swept)
         _print_motion(records, console, whole)
-    for case in still[:FEW]:
+    for case in still[:SHORT]:
         console.print(
             f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
             highlight=False,
             markup=False,
             style="dim",
         )
-    if len(still) > FEW:
-        console.print(f"and {len(still) - FEW} more with nothing to do", highlight=False, style="dim")
+    if len(still) > SHORT:
+        console.print(f"and {len(still) - SHORT} more with nothing to do", highlight=False, style="dim")
     _print_lost(records, console)
     _print_suspicions(records, console)
     if not campaign:
@@ -87,10 +87,10 @@ def print_report(
     wrong = [r for r in records if r.contradicted]
     if wrong:
         console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")
-        for r in wrong[:FEW]:
+        for r in wrong[:SHORT]:
             console.print(f"  {r.case}, {r.solver}: {r.contradicted}", highlight=False, markup=False)
-        if len(wrong) > FEW:
-            console.print(f"  and {len(wrong) - FEW} more", highlight=False)
+        if len(wrong) > SHORT:
+            console.print(f"  and {len(wrong) - SHORT} more", highlight=False)
 
 
 def _print_motion(records: Records, console: Console, whole: bool) -> None:
@@ -100,7 +100,7 @@ def _print_motion(records: Records, console: Console, whole: bool) -> None:
     console.print(BY_MOTION, highlight=False)
     print_table(console, contents.speed_table(records))
     moved = contents.moved_table(records)
-    if whole or len(moved.rows) <= FEW:
+    if whole or len(moved.rows) <= SHORT:
         console.print()
         print_table(console, moved, grouped=True)
 
@@ -122,16 +122,16 @@ def _print_lost(records: Records, console: Console) -> None:
 
 def _print_suspicions(records: Records, console: Console) -> None:
     found = suspicions(records)
-    for case, told in found[:FEW]:
+    for case, told in found[:SHORT]:
         console.print("[yellow]suspicious:[/]", end=" ")
         console.print(f"{case}: {told}", highlight=False, markup=False)
-    if len(found) > FEW:
-        console.print(f"and {len(found) - FEW} more, on the page", highlight=False, style="dim")
+    if len(found) > SHORT:
+        console.print(f"and {len(found) - SHORT} more, on the page", highlight=False, style="dim")
 
 
 def _print_tables(records: Records, console: Console, levels: Sequence[float], whole: bool) -> None:
     lines = len(tables.reaches(records, levels)) + len(tables.passes(records))
-    if not whole and lines > FEW:
+    if not whole and lines > SHORT:
         console.print(
             f"{count(lines, 'line')} of single cases and sequences: --tables prints them",
             highlight=False,

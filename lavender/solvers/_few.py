@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.problem import LAWS, Problem
-from lavender.registry import FEW
+from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers import _rates as rates
@@ -66,7 +66,7 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
         cost = general_cost(problem, problem.generalized.nv)
     else:
         per = sweep_cost(problem)
-        cost = (first_look(per) if problem.m <= FEW else IN_ALL * SWEPT) * per
+        cost = (first_look(per) if problem.m <= SMALL_ROWS else IN_ALL * SWEPT) * per
     return 4e-9 * cost <= time_limit
 
 
@@ -79,7 +79,7 @@ def prepared(problem: Problem) -> Any:
 
 
 def _make(problem: Problem) -> Chain | Islands | None:
-    if problem.m > FEW:
+    if problem.m > SMALL_ROWS:
         return _divided(problem)
     reference(problem)
     data, start = problem.metric, problem._start
@@ -139,7 +139,7 @@ class Few:
                 return None
             found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
         else:
-            chain = prepared(problem) if problem.m <= FEW or self.sweeps else None
+            chain = prepared(problem) if problem.m <= SMALL_ROWS or self.sweeps else None
             if chain is None or not (self.pivots if chain.pivots else self.sweeps):
                 return None
             found = chain.run(impulse, tol, self.looks, WARM, self.looks) or False

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lavender.problem import Problem
-from lavender.registry import FEW
+from lavender.registry import SMALL_ROWS
 from lavender.solvers import _rates as weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
@@ -81,7 +81,7 @@ class Structure:
     def is_definite(self) -> bool:
         """`direct` exchanges rows of symmetric matrices, or of few rows."""
         p = self.problem
-        return p.law == "linear" or (p.law == "lcp" and (p.m <= FEW or p.is_symmetric))
+        return p.law == "linear" or (p.law == "lcp" and (p.m <= SMALL_ROWS or p.is_symmetric))
 
     @property
     def direct_least(self) -> float:
@@ -178,7 +178,7 @@ class Structure:
         """One compiled call is tried before all else."""
         if self.problem.generalized is not None:
             return self.goes_first
-        return self.m <= FEW or prepared(self.problem) is not None
+        return self.m <= SMALL_ROWS or prepared(self.problem) is not None
 
     @cached_property
     def velocities(self) -> float:

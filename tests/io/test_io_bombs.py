@@ -17,6 +17,7 @@ import scipy.sparse as sp
 import lavender as lv
 import lavender.io
 from lavender.io import fclib
+from lavender.io.condensed import most_entries
 
 h5py = pytest.importorskip("h5py")
 resource = pytest.importorskip("resource")
@@ -263,7 +264,7 @@ def test_a_condensed_matrix_is_never_larger_than_expected():
             mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
         file = contents(mass, h)
         label = fclib.csgraph.connected_components(file.M, directed=False)[1]
-        assert file.problem().csr.nnz <= fclib._most_entries(label, file.H)
+        assert file.problem().csr.nnz <= most_entries(label, file.H)
 
 
 def test_factors_that_would_fill_are_refused_and_narrow_ones_are_not():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, random_contact_problem, seeds
+from random_problems import as_matrix, dragged, random_contact_problem, seeds
 
 import lavender as lv
 from lavender import registry
@@ -20,20 +20,7 @@ LAWS = ("coulomb", "cone")
 
 
 def free(seed, contacts=4, friction="coulomb", mu=None):
-    """J and M of contacts alone, pressed on and dragged."""
-    rng = np.random.default_rng(seed)
-    m, nv = 3 * contacts, 3 * contacts + 3
-    mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
-    target = rng.normal(size=m)
-    target[::3] += 1.0
-    return lv.Problem.from_jacobian(
-        rng.normal(size=(m, nv)),
-        np.eye(nv),
-        rng.normal(size=nv),
-        target=target,
-        cones=lv.Cones.contacts(mu, shape="box", count=contacts if np.ndim(mu) == 0 else None),
-        friction=friction,
-    )
+    return dragged(seed, contacts, mu, "box", friction)
 
 
 # -- blocks ------------------------------------------------------------------------------------------------------------

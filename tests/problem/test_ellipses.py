@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, random_ellipses, seeds
+from random_problems import as_matrix, dragged, random_ellipses, seeds
 
 import lavender as lv
 from lavender import registry
@@ -18,16 +18,7 @@ LAWS = ("coulomb", "cone")
 
 
 def free(seed, contacts=3, friction="coulomb", mu=None):
-    """J and M of contacts alone, pressed on and dragged."""
-    rng = np.random.default_rng(seed)
-    m, nv = 3 * contacts, 3 * contacts + 3
-    mu = rng.uniform(0.1, 1.0, (contacts, 2)) if mu is None else mu
-    target = rng.normal(size=m)
-    target[::3] += 1.0
-    return lv.Problem.from_jacobian(
-        rng.normal(size=(m, nv)), np.eye(nv), rng.normal(size=nv), target=target, cones=lv.Cones.contacts(mu),
-        friction=friction,
-    )  # fmt: skip
+    return dragged(seed, contacts, mu, friction=friction)
 
 
 def on_rows(seed, friction="coulomb", **sizes):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import as_matrix, good, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -13,10 +13,6 @@ from lavender.solvers._certify import certify
 from lavender.solvers._log import SolveLog
 from lavender.solvers._newton import general
 from lavender.solvers.islands import islands, restrict, rows_of
-
-
-def good(solution, tol):
-    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
 
 
 def several(count, seed=0, friction="coulomb"):

@@ -7,7 +7,8 @@ from unittest import mock
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, random_contact_problem, seeds
+from random_problems import as_matrix, good, random_contact_problem, seeds
+from twins import block_diagonal
 
 import lavender as lv
 from lavender import suite
@@ -16,20 +17,6 @@ from lavender.solvers._newton.systems import System, make_system
 from lavender_ext.newton.elements import MAP_AUGMENTED as AUGMENTED
 from lavender_ext.newton.elements import MAP_CONVEX as CONVEX
 from lavender_ext.newton.solve import PHASES
-
-
-def good(solution, tol):
-    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
-
-
-def dense(system, values):
-    """The elements' small matrices as one block diagonal matrix."""
-    sc = system.sc
-    out = np.zeros((sc.m, sc.m))
-    for i, q in enumerate(sc.wptr[:-1]):
-        j, end = sc.ptr[i], sc.ptr[i + 1]
-        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
-    return out
 
 
 def dense_h(system):
@@ -85,7 +72,7 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
     solve.begin(1e-10, 0.9)
     for _ in range(3):
         solve.weigh(system.elements, 1e-10)
-        w = np.linalg.inv(dense(system, solve.v)) - np.diag(sc.theta)
+        w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
         np.subtract.at(c, (first, np.arange(sc.m)), solve.turn(0.9))
         assert solve.factor("pair", augmented=form == "augmented")
@@ -108,7 +95,7 @@ def test_augmented_system_is_the_same_newton_system(law, seed):
     z, r = rng.normal(size=m), rng.normal(size=m)
     solve.natural(z, solve.times(z) - system.sc.g, law, 1e-3)
     assert solve.factor("natural", 1e-3, augmented=True)
-    p = dense(system, solve.p)
+    p = block_diagonal(system, solve.p)
     matrix = np.eye(m) - p + p @ (dense_h(system) + 1e-3 * np.eye(m))
     x = solve.solve("natural", r)
     # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.

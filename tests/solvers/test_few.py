@@ -16,7 +16,7 @@ import lavender as lv
 from benchmarks.drawn import wild
 from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
-from lavender.registry import FEW
+from lavender.registry import SMALL_ROWS
 from lavender.solvers import _rates as rates
 from lavender.solvers._few import AUTO, ISLAND, call_ends_within, general_cost
 from lavender.solvers._newton import general
@@ -51,7 +51,7 @@ def check(problem, solver, **options):
 def draw(kind, seed):
     rng = np.random.default_rng(seed)
     if kind == "lcp":
-        return random_lcp(seed, m=int(rng.integers(1, FEW)), rank=None if rng.random() < 0.7 else 3)
+        return random_lcp(seed, m=int(rng.integers(1, SMALL_ROWS)), rank=None if rng.random() < 0.7 else 3)
     if kind == "linear":
         g = rng.normal(size=(9, 9))
         a = g @ g.T if rng.random() < 0.6 else g
@@ -104,7 +104,7 @@ def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
 @pytest.mark.parametrize("name", suite.families())
 def test_families_of_few_rows(name):
     problem = suite.case(name).problem
-    if problem.m > FEW:
+    if problem.m > SMALL_ROWS:
         pytest.skip("many rows")
     for solver in SHORT:
         if registry.get(solver).refuses(problem) is None:

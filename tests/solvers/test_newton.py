@@ -8,7 +8,8 @@ import pytest
 import scipy.sparse as sp
 from enumeration import enumerate_lcp
 from hypothesis import given, settings
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import as_matrix, good, random_contact_problem, random_lcp, seeds
+from twins import block_diagonal
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -24,23 +25,9 @@ from lavender_ext.newton.elements import Elements
 from lavender_ext.newton.normal_matrix import Factor
 
 
-def good(solution, tol):
-    return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
-
-
 def dense_h(problem):
     s = 1.0 / np.sqrt(problem.d)
     return problem.dense() * s[:, None] * s[None, :]
-
-
-def dense_small(system, values):
-    """The elements' small matrices as one block diagonal matrix."""
-    sc = system.sc
-    out = np.zeros((sc.m, sc.m))
-    for i, q in enumerate(sc.wptr[:-1]):
-        j, end = sc.ptr[i], sc.ptr[i + 1]
-        out[j:end, j:end] = values[q : sc.wptr[i + 1]].reshape(end - j, end - j)
-    return out
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse"])
@@ -161,7 +148,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     assert solve.factor("natural", eps)
     r = rng.normal(size=m)
     x = solve.solve("natural", r)
-    matrix = np.eye(m) + dense_small(system, solve.p) @ (
+    matrix = np.eye(m) + block_diagonal(system, solve.p) @ (
         dense_h(problem)[np.ix_(system.sc.keep, system.sc.keep)] + (eps - 1.0) * np.eye(m)
     )
     # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
@@ -183,7 +170,7 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
         solve.factor("barrier")
         r = np.random.default_rng(seed).normal(size=sc.m)
         x = solve.solve("barrier", r)
-        v = dense_small(system, solve.v)
+        v = block_diagonal(system, solve.v)
         expected = np.linalg.solve(np.eye(sc.m) + v @ h, v @ r)
         # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())

@@ -27,7 +27,7 @@ __all__ = ["ROUNDS", "Ask", "finals"]
 ROUNDS, LEAST_ROUNDS, MOST_ROUNDS = 7, 3, 41
 SPARE = 3.0  # s, for more repetitions than usual where they are cheap
 STAGE = 20.0  # time limits, that all repetitions may take together once there were the least
-TOGETHER = 32  # cases that are held in memory at a time
+LOADED = 32  # cases that are held in memory at a time
 ALIKE = 10  # rows of the largest over the smallest problem, up to which they are a batch
 
 
@@ -102,7 +102,7 @@ def finals(
         what = repr([asks, [info.sha for _, info in described]])
         stage = _Stage(runner, asks, hashlib.sha256(what.encode()).hexdigest()[:12])
         single = [(i, info) for i, info in described if not i.sequence]
-        parts = [single[k : k + TOGETHER] for k in range(0, len(single), TOGETHER)]
+        parts = [single[k : k + LOADED] for k in range(0, len(single), LOADED)]
         sequences: dict[str, list[tuple[Item, CaseInfo]]] = {}
         for item, info in described:
             if item.sequence:
@@ -148,7 +148,7 @@ class _Stage:
                 if ask.way == "batch" and _is_batch(taken[ask], steps):
                     self.batch(ask, taken[ask], made)
         for records in made.values():
-            self.runner.keep(_together(records))
+            self.runner.keep(_merged(records))
 
     def takes(self, ask: Ask, item: Item) -> bool:
         spec = self.runner.specs[ask.solver]
@@ -203,7 +203,7 @@ def _is_batch(some: Cases, steps: bool) -> bool:
     return len(rows) > 1 and (steps or max(rows) <= ALIKE * min(rows))
 
 
-def _together(records: Sequence[Record]) -> Record:
+def _merged(records: Sequence[Record]) -> Record:
     """The record of all repetitions: the last, with everybody's times."""
     times = [t for r in records for t in r.times]
     paces = [r.pace for r in records if r.pace is not None]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -160,9 +159,12 @@ class Plan:
         """Make every measurement of `tasks`."""
         tasks = self.tasks(info, problem, spec)
         record: Record | None = None
-        with suppress(StopIteration):
-            while True:
-                record = make(tasks.send(record))  # type: ignore[attr-defined]
+        while True:
+            try:
+                task = tasks.send(record)  # type: ignore[attr-defined]
+            except StopIteration:
+                return
+            record = make(task)
 
     def _to_speeds(self, task: Callable[..., Task], spec: SolverSpec, start: str) -> Iterator[Task | None]:
         """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""

@@ -29,7 +29,7 @@ from lavender.registry import SolverSpec
 __all__ = ["Event", "run", "solver_names"]
 
 QUICK = 0.05  # of the time limit: after a step that took less, the next is solved without a guard
-FEW_STEPS = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
+SHORT_SEQUENCE = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
 
 Watch = Callable[["Event"], Any]
 
@@ -225,7 +225,7 @@ class _Runner:
         max_iter: int,
     ) -> None:
         """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
-        repeats = self.plan.repeats if len(steps) <= FEW_STEPS else 1
+        repeats = self.plan.repeats if len(steps) <= SHORT_SEQUENCE else 1
         tasks = [
             Task.of(
                 info,

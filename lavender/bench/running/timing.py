@@ -13,7 +13,7 @@ import gc
 import statistics
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from time import perf_counter
 from typing import Any
@@ -70,24 +70,13 @@ class Task:
 
     def record(self, **what: Any) -> Record:
         """A record of this task."""
-        return Record(
-            run=self.run,
-            case=self.case,
-            sha=self.sha,
-            solver=self.solver,
-            options=dict(self.options),
-            start=self.start,
-            mode=self.mode,
-            tol=self.tol,
-            max_iter=self.max_iter,
-            time_limit=self.time_limit,
-            order=str(self.options.get("order", "given")),
-            seed=int(self.options.get("seed", 0)),
-            step=self.step,
-            way=self.way,
-            turns=self.turns,
-            **what,
-        )
+        order, seed = str(self.options.get("order", "given")), int(self.options.get("seed", 0))
+        same = {name: getattr(self, name) for name in _SHARED}
+        return Record(**{**same, "options": dict(self.options)}, order=order, seed=seed, **what)
+
+
+#: Fields of a task that its record has, too; `repeats` of a record are those that were made.
+_SHARED = {f.name for f in fields(Task)} & {f.name for f in fields(Record)} - {"repeats"}
 
 
 @cache

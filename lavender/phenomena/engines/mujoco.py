@@ -67,10 +67,11 @@ class Engine(Stepping):
         option = (
             f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"{step}{solver}/>'
         )
+        room = "64M" if tree else "1G"  # of contacts and rows between free bodies
         self.apart = ' contype="0" conaffinity="0"' if scene.joints else ""
         trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
         self.model = mujoco.MjModel.from_xml_string(
-            f"<mujoco>{option}<size memory='1G'/><default><geom {friction}{spin}/></default>"
+            f"<mujoco>{option}<size memory='{room}'/><default><geom {friction}{spin}/></default>"
             f"<worldbody>{trees}</worldbody><equality>{''.join(map(_tie, ties))}</equality></mujoco>"
         )
         self.data = mujoco.MjData(self.model)
