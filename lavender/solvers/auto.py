@@ -22,7 +22,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers._certify import certify
-from lavender.solvers._few import AUTO, call_ends_within
+from lavender.solvers._few import AUTO, call_ends_within, prepared
 from lavender.solvers._log import SolveLog
 from lavender.solvers._methods import Candidate, Sweeps, in_short_time, make
 from lavender.solvers._plan import Costs, Plan, candidates
@@ -67,7 +67,9 @@ class Auto:
         return self.prepare(problem)
 
     def ready(self, state: State, time_limit: float) -> None:
-        """Before the clock of a limit [s] starts in which others may not end: set up sweeps, which then come first."""
+        """Before the clock of a limit [s] starts: set up the compiled call, and sweeps where others may not end."""
+        if state.problem.generalized is None and call_ends_within(state.problem, time_limit):
+            prepared(state.problem)
         if state.problem.m and self.plan is None and not state.problem.cones.has_round:
             state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
 

@@ -190,6 +190,14 @@ def test_steps_over_few_velocities_end_too_late_for_the_least_limits():
     assert state.sweeps is not None
 
 
+def test_the_compiled_call_is_set_up_before_the_clock():
+    problem = suite.case("pyramid(k=3)").problem
+    reference(problem)
+    assert problem.derived.chain is None
+    Auto().ready(Auto().prepare(problem), 1.0)
+    assert problem.derived.chain
+
+
 def test_with_time_enough_nothing_is_set_up_before_the_clock():
     state = Auto().prepare(suite.stack(n=200).problem)
     Auto().ready(state, 10.0)
