@@ -174,17 +174,6 @@ cdef inline void tree_solve(const generalized_t* g, double* x) noexcept nogil:
     ldl_solve(g.n, g.lptr, g.lidx, g.lval, g.inv_pivot, x)
 
 
-cdef inline void tree_unwhiten(const generalized_t* g, double* x) noexcept nogil:
-    """x <- L^-1 D^-1/2 x: velocities of whitened ones."""
-    cdef int32_t k, q
-    cdef double z
-    for k in range(g.n):
-        z = x[k] * g.root[k]
-        for q in range(g.lptr[k], g.lptr[k + 1]):
-            z -= g.lval[q] * x[g.lidx[q]]
-        x[k] = z
-
-
 # -- J ---------------------------------------------------------------------------------------------------
 
 

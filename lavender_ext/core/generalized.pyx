@@ -4,8 +4,7 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.generalized cimport (jac_push, jac_row, tree_factor, tree_pattern, tree_solve,
-                                            tree_unwhiten)
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_factor, tree_pattern, tree_solve
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 
@@ -107,11 +106,6 @@ cdef class Operator:
         """x <- M^-1 x (n,)."""
         if self.g.n:
             tree_solve(&self.g, &x[0])
-
-    def unwhiten(self, double[::1] x):
-        """x <- L^-1 D^-1/2 x (n,)."""
-        if self.g.n:
-            tree_unwhiten(&self.g, &x[0])
 
     def change(self, const double[::1] lam, double[::1] x):
         """x = M^-1 J^T lam (n,)."""
