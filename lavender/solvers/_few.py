@@ -229,6 +229,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", Gate(GENERAL, rates.GENERAL_FIRST), True, True, looks=True)
+AUTO = Few("auto", Gate(GENERAL, tuple(rates.GENERAL_FIRST[law] for law in LAWS)), True, True, looks=True)
 DIRECT = Few("direct", None, True, False)
-NEWTON = Few("newton", Gate(GENERAL, rates.GENERAL_MOST), False, False)
+NEWTON = Few("newton", Gate(GENERAL, len(LAWS) * (rates.GENERAL_MOST,)), False, False)

@@ -23,6 +23,7 @@ GENERAL_START = 60e3
 GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
 GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
 GENERAL_COUNT = {"linear": 5.0, "lcp": 5.0, "cone": 12.0, "coulomb": 30.0}
-GENERAL_FIRST = 0.9e6  # ns of it up to which nothing else is looked at first,
+# ns of it up to which nothing else is looked at first; bounded rows and cones it mostly ends soonest,
+GENERAL_FIRST = {"linear": 0.9e6, "lcp": 2e6, "cone": 2e6, "coulomb": 0.9e6}
 GENERAL_MOST = 1e7  # and up to which nobody looks at the clock in between
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries,

@@ -171,7 +171,8 @@ class Structure:
     def goes_first(self) -> bool:
         """It is what the compiled call for few rows does."""
         kernel = self.kernel
-        return kernel is not None and general_cost(self.problem, kernel.largest) <= weights.GENERAL_FIRST
+        most = weights.GENERAL_FIRST[self.problem.law]
+        return kernel is not None and general_cost(self.problem, kernel.largest) <= most
 
     @property
     def is_small(self) -> bool:

@@ -37,7 +37,7 @@ cdef struct gate_t:             # what Newton's method may be counted to cost [n
     double row[4]               # by law: linear, lcp, coulomb, cone
     double factor[4]
     double count[4]             # factorisations by law
-    double most
+    double most[4]              # by law
 
 
 cdef struct job_t:
@@ -103,7 +103,7 @@ cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) n
     cdef double flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
     if j.law == 2:
         flops = 2.0 * flops
-    return gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops) <= gate.most
+    return gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops) <= gate.most[j.law]
 
 
 cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
@@ -195,16 +195,15 @@ cdef class Gate:
     ----------
     rates : tuple (start, rows, factors, counts)
         ns; by law.
-    most : float
-        ns
+    most : tuple
+        ns; by law.
     """
     cdef gate_t at
 
-    def __init__(self, rates, double most):
+    def __init__(self, rates, most):
         self.at.start, rows, factors, counts = rates
-        self.at.most = most
         for i in range(4):
-            self.at.row[i], self.at.factor[i], self.at.count[i] = rows[i], factors[i], counts[i]
+            self.at.row[i], self.at.factor[i], self.at.count[i], self.at.most[i] = rows[i], factors[i], counts[i], most[i]
 
 
 def solve_first(Data p, start, double tol, Gate gate, double most):

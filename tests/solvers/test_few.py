@@ -233,7 +233,7 @@ def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
     found = solve_first(problem.metric, None, np.inf, AUTO.gate, general.ROOM)
     cost = general_cost(problem, general.prepare(problem).largest)
-    assert (found is not None) == (cost <= rates.GENERAL_FIRST)
+    assert (found is not None) == (cost <= rates.GENERAL_FIRST[problem.law])
 
 
 def side_by_side(parts):
