@@ -337,7 +337,7 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
       more than half of all pairs: "dense".
     - "redundant": fewer independent rows than rows, where the rank is cheap to know or the counts alone
       prove it.
-    - "friction": the law. "large mass ratio": from 1000 on.
+    - "friction": the law. "ellipses": contacts of two coefficients. "large mass ratio": from 1000 on.
     - "asymmetric": A is not symmetric. A matrix that is not even nearly so comes from no scene of
       bodies, and gets no word for its shape or masses.
     """
@@ -351,6 +351,8 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
         found.append("redundant")
     if problem.law in ("coulomb", "cone"):
         found.append("friction")
+    if problem.cones.has_ellipse:
+        found.append("ellipses")
     if mechanical and mass_ratio(problem) >= LARGE_RATIO:
         found.append("large mass ratio")
     if not problem.is_symmetric:

@@ -5,6 +5,7 @@ Only the standard library is imported, so that setup.py can run this before anyt
 
 from __future__ import annotations
 
+import re
 import runpy
 import tempfile
 from pathlib import Path
@@ -36,6 +37,7 @@ MODULES = (
     "engine.substep",
     "host.memory",
 )
+HEADER = HERE / "c" / "lavender.h"
 FRONT = [
     HERE / "front" / f"{name}.c"
     for name in ("front", "problem", "judge", "solve", "methods", "pivots", "full")
@@ -44,7 +46,23 @@ FRONT = [
 
 def source_hash(root: Path) -> str:
     """Hash of everything that the library is made of."""
-    return str(CUT["source_hash"](root, MODULES, FRONT))
+    return str(CUT["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
+
+
+def words(header: str) -> str:
+    """`lav_text`, `lav_name` and `lav_outcome`, of the header's enums and what it says behind each error."""
+    errors, methods, outcomes = re.findall(r"enum \{ /\*[^*]*\*/\n(.*?)\n\};", header, re.DOTALL)
+    texts = re.findall(r"(LAV_\w+) = -?\d+,?\s*/\* (.*?) \*/", errors)
+    lists = {"lav_text(int32_t code)": (texts, '"no such code"')}
+    for call, body in (("lav_name(int32_t method)", methods), ("lav_outcome(int32_t outcome)", outcomes)):
+        names = re.findall(r"(LAV_\w+) = ", body)
+        lists[call] = ([(name, name.removeprefix("LAV_").lower()) for name in names], "NULL")
+    out = []
+    for call, (said, otherwise) in lists.items():
+        cases = "".join(f'    case {name}: return "{text}";\n' for name, text in said)
+        out.append(f"\nconst char *{call} {{\n  switch ({call[:-1].split()[-1]}) {{\n{cases}")
+        out.append(f"    default: return {otherwise};\n  }}\n}}\n")
+    return "".join(out)
 
 
 def amalgamate(root: Path, made: Path | None = None) -> str:
@@ -56,6 +74,7 @@ def amalgamate(root: Path, made: Path | None = None) -> str:
         The kernels cannot be translated, or need Python.
     """
     front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
+    front += words(HEADER.read_text(encoding="utf-8"))
     version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
     with tempfile.TemporaryDirectory() as work:
         kernels = CUT["cut"](CUT["translate"](root, MODULES, Path(work), made), front)

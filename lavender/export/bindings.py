@@ -96,6 +96,24 @@ def rust(header: str) -> str:
     return "\n".join([*out, "}", ""])
 
 
+def _typescript(header: str) -> list[str]:
+    """Structs as interfaces: what a caller gives, fields of his choice; what comes back, all of them."""
+    numbers = {"uint64_t": "bigint"}
+    out = []
+    for name in ("lav_problem", "lav_options", "lav_verdict", "lav_result"):
+        fields, given = [], name in ("lav_problem", "lav_options")
+        for kind, field in struct_fields(header, name):
+            if kind == "(*)" or field == "size" or (name, field) == ("lav_options", "method"):
+                continue
+            of = kind.replace("const", "").replace("*", "").strip()
+            said = "Verdict" if of == "lav_verdict" else numbers.get(of, "number")
+            said = f"ArrayLike<{said}>" if "*" in kind else said
+            mark = "?" if given and field not in ("n_blocks", "n_rows") else ""
+            fields.append(f"{field}{mark}: {said};")
+        out.append(f"export interface {name.removeprefix('lav_').title()} {{ {' '.join(fields)} }}")
+    return out
+
+
 def javascript(header: str) -> tuple[str, str]:
     """(module, types) of the constants and of where the fields of structs lie in WebAssembly's 32-bit memory."""
     numbers = constants(header)
@@ -108,7 +126,7 @@ def javascript(header: str) -> tuple[str, str]:
             size = 4 if "*" in kind else total.get(kind) or sizes[kind]
             align = 8 if kind in total else size
             at = (at + align - 1) // align * align
-            layouts[name][field] = ("pointer" if "*" in kind else kind, at)
+            layouts[name][field] = (kind.replace("const ", "").replace(" ", ""), at)
             at += size
         total[name] = (
             (at + 7) // 8 * 8
@@ -125,4 +143,4 @@ def javascript(header: str) -> tuple[str, str]:
     types.append(
         "export const STRUCTS: Record<string, { size: number; fields: Record<string, [string, number]> }>;"
     )
-    return "\n".join([*module, "};", ""]), "\n".join([*types, ""])
+    return "\n".join([*module, "};", ""]), "\n".join([*types, *_typescript(header), ""])

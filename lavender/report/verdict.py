@@ -96,13 +96,13 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
         return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), near)
     final, first = race.ranking[0]
     said = [_head(first, level, what, BY_RESIDUAL), *_sure(race)]
-    code = _told(final, first.score, WAYS[subject.way])
+    code = _told(records, final, first.score, WAYS[subject.way])
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
         f for f in lines(records, "batch") if f.line.solver == first.solver and set(f.runs) <= set(final.runs)
     ]
     for batch in some[:1] if len(final.runs) > 1 else ():
-        code += _told(batch, batch.time, WAYS["batch"])
+        code += _told(records, batch, batch.time, WAYS["batch"])
     plain = lines(records, subject.way, rounds=False)
     for t in times or [a.target for a in subject.quick if a.target <= QUICKER * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
@@ -113,14 +113,14 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
             said += [f"{asked}, nobody gets any of {what} to half of the start's residual."] if times else []
             continue
         said.append(_serves(asked, *quick.ranking[0], t))
-        code += _told(quick.ranking[0][0], quick.ranking[0][0].time, f"for {seconds(t)}")
+        code += _told(records, quick.ranking[0][0], quick.ranking[0][0].time, f"for {seconds(t)}")
         leaders.insert(1, quick.ranking[0][1].solver)
     for budget in sweeps:
         same = [f for f in plain if f.line.mode == "budget" and f.line.max_iter == budget]
         swept = in_time(records, same, math.inf, n)
         if swept is not None:
             said.append(_serves(f"With {count(budget, 'sweep')}", *swept.ranking[0], math.inf))
-            code += _told(swept.ranking[0][0], swept.ranking[0][0].time, count(budget, "sweep"))
+            code += _told(records, swept.ranking[0][0], swept.ranking[0][0].time, count(budget, "sweep"))
     foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
     if foreign and subject.way == "call":
         said.append(
@@ -170,16 +170,31 @@ def _serves(asked: str, final: Final, choice: Choice, limit: float) -> str:
     return f"{said}."
 
 
-def _told(final: Final, time: float, what: str) -> list[str]:
+def _not_in_c(records: Records, final: Final) -> str:
+    """Why the C library does not take what a line was measured on; empty where it does."""
+    for case, record in final.runs.items():
+        info = records.cases[case]
+        if "ellipses" in info.structure:
+            return "the library has no ellipses: give it problem.disk"
+        if record.solver in ("direct", "lemke") and info.law not in ("linear", "lcp"):
+            return f"{record.solver} takes bounded rows alone there"
+        if record.solver in ("pgs", "jacobi") and info.bodies and record.form != "whitened J":
+            return f"{record.solver} takes no bodies there: give it the matrix, problem.csr"
+    return ""
+
+
+def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     """Lines to copy, with what they were timed at."""
     *before, last = final.code
     timed = f"{seconds(time)}, {what}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
-    calls = ", ".join(c_of(final.line))
+    calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
     made = "lavender export c"
     if final.line.solver == "auto":
         made += " --for RECORD, which writes the turns that options are to name"
     in_c = [f"# in C ({made}): {calls}, lav_run(solver, &budget, &result);"] if calls else []
+    if calls and reason:
+        in_c = [f"# not in C: {reason}"]
     if final.line.start == "carried":
         return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
     return [*before, f"{last}  # {timed}", *in_c]

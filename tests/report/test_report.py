@@ -245,6 +245,22 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert "Python's share" in quick.text
 
 
+@pytest.mark.parametrize(
+    ("solver", "law", "structure", "sign"),
+    [
+        ("nncg", "coulomb", ("stack", "friction", "ellipses"), "problem.disk"),
+        ("direct", "coulomb", ("stack", "friction"), "bounded rows alone"),
+        ("pgs", "coulomb", ("stack", "friction"), "problem.csr"),
+        ("nncg", "coulomb", ("stack", "friction"), ""),
+    ],
+)
+def test_no_calls_in_c_for_what_the_library_does_not_take(solver, law, structure, sign):
+    found = records_of(record("a", solver, 4e-3, 1e-7), law={"a": law}, structure={"a": structure})
+    found.cases["a"] = dataclasses.replace(found.cases["a"], bodies=6)
+    (line,) = (line for line in verdict(found).code if " in C" in line)
+    assert (line.startswith("# not in C: ") and sign in line) if sign else "LAV_NNCG" in line
+
+
 @pytest.mark.parametrize(("cases", "solvers", "most"), [(17, 23, 400_000), (100, 14, 1_500_000)])
 def test_a_page_is_small(cases, solvers, most, tmp_path):
     rng = random.Random(1)

@@ -46,24 +46,24 @@ extern "C" {
 
 typedef struct lav_solver lav_solver; /* lies in the caller's memory */
 
-enum { /* what functions return */
-  LAV_OK = 0,
+enum { /* what functions return; `lav_text` has these words */
+  LAV_OK = 0,                 /* no error */
   LAV_ERROR_NULL = -1,        /* a pointer that is needed is null */
-  LAV_ERROR_VERSION = -2,     /* `size` of a struct is not one of this library's */
+  LAV_ERROR_VERSION = -2,     /* size of a struct is not one of this library's: fill it by a lav_default_... function */
   LAV_ERROR_COUNT = -3,       /* a count is negative, too large, or does not fit another */
   LAV_ERROR_NUMBER = -4,      /* a number is NaN or infinite where it must not be */
   LAV_ERROR_BOUNDS = -5,      /* lower > upper, or an infinite bound on the wrong side */
   LAV_ERROR_FRICTION = -6,    /* mu or patch_radius is negative, or a contact with mu has no row to feel it */
-  LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks, or not in this order */
-  LAV_ERROR_INDEX = -8,       /* a column, body or order is out of range, or columns do not ascend */
-  LAV_ERROR_MASS = -9,        /* a mass is negative, or M is not positive definite */
-  LAV_ERROR_ROOM = -10,       /* too little memory; `lav_needed` says how much it takes */
-  LAV_ERROR_UNSUPPORTED = -11, /* this method does not take this form, law or kind; `lav_takes` asks beforehand */
+  LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts */
+  LAV_ERROR_INDEX = -8,       /* a column, body or place in the order is out of range, or columns do not ascend */
+  LAV_ERROR_MASS = -9,        /* an inverse mass is negative, or M is not positive definite */
+  LAV_ERROR_ROOM = -10,       /* too little memory: give as many bytes as lav_needed or lav_room says */
+  LAV_ERROR_UNSUPPORTED = -11, /* this method of this build does not take this form, law or kind of block: lav_takes asks beforehand */
   LAV_ERROR_OPTION = -12,     /* an option is out of its range */
-  LAV_ERROR_BUSY = -13,       /* another thread is in this solver */
-  LAV_ERROR_NO_PROBLEM = -14, /* `lav_set` has not succeeded yet */
+  LAV_ERROR_BUSY = -13,       /* another thread is in this solver: one at a time */
+  LAV_ERROR_NO_PROBLEM = -14, /* no problem is set: lav_set comes first, and must have succeeded */
   LAV_ERROR_SOLVER = -15,     /* this is no solver: not opened, or its memory was written over */
-  LAV_ERROR_SELF_TEST = -16   /* this build does not round as it must: contraction, or fast math */
+  LAV_ERROR_SELF_TEST = -16   /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
 };
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */

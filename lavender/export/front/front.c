@@ -76,62 +76,6 @@ struct lav_solver {
 
 uint32_t lav_version(void) { return (uint32_t)LAV_VERSION_MAJOR << 16 | LAV_VERSION_MINOR; }
 
-const char *lav_text(int32_t code) {
-  switch (code) {
-    case LAV_OK: return "no error";
-    case LAV_ERROR_NULL: return "a pointer that is needed is null";
-    case LAV_ERROR_VERSION: return "size of a struct is not one of this library's: fill it by a lav_default_... function";
-    case LAV_ERROR_COUNT: return "a count is negative, too large, or does not fit another";
-    case LAV_ERROR_NUMBER: return "a number is NaN or infinite where it must not be";
-    case LAV_ERROR_BOUNDS: return "lower is above upper, or an infinite bound stands on the wrong side";
-    case LAV_ERROR_FRICTION: return "mu or patch_radius is negative, or a contact with mu has no row to feel it";
-    case LAV_ERROR_BLOCKS: return "block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts";
-    case LAV_ERROR_INDEX: return "a column, body or place in the order is out of range, or columns do not ascend";
-    case LAV_ERROR_MASS: return "an inverse mass is negative, or M is not positive definite";
-    case LAV_ERROR_ROOM: return "too little memory: give as many bytes as lav_needed or lav_room says";
-    case LAV_ERROR_UNSUPPORTED: return "this method of this build does not take this form, law or kind of block";
-    case LAV_ERROR_OPTION: return "an option is out of its range";
-    case LAV_ERROR_BUSY: return "another thread is in this solver: one at a time";
-    case LAV_ERROR_NO_PROBLEM: return "no problem is set: lav_set comes first, and must have succeeded";
-    case LAV_ERROR_SOLVER: return "this is no solver: not opened, or its memory was written over";
-    case LAV_ERROR_SELF_TEST: return "this build does not round as it must: compile lavender.c with -ffp-contract=off and "
-                                     "without -march=native or fast math";
-    default: return "no such code";
-  }
-}
-
-const char *lav_name(int32_t method) {
-  switch (method) {
-    case LAV_SEQUENTIAL_IMPULSES: return "sequential_impulses";
-    case LAV_PGS: return "pgs";
-    case LAV_SOR: return "sor";
-    case LAV_GAUSS_SEIDEL: return "gauss_seidel";
-    case LAV_JACOBI: return "jacobi";
-    case LAV_BLOCK_GAUSS_SEIDEL: return "block_gauss_seidel";
-    case LAV_ANDERSON: return "anderson";
-    case LAV_NNCG: return "nncg";
-    case LAV_NEWTON: return "newton";
-    case LAV_DIRECT: return "direct";
-    case LAV_LEMKE: return "lemke";
-    case LAV_ADMM: return "admm";
-    case LAV_AUTO: return "auto";
-    default: return NULL;
-  }
-}
-
-const char *lav_outcome(int32_t outcome) {
-  switch (outcome) {
-    case LAV_MAX_ITERATIONS: return "max_iterations";
-    case LAV_CONVERGED: return "converged";
-    case LAV_DIVERGED: return "diverged";
-    case LAV_STALLED: return "stalled";
-    case LAV_FLOOR: return "floor";
-    case LAV_TIME_LIMIT: return "time_limit";
-    case LAV_FAILED: return "failed";
-    default: return NULL;
-  }
-}
-
 int32_t lav_default_problem(int32_t form, lav_problem *out) {
   if (!out) return LAV_ERROR_NULL;
   if (form < LAV_MATRIX || form > LAV_VELOCITIES) return LAV_ERROR_OPTION;
@@ -161,16 +105,18 @@ int32_t lav_default_budget(lav_budget *out) {
   return LAV_OK;
 }
 
-uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) {
-  uint64_t h = seed, bits;
-  int32_t i;
-  for (i = 0; x && i < n; i++) {
-    memcpy(&bits, x + i, 8);
-    h = (h ^ bits) * 0x9E3779B97F4A7C15u;
+static uint64_t hash_bytes(const void *from, uint64_t bytes, uint64_t seed) {
+  const unsigned char *at = (const unsigned char *)from;
+  uint64_t h = seed, x;
+  for (; bytes >= 8; at += 8, bytes -= 8) {
+    memcpy(&x, at, 8);
+    h = (h ^ x) * 0x9E3779B97F4A7C15u;
     h ^= h >> 29;
   }
   return h ^ h >> 32;
 }
+
+uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) { return hash_bytes(x, x && n > 0 ? 8 * (uint64_t)n : 0, seed); }
 
 /* -- what is asked for, looked at ------------------------------------------------------------------------------------- */
 

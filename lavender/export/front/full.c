@@ -42,16 +42,6 @@ struct lav_engine {
 
 static const uint64_t IMAGE = 0x31474D4956414Cu; /* "LAVIMG1" */
 
-static uint64_t hash_bytes(const unsigned char *at, uint64_t bytes) {
-  uint64_t h = 0, x;
-  for (; bytes >= 8; at += 8, bytes -= 8) {
-    memcpy(&x, at, 8);
-    h = (h ^ x) * 0x9E3779B97F4A7C15u;
-    h ^= h >> 29;
-  }
-  return h ^ h >> 32;
-}
-
 static uint64_t image_bytes_of(const int32_t *count) {
   return sizeof(image_t) + 40 + 8 * (uint64_t)count[0] + 4 * (((uint64_t)count[1] + 1) / 2 * 2) + 8 * (uint64_t)count[2];
 }
@@ -69,7 +59,7 @@ static int32_t read_image(const void *image, uint64_t bytes, int32_t *size, int3
     if (size[i] < 0) return LAV_ERROR_COUNT;
   k_engine_lengths(size, count);
   if (count[0] < 0 || count[1] < 0 || count[2] < 0 || image_bytes_of(count) != bytes) return LAV_ERROR_COUNT;
-  return hash_bytes(at + sizeof head, bytes - sizeof head) == head.hash ? LAV_OK : LAV_ERROR_NUMBER;
+  return hash_bytes(at + sizeof head, bytes - sizeof head, 0) == head.hash ? LAV_OK : LAV_ERROR_NUMBER;
 }
 
 int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes) {
@@ -143,7 +133,7 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
     } else k_engine_move(e->size, e->real, e->index, e->keys, size, real, index, keys);
   }
   head.magic = IMAGE;
-  head.hash = hash_bytes(at, *bytes - sizeof head);
+  head.hash = hash_bytes(at, *bytes - sizeof head, 0);
   memcpy(out, &head, sizeof head);
   return LAV_OK;
 }

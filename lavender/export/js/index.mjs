@@ -2,8 +2,7 @@
 import { LAV_BODIES, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
 export * from './header.mjs';
 
-const ARRAYS = { int32_t: Int32Array, double: Float64Array, uint64_t: BigUint64Array };
-const WHOLE = new Set(['block_ptr', 'kind', 'order', 'index_ptr', 'index', 'mass_ptr', 'mass_index', 'joint_body', 'contact_body']);
+const ARRAYS = { 'int32_t*': Int32Array, 'double*': Float64Array, 'uint64_t*': BigUint64Array };
 
 export class LavenderError extends Error {
   constructor(code, text) {
@@ -52,7 +51,7 @@ export class Library {
   }
   hash(x, seed = 0n) {
     const at = this.take(8 * x.length + 8);
-    this.view('double', at, x.length).set(x);
+    this.view('double*', at, x.length).set(x);
     const out = BigInt.asUintN(64, this.c.lav_hash(at, x.length, seed));
     this.top = at;
     return out;
@@ -95,18 +94,15 @@ export class Solver {
     Object.assign(this, { library, c: library.c, at: 0, bytes: 0, rows: 0, speeds: 0 });
     for (const name of ['options', 'budget', 'result', 'problem']) this[name] = library.struct(`lav_${name}`);
     library.check(this.c.lav_default_options(method, this.options.at));
-    for (const [key, value] of Object.entries(options)) this.options.set(key, value);
     this.pointer = library.take(16);
     this.arrays = new Map(); // name -> place and room of the copy that the module reads
+    this.fill(this.options, options);
   }
   /** A problem: counts by name, arrays of numbers by name, as in lavender.h. */
   set(given) {
     const q = this.problem;
     this.library.check(this.c.lav_default_problem(given.form ?? LAV_BODIES, q.at));
-    for (const [key, value] of Object.entries(given)) {
-      if (typeof value === 'number') q.set(key, value);
-      else if (value != null) q.set(key, this.copy(key, value));
-    }
+    this.fill(q, given);
     if (!this.at) this.open(0n);
     let code = this.c.lav_set(this.at, q.at);
     for (let turn = 0; code === LAV_ERROR_ROOM && turn < 40; turn++) {
@@ -117,8 +113,14 @@ export class Solver {
     this.rows = q.get('n_rows');
     this.speeds = q.get('form') === LAV_BODIES ? 6 * q.get('n_bodies') : q.get('n_velocities');
   }
-  copy(key, values) {
-    const kind = key === 'key' ? 'uint64_t' : WHOLE.has(key) ? 'int32_t' : 'double', bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
+  fill(struct, given) {
+    for (const [key, value] of Object.entries(given)) {
+      if (value != null) struct.set(key, typeof value === 'object' ? this.copy(key, value, struct.fields[key]?.[0]) : value);
+    }
+  }
+  copy(key, values, kind) {
+    if (!(kind in ARRAYS)) throw new TypeError(`${key} is no array of lavender.h: a number is needed, or another name`);
+    const bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
     let held = this.arrays.get(key);
     if (!held || held.bytes < bytes) this.arrays.set(key, (held = { at: this.library.take(2 * bytes + 8), bytes: 2 * bytes }));
     this.library.view(kind, held.at, values.length).set(values);
@@ -126,10 +128,10 @@ export class Solver {
   }
   open(needed) {
     this.library.check(this.c.lav_room(this.problem.at, this.options.at, this.pointer));
-    const wanted = this.library.view('uint64_t', this.pointer, 1)[0], bytes = wanted > needed ? wanted : needed;
+    const wanted = this.library.view('uint64_t*', this.pointer, 1)[0], bytes = wanted > needed ? wanted : needed;
     const memory = this.library.take(Number(bytes) + 16);
     this.library.check(this.c.lav_open(memory, bytes + 16n, this.problem.at, this.options.at, this.pointer));
-    this.at = this.library.view('int32_t', this.pointer, 1)[0];
+    this.at = this.library.view('int32_t*', this.pointer, 1)[0];
   }
   run({ iterations = 1000, tol = 1e-6 } = {}) {
     this.library.check(this.c.lav_default_budget(this.budget.at));
@@ -141,7 +143,7 @@ export class Solver {
   }
   numbers(call, n) {
     const at = this.library.take(8 * n + 8);
-    const code = call(this.at, at, n), out = this.library.view('double', at, n).slice();
+    const code = call(this.at, at, n), out = this.library.view('double*', at, n).slice();
     this.library.top = at;
     this.library.check(code);
     return out;
