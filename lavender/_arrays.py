@@ -118,7 +118,7 @@ def number(
 def whole_number(what: str, value: object, low: int = 0, high: int | None = 2**31 - 1) -> int:
     """`value` as an int in [low, high], of any size with None."""
     if (
-        isinstance(value, bool)
+        isinstance(value, (bool, np.timedelta64))
         or not isinstance(value, (int, np.integer))
         or value < low
         or (high is not None and value > high)

@@ -32,7 +32,7 @@ from lavender.outcome import (
     finish,
 )
 from lavender.problem import Problem, check_problem
-from lavender.registry import SolverSpec, State, get
+from lavender.registry import SMALL_ROWS, SolverSpec, State, get
 from lavender.residuals import Residual, reference, residual, told, unstretched
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
@@ -470,8 +470,8 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
     """
     if type(problem) is not Problem or not isinstance(tol, float) or not 0.0 < tol < math.inf:
         return None
-    if problem.cones.has_ellipse:
-        return None
+    if problem.cones.has_ellipse or (problem.m > SMALL_ROWS and problem.generalized is None):
+        return None  # of islands, which may take long: who hears Ctrl-C asks for these
     start = perf_counter()
     if impulse is None:
         given = problem.guess
@@ -549,7 +549,9 @@ def _check_problem(problem: Problem, spec: SolverSpec) -> None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(
+        value, (bool, np.timedelta64)
+    )
 
 
 def check_budget(

@@ -60,7 +60,7 @@ def advised(advice: Advice, in_time: bool) -> Cell:
             f"worst: {best.hardest}" + (f"; ≈ {title}" if ties else ""),
         )
     mark = "warn" if best.solved < best.cases else ""
-    text = say(best.score) + share(best.solved, best.cases)
+    text = ("to " if in_time else "") + say(best.score) + share(best.solved, best.cases)
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 

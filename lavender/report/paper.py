@@ -21,7 +21,7 @@ from lavender.report.curves import LINES, Figure, figures
 from lavender.report.draw import matplotlib_figure
 from lavender.report.moved import working
 from lavender.report.style import looks
-from lavender.report.table import Table, latex, tex
+from lavender.report.table import Cell, Table, latex, tex
 from lavender.report.tables.advice import NOISE
 from lavender.report.text import count, seconds
 from lavender.report.verdict import verdict
@@ -99,7 +99,7 @@ def _tables(records: Records, times: Sequence[float]) -> str:
     lines = tables.advice(records, times)
     advice = contents.advice_table(records, lines, ())
     rows = [
-        [row[0], str(line.size), *row[1 : len(advice.heads)]]
+        [str(row[0]), str(line.size), *(replace(c, after="") for c in row[1:] if isinstance(c, Cell))]
         for row, line in zip(advice.rows, lines, strict=True)
     ]
     made = [latex(Table(["structure", "cases", *advice.heads[1:]], rows), caption, "recommended")]

@@ -78,7 +78,7 @@ class Table:
 
 def markdown(table: Table) -> list[str]:
     """Lines of Markdown."""
-    lines = ["| " + " | ".join(table.heads) + " |", "|---" * len(table.heads) + "|"]
+    lines = ["| " + " | ".join(map(plain, table.heads)) + " |", "|---" * len(table.heads) + "|"]
     return lines + ["| " + " | ".join(map(plain, row)) + " |" for row in table.texts]
 
 
@@ -98,7 +98,8 @@ _SPECIAL = {
 
 def tex(text: str) -> str:
     """Text as LaTeX prints it, with no meaning of its own."""
-    return re.sub(r"[\\~^&%$#_{}µ≈✗–]", lambda found: _SPECIAL[found[0]], " ".join(text.split()))
+    made = re.sub(r"[\\~^&%$#_{}µ≈✗–]", lambda found: _SPECIAL[found[0]], " ".join(text.split()))
+    return f"{{}}{made}" if made.startswith(("[", "*")) else made  # no argument of the line's end before it
 
 
 def latex(table: Table, caption: str, label: str) -> str:

@@ -36,7 +36,7 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 ISLAND = {"coulomb": 150, "cone": 12}
 SWEPT = 16  # sweeps of an island at most, before its factors
 IN_ALL = 10  # times as long, as sweeps and factors of all islands mostly take
-LONGEST = 2.5e8  # ns of SWEPT sweeps of all islands at most: nobody looks for Ctrl-C in between
+LONGEST = 2.5e8  # ns of SWEPT sweeps of all islands at most
 # All that `general_cost` reads, by law.
 GENERAL = (
     rates.GENERAL_START,
@@ -142,7 +142,7 @@ class Few:
             chain = prepared(problem) if problem.m <= SMALL_ROWS or self.sweeps else None
             if chain is None or not (self.pivots if chain.pivots else self.sweeps):
                 return None
-            found = chain.run(impulse, tol, self.looks, WARM, self.looks) or False
+            found = chain.run(impulse, tol, self.looks, WARM, self.looks)
         if found is False:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found or None
@@ -189,7 +189,7 @@ class Few:
             return Claim(Status.CONVERGED, done, work, said("anderson", work))
         factorisations, driven, count = more
         message = said(f"anderson on {count} islands", work)
-        if driven:
+        if factorisations:
             work["factorisations"] = factorisations
             message += " -> " + said(f"newton on {driven} islands", {"factorisations": factorisations})
         return Claim(Status.CONVERGED, done, work, message)

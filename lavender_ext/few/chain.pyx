@@ -96,7 +96,7 @@ cdef class Chain:
 
         look: something else comes next. Is `impulse` a solution? And where its residual is above `warm`, pivots start
         from `start`. follow: Lemke's path where exchanges are stuck; and what pivots find is good where it is below
-        tol, not to rounding alone. None where it does not end below tol, or another thread is here.
+        tol, not to rounding alone. False where it does not end below tol, None where another thread is here.
 
         What was done is None where `impulse` is the solution, else counts: of pivots (rounds, whether swept,
         refinements, factorisations, pivots, shifts, rank of a singular linear system or 0, pivots of Lemke's path); of
@@ -137,10 +137,10 @@ cdef class Chain:
             ended = pivot(t, &start[0])
         if not ended:
             if not follow or t.linear or t.solved:
-                return None
+                return False
             path = self.followed(own)
             if path < 0:
-                return None
+                return False
         memcpy(&start[0], t.best, t.s.n * sizeof(double))
         return Judged(self.data, own), (t.done, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts,
                                         t.rank, path)
@@ -185,5 +185,5 @@ cdef class Chain:
             self.prepared is not None, 0, space, self.order, self.split, 0, self.rng)
         found = Judged(self.data, own)
         if not found.relative <= tol:
-            return None
+            return False
         return found, (done, sweeps, restarts)

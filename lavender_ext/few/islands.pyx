@@ -7,6 +7,7 @@ Island i of n, E0_i its error of doing nothing, has met its share where
 which for all of them together is tol by both measures. An island with the bytes of the one before has its answer. One
 that misses its share ends the call: the caller starts again the long way.
 """
+from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.stdlib cimport free, malloc
@@ -34,7 +35,8 @@ cdef enum:
     SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them,
     AGAIN = 8
     STEPS = 120                 # and in all
-    MOST_FACTORED = 1000000000  # multiply-adds of all islands, about a second: nobody looks for Ctrl-C in between
+    MOST_FACTORED = 1000000000  # multiply-adds of all islands, about a second
+    LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
     HOPED = 4                   # times the rounds left, that what the last one gained may promise an end in
 
 
@@ -209,6 +211,8 @@ cdef inline bint solve_island(island_t* s, sweep_data_t* c, ask_t* o, room_t* r)
     do_nothing(&s.p, s.answer, s.w)
     judge_into(&s.p, &s.a, NULL, False, s.answer, s.w, s.error, NULL, False, &nothing)
     own = nothing.energy
+    if own == 0.0 and nothing.velocity == 0.0:
+        return True     # doing nothing is right
     e0, v0 = sqrt(0.5 * (own * own + o.e0 * o.e0)), o.v0
     memcpy(s.swept, s.lam, m * sizeof(double))
     c.turn = 0
@@ -243,7 +247,7 @@ cdef inline bint solve_island(island_t* s, sweep_data_t* c, ask_t* o, room_t* r)
 
 
 cdef class Islands:
-    """A problem under friction that divides; `run` serves one thread at a time.
+    """A problem under friction that divides; `run` only reads it.
 
     Parameters
     ----------
@@ -264,7 +268,6 @@ cdef class Islands:
     cdef readonly int count
     cdef object start, label
     cdef int most
-    cdef bint busy
 
     def __init__(self, Data data, Data matrix, start, label, int count, int most):
         self.data, self.matrix, self.start, self.label = data, matrix, start, label
@@ -273,8 +276,6 @@ cdef class Islands:
     def run(self, impulse, double tol, bint look, double warm, bint follow=False):
         """As `Chain.run`; counts are (longest, sweeps, undone, factorisations, islands that asked for these, islands)."""
         cdef Judged found
-        if self.busy:
-            return None
         if impulse is None or same_bits(impulse, self.start):
             impulse = self.start
             if self.data.start_relative <= tol:
@@ -286,15 +287,11 @@ cdef class Islands:
             if not found.relative < 1.0:
                 impulse = self.start
         own = impulse.copy()
-        self.busy = True
-        try:
-            counts = self.solve(own, tol)
-        finally:
-            self.busy = False
+        counts = self.solve(own, tol)
         if counts is None:
-            return None
+            return False
         found = Judged(self.data, own)
-        return (found, counts) if found.relative <= tol else None
+        return (found, counts) if found.relative <= tol else False
 
     cdef solve(self, double[::1] own, double tol):
         cdef const int32_t[::1] label = self.label, block, first
@@ -308,6 +305,8 @@ cdef class Islands:
         cdef sweep_data_t c
         cdef room_t r = room_t(0, 0, NULL, NULL)
         cdef uint64_t rng = 0
+        cdef int64_t swept
+        cdef double factored, unheard = 0.0     # multiply-adds
         cdef bint good = True
         cdef const int32_t[::1] prepared_at
         cdef const double[::1] prepared
@@ -335,24 +334,32 @@ cdef class Islands:
             prepared_at, prepared = gauss_seidel.prepare(self.matrix)
             c.start, c.g = &at[0], &prepared[0]
         two[1].n_numbers = -1
-        with nogil:
-            for i in range(n):
-                s = &two[i % 2]
-                m, k, nnz = size[i, 0], first[i + 1] - first[i], size[i, 1]
-                lay(s, &numbers[(i % 2) * each], &marks[(i % 2) * whole], m, k, nnz)
-                cut(s, p, a, &block[first[i]], &own[0], &place[0])
-                if same(s, &two[1 - i % 2]):
-                    memcpy(s.answer, two[1 - i % 2].answer, m * sizeof(double))
-                else:
-                    for j in range(k if c.exact else 0):
-                        at[j] = prepared_at[block[first[i] + j]]
-                    c.blocks, c.csr = &s.p, &s.a
-                    good = solve_island(s, &c, &o, &r)
-                    if not good:
-                        break
-                for j in range(k):
-                    q = block[first[i] + j]
-                    memcpy(&own[p.ptr[q]], s.answer + s.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
-        free(r.index)
-        free(r.real)
+        try:
+            with nogil:
+                for i in range(n):
+                    s = &two[i % 2]
+                    m, k, nnz = size[i, 0], first[i + 1] - first[i], size[i, 1]
+                    lay(s, &numbers[(i % 2) * each], &marks[(i % 2) * whole], m, k, nnz)
+                    cut(s, p, a, &block[first[i]], &own[0], &place[0])
+                    if same(s, &two[1 - i % 2]):
+                        memcpy(s.answer, two[1 - i % 2].answer, m * sizeof(double))
+                    else:
+                        for j in range(k if c.exact else 0):
+                            at[j] = prepared_at[block[first[i] + j]]
+                        c.blocks, c.csr = &s.p, &s.a
+                        swept, factored = o.swept, o.factored
+                        good = solve_island(s, &c, &o, &r)
+                        if not good:
+                            break
+                        unheard += o.factored - factored + <double>nnz * (o.swept - swept)
+                        if unheard > LISTEN:
+                            unheard = 0.0
+                            with gil:
+                                PyErr_CheckSignals()
+                    for j in range(k):
+                        q = block[first[i] + j]
+                        memcpy(&own[p.ptr[q]], s.answer + s.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
+        finally:
+            free(r.index)
+            free(r.real)
         return (o.longest, o.swept, o.undone, o.factorisations, o.driven, n) if good else None
