@@ -101,7 +101,7 @@ def record(folder, steps=STEPS, scenes=SCENES):
     packed = [vector for i, problem in enumerate(given) for vector in solved(problem, i)]
     vectors.write_packed(folder, packed)
     inputs = {
-        "inputs of scenes": b"".join(start for start, _ in made),
+        "inputs of scenes": numbers(steps) + b"".join(start for start, _ in made),
         "inputs of problems": b"".join(
             vectors.pack_problem(problem, "block_gauss_seidel") for problem in given
         ),
