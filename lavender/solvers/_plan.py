@@ -48,7 +48,7 @@ _GIVEN = {
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     "rows": _GIVEN
     | {"lcp": ("anderson", "direct", "newton"), "coulomb": ("anderson", "newton", "relaxation")},
-    "matrix": _GIVEN,
+    "matrix": _GIVEN | {"cone": ("anderson", "newton", "admm")},
     "generalized": {
         "linear": ("newton", "direct", "anderson", "newton over rows"),
         "lcp": ("newton", "anderson", "direct"),

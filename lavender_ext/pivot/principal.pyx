@@ -395,6 +395,18 @@ cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32
     renew(s)
 
 
+cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t band, const int32_t* order, double tiny,
+                                    const double* start, int32_t sweeps, int32_t n, double* real,
+                                    int32_t* whole) noexcept nogil:
+    """A whole solve for a host without Python, in room of 6 m + m (band + 1) + 1 and 2 m numbers; x, w come first."""
+    cdef pivoting_t s
+    cdef int32_t swept, code
+    lay_out(&s, a, p, band, order, tiny, real, whole)
+    code = pivots_solve(&s, start, sweeps, n, &swept)
+    pivots_slack(&s)
+    return code
+
+
 cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, double tiny, double* real,
                     int32_t* whole) noexcept nogil:
     lay_out(s, a, p, band, NULL, tiny, real, whole)

@@ -351,10 +351,16 @@ def test_the_floor_of_a_tiny_matrix_does_not_underflow():
     assert (tiny.relative, tiny.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-12)
 
 
+@pytest.mark.parametrize("form", ["rows", "coulomb", "cone", "rolling"])
 @given(seed=seeds)
-def test_the_size_of_the_numbers_changes_no_residual(seed):
+@settings(max_examples=40)
+def test_the_size_of_the_numbers_changes_no_residual(form, seed):
     """Powers of two, so that A, b and lambda keep their bits: squares of e, w or d alone would vanish or overflow."""
-    problem = random_lcp(seed, boxed=False)
+    if form == "rows":
+        problem = random_lcp(seed, boxed=False)
+    else:  # a disk, a twist, what rolls: pairs of rows have one speed
+        friction, rolling = ("coulomb", True) if form == "rolling" else (form, False)
+        problem = as_matrix(random_contact_problem(seed, friction, joints=0, rolling=rolling))
     lam = np.random.default_rng(seed).normal(size=problem.m)
     usual = lv.residual(problem, lam)
     for a, b in (
@@ -367,10 +373,16 @@ def test_the_size_of_the_numbers_changes_no_residual(seed):
         (900, 900),
         (-300, -990),
     ):
-        scaled = lv.Problem.lcp(problem.matrix * 2.0**a, problem.b * 2.0**b)
+        scaled = lv.Problem(
+            problem.b * 2.0**b, problem.cones, problem.csr * 2.0**a, friction=problem.friction
+        )
         got = lv.residual(scaled, lam * 2.0 ** (b - a))
         # A dozen sums of positive terms: 1e-13 is a hundred roundings.
         assert (got.relative, got.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-13)
+        assert got.velocity / got.velocity_start == pytest.approx(
+            usual.velocity / usual.velocity_start, rel=1e-13
+        )
+        assert got.worst_row == usual.worst_row
 
 
 def test_the_inequality_between_two_points_holds():
