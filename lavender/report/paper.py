@@ -98,7 +98,7 @@ def _tables(records: Records, times: Sequence[float]) -> str:
     )
     lines = tables.advice(records, times)
     advice = contents.advice_table(records, lines, ())
-    rows = [
+    rows: list[list[str | Cell]] = [
         [str(row[0]), str(line.size), *(replace(c, after="") for c in row[1:] if isinstance(c, Cell))]
         for row, line in zip(advice.rows, lines, strict=True)
     ]
