@@ -99,7 +99,11 @@ def _tables(records: Records, times: Sequence[float]) -> str:
     lines = tables.advice(records, times)
     advice = contents.advice_table(records, lines, ())
     rows: list[list[str | Cell]] = [
-        [str(row[0]), str(line.size), *(replace(c, after="") for c in row[1:] if isinstance(c, Cell))]
+        [
+            str(row[0]),
+            str(line.size),
+            *(replace(c, after="") for c in row[1 : len(advice.heads)] if isinstance(c, Cell)),
+        ]
         for row, line in zip(advice.rows, lines, strict=True)
     ]
     made = [latex(Table(["structure", "cases", *advice.heads[1:]], rows), caption, "recommended")]
