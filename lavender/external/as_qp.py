@@ -188,7 +188,7 @@ def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
     rows = problem.rows
     if form == "velocity" and rows is None:
         raise CapabilityError(
-            "form='velocity' needs a problem with rows (Problem.from_rows); this one was given as a matrix"
+            "form='velocity' needs a problem with rows (Problem.from_rows) and without ellipses; this one is a matrix"
         )
     if form != "auto":
         return form

@@ -78,7 +78,7 @@ class Table:
 
 def markdown(table: Table) -> list[str]:
     """Lines of Markdown."""
-    lines = ["| " + " | ".join(map(plain, table.heads)) + " |", "|---" * len(table.heads) + "|"]
+    lines = ["| " + " | ".join(table.heads) + " |", "|---" * len(table.heads) + "|"]
     return lines + ["| " + " | ".join(map(plain, row)) + " |" for row in table.texts]
 
 

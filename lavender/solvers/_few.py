@@ -137,7 +137,7 @@ class Few:
         if problem.generalized is not None:
             if self.gate is None:
                 return None
-            found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM)
+            found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM) or False
         else:
             chain = prepared(problem) if problem.m <= SMALL_ROWS or self.sweeps else None
             if chain is None or not (self.pivots if chain.pivots else self.sweeps):

@@ -98,6 +98,8 @@ class Structure:
         dense = dense_factor(m)
         if p.rows is not None and p.rows.n_bodies:
             return min(dense, weights.BAND * m * self._body_band() ** 2, self._sparse(self.entries))
+        if p.generalized is not None and p.law != "linear":
+            return min(dense, self._sparse(self.entries))
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
         if form == "band":
             return weights.BAND * m * float(min(band, m) + 1) ** 2

@@ -28,7 +28,8 @@ cdef enum:
     SOLVED = 1
 
 cdef enum:
-    STEPS = 64                  # of newton
+    STEPS = 64                  # of newton in all, and
+    OF_EACH = 4                 # for each island
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
@@ -109,7 +110,7 @@ cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) n
 cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, end, i
+    cdef int32_t m = j.p.n_rows, end, i, steps
     cdef bint cold = j.cold
     if j.made.n_empty:
         return
@@ -140,9 +141,10 @@ cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double
                 if j.lam[i] != j.both[i]:
                     cold = False
                     break
-    aim_at(&f, tol, STEPS, j.begin[0], j.begin[1])
+    steps = STEPS + OF_EACH * f.n_islands
+    aim_at(&f, tol, steps, j.begin[0], j.begin[1])
     end = descend_all(&f, j.lam, cold)
-    j.counts[0] = STEPS - f.steps
+    j.counts[0] = steps - f.steps
     if end != DONE:
         return
     j.counts[1] = f.factorisations

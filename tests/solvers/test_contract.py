@@ -144,7 +144,9 @@ def test_every_form_of_a_solver_finds_the_same(name):
             continue  # round cones have one form
         if kind == "boxes" and law not in registry.get(name).laws:
             continue  # handed on as bounded rows of a matrix
-        for form in ("impulse", "velocity"):
+        for form in (
+            ("impulse",) if kind == "ellipses" else ("impulse", "velocity")
+        ):  # which are solved as a matrix
             tol = 1e-8 if name in OURS else 1e-6
             solution = lv.solve(forms[0], name, tol=tol, form=form)
             assert solution.solver.form.startswith(form)
