@@ -6,7 +6,7 @@ function (daqp, quadprog, scs) have that in it, too.
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from time import perf_counter
@@ -25,11 +25,14 @@ OWN = {
     "highs": ("highspy:Highs.run",),
     "osqp": ("osqp:OSQP.solve",),
     "piqp": ("piqp:DenseSolver.solve", "piqp:SparseSolver.solve"),
-    "proxqp": ("proxsuite.proxqp.dense:QP.solve", "proxsuite.proxqp.sparse:QP.solve"),
+    "proxqp": (
+        "proxsuite.proxqp.dense:QP.solve", "proxsuite.proxqp.dense:solve",
+        "proxsuite.proxqp.sparse:QP.solve", "proxsuite.proxqp.sparse:solve",
+    ),
     "qpalm": ("qpalm:Solver.solve",),
     "quadprog": ("qpsolvers.solvers.quadprog_:solve_qp",),
     "scs": ("qpsolvers.solvers.scs_:solve",),
-}
+}  # fmt: skip
 
 
 class _Watched:
@@ -72,7 +75,7 @@ def own_time(
         for place in OWN.get(solver, ()):
             path, _, name = place.partition(":")
             name, _, method = name.partition(".")
-            module = importlib.import_module(path)
+            module = pkgutil.resolve_name(path)
             true = getattr(module, name)
 
             def watched(*args: Any, true: Any = true, method: str = method, **kwargs: Any) -> Any:
