@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
+from scipy.linalg import block_diag
 
 import lavender as lv
-from lavender import residuals
+from lavender import residuals, suite
 from lavender.certificates import check_certificate
 from lavender.measures import natural_map, qp_residual
 from lavender.residuals import judged, known, remember
@@ -265,6 +266,26 @@ def test_floor_of_rows_is_a_little_above_that_of_the_matrix(seed):
     ratio = rows.floor * rows.energy_start / (matrix.floor * matrix.energy_start)
     assert ratio > 0.1
     assert ratio < 100.0
+
+
+@pytest.mark.parametrize(
+    "problem", [suite.case("four_bar(tilt=0.3)").problem, suite.case("ring(n=8)").problem]
+)
+def test_floor_of_joints_is_that_of_the_formula(problem):
+    """F = 2^-53 (|J| |M^-1| |J|^T |lam| + c |lam| + |b|), by dense matrices."""
+    rows = problem.rows
+    assert rows.n_joints == problem.n_blocks
+    lam = np.random.default_rng(0).normal(size=problem.m)
+    inv_mass = block_diag(
+        *(w for i in range(rows.n_bodies) for w in (rows.inv_mass[i] * np.eye(3), rows.inv_inertia[i]))
+    )
+    jac = np.abs(rows.jacobian(problem.cones).toarray())
+    size = jac @ (np.abs(inv_mass) @ (jac.T @ np.abs(lam)))
+    f = 2.0**-53 * (size + problem.compliance * np.abs(lam) + np.abs(problem.b))
+    found = lv.residual(problem, lam)
+    energy = np.sqrt(np.sum(f**2 / problem.d)) / found.energy_start
+    velocity = np.max(f * problem.metric.weight / problem.d) / found.velocity_start
+    assert found.floor == pytest.approx(max(energy, velocity), rel=1e-12)  # sums in another order
 
 
 # -- other measures --------------------------------------------------------------------------------------
