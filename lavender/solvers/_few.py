@@ -36,6 +36,7 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 ISLAND = {"coulomb": 150, "cone": 12}
 SWEPT = 16  # sweeps of an island at most, before its factors
 IN_ALL = 10  # times as long, as sweeps and factors of all islands mostly take
+FACTORED = 0.05  # ns of a multiply-add of factors of islands
 LONGEST = 2.5e8  # ns of SWEPT sweeps of all islands at most
 # All that `general_cost` reads, by law.
 GENERAL = (
@@ -67,6 +68,9 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
     else:
         per = sweep_cost(problem)
         cost = (first_look(per) if problem.m <= SMALL_ROWS else IN_ALL * SWEPT) * per
+        if problem.m > SMALL_ROWS and 4e-9 * cost <= time_limit:
+            parts = prepared(problem)
+            cost += FACTORED * (0.0 if parts is None else parts.most_factored)
     return 4e-9 * cost <= time_limit
 
 
@@ -143,6 +147,8 @@ class Few:
             if chain is None or not (self.pivots if chain.pivots else self.sweeps):
                 return None
             found = chain.run(impulse, tol, self.looks, WARM, self.looks)
+            if found is None:  # another thread has its room
+                found = _make(problem).run(impulse, tol, self.looks, WARM, self.looks)  # type: ignore[union-attr]
         if found is False:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found or None

@@ -32,10 +32,9 @@ from lavender_ext.newton.plan cimport CERTIFICATE, MORE
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
     FIRST = 4                   # before the first look
-    SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them,
+    SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them; of each in the mean,
     AGAIN = 8
     STEPS = 120                 # and in all
-    MOST_FACTORED = 1000000000  # multiply-adds of all islands, about a second
     LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
     HOPED = 4                   # times the rounds left, that what the last one gained may promise an end in
 
@@ -63,7 +62,8 @@ cdef struct ask_t:
     int64_t swept               # what was done in all
     int64_t undone
     int64_t factorisations
-    double factored             # multiply-adds of them
+    double factored             # multiply-adds of them,
+    double most_factored        # and at most
     int32_t driven              # islands that asked for factors
     int32_t longest             # sweeps and factorisations of one island
 
@@ -243,7 +243,7 @@ cdef inline bint solve_island(island_t* s, sweep_data_t* c, ask_t* o, room_t* r)
     o.factored += n.said.factorisations * (<double>m * m * m)
     if c.turn + n.said.factorisations > o.longest:
         o.longest = c.turn + n.said.factorisations
-    return now <= o.tol and o.factored <= MOST_FACTORED
+    return now <= o.tol and o.factored <= o.most_factored
 
 
 cdef class Islands:
@@ -266,12 +266,15 @@ cdef class Islands:
     cdef Data data, matrix
     cdef readonly bint pivots
     cdef readonly int count
+    cdef readonly double most_factored
     cdef object start, label
     cdef int most
 
     def __init__(self, Data data, Data matrix, start, label, int count, int most):
         self.data, self.matrix, self.start, self.label = data, matrix, start, label
         self.count, self.most = count, most
+        rows = np.bincount(label, np.diff(np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)))
+        self.most_factored = SHORT * float(rows @ rows**2)
 
     def run(self, impulse, double tol, bint look, double warm, bint follow=False):
         """As `Chain.run`; counts are (longest, sweeps, undone, factorisations, islands that asked for these, islands)."""
@@ -299,7 +302,7 @@ cdef class Islands:
         cdef const csr_t* a = &self.matrix.csr
         cdef int32_t i, j, q, m, k, nnz, n = self.count, most_m = 0, most_k = 0, most_nnz = 0
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>n), self.data.start_velocity, self.most, has_wide(),
-                             0, 0, 0, 0.0, 0, 0)
+                             0, 0, 0, 0.0, self.most_factored, 0, 0)
         cdef island_t two[2]
         cdef island_t* s
         cdef sweep_data_t c

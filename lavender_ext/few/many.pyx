@@ -29,7 +29,8 @@ cdef enum:
 
 cdef enum:
     STEPS = 64                  # of newton in all, and
-    OF_EACH = 4                 # for each island
+    OF_EACH = 4                 # for each island; as many as `newton` has by default at most
+    MOST = 1500
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
@@ -141,7 +142,9 @@ cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double
                 if j.lam[i] != j.both[i]:
                     cold = False
                     break
-    steps = STEPS + OF_EACH * f.n_islands
+    steps = MOST
+    if f.n_islands < (MOST - STEPS) / OF_EACH:
+        steps = STEPS + OF_EACH * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
     end = descend_all(&f, j.lam, cold)
     j.counts[0] = steps - f.steps

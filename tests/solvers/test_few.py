@@ -315,16 +315,32 @@ def test_islands_where_doing_nothing_is_right_from_a_warm_start():
     assert not found.impulse[:12].any()
 
 
-def test_islands_of_one_problem_in_two_threads_have_the_same_bits():
+@pytest.mark.parametrize("form", ["islands", "cone", "singular"])
+def test_one_problem_in_two_threads_has_the_same_bits(form):
     """What another thread has in hand is no attempt in vain."""
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(4)
+    if form == "islands":
         parts = [g @ g.T for g in rng.normal(size=(12, 9, 6))]
         problem = lv.Problem.contact(block_diag(parts), rng.normal(size=108), np.full(36, 0.3))
-        expected = facts(lv.solve(problem))
-        for solution in lv.solve_many([problem] * 6, threads=2):
-            assert facts(solution) == expected
-        assert facts(lv.solve(problem)) == expected
+    elif form == "cone":
+        g = rng.normal(size=(60, 63))
+        problem = lv.Problem.contact(g @ g.T, rng.normal(size=60), mu=0.5, friction="cone")
+    else:
+        g = rng.normal(size=(60, 30))
+        problem = lv.Problem.lcp(g @ g.T, g @ (g.T @ np.abs(rng.normal(size=60))))
+    expected = facts(lv.solve(problem))
+    for solution in lv.solve_many([problem] * 100, threads=2):
+        assert facts(solution) == expected
+    assert facts(lv.solve(problem)) == expected
+
+
+def test_many_islands_that_each_take_a_few_factors_are_one_call():
+    rng = np.random.default_rng(0)
+    turned = [np.linalg.qr(g)[0] for g in rng.normal(size=(70, 150, 150))]
+    parts = [(q * np.logspace(0.0, -6.0, 150)) @ q.T for q in turned]
+    whole = block_diag(parts, format="csr")
+    problem = lv.Problem.contact(whole, rng.normal(size=whole.shape[0]), np.full(whole.shape[0] // 3, 0.5))
+    assert "newton on 70 islands" in lv.solve(problem).message
 
 
 def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
@@ -369,3 +385,13 @@ def test_one_call_has_steps_for_every_island_of_velocities():
     )
     found = solve_first(problem.metric, None, 1e-6, AUTO.gate, general.ROOM)
     assert found and found[1][0] > 64
+
+
+def test_the_one_call_keeps_to_what_newton_does_by_default():
+    """1,500 arms, of which some take two steps: more in all than `newton` has."""
+    rng = np.random.default_rng(1)
+    arms = [(rng.normal(size=(1, 3)), q @ q.T) for q in rng.normal(size=(1500, 3, 5))]
+    jac, mass = (block_diag(x, format="csr") for x in zip(*arms, strict=True))
+    v = 2.0 * rng.normal(size=4500)
+    problem = lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.contacts(0.0, tangents=0, count=1500))
+    assert check(problem, "newton").iterations <= registry.get("newton").max_iter
