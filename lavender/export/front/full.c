@@ -71,7 +71,7 @@ int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes
 }
 
 int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_t image_bytes, lav_engine **out) {
-  const unsigned char *at = (const unsigned char *)image + sizeof(image_t) + 40;
+  const unsigned char *at;
   lav_engine *e;
   int32_t size[10], count[3];
   uint64_t skip;
@@ -86,6 +86,7 @@ int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_
   e->real = (double *)(void *)(e + 1);
   e->keys = (uint64_t *)(void *)(e->real + count[0]);
   e->index = (int32_t *)(void *)(e->keys + count[2]);
+  at = (const unsigned char *)image + sizeof(image_t) + 40;
   memcpy(e->real, at, 8 * (size_t)count[0]);
   at += 8 * (size_t)count[0];
   memcpy(e->index, at, 4 * (size_t)count[1]);
@@ -108,7 +109,7 @@ int32_t lav_engine_step(lav_engine *engine, int32_t substeps, double *values) {
 int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint64_t *bytes) {
   lav_engine *e = engine;
   int32_t size[10], count[3];
-  unsigned char *at = (unsigned char *)out + sizeof(image_t);
+  unsigned char *at;
   image_t head;
   if (!e || !bytes) return LAV_ERROR_NULL;
   if ((uintptr_t)e % 8 != 0 || e->magic != IMAGE) return LAV_ERROR_SOLVER;
@@ -119,6 +120,7 @@ int32_t lav_engine_image(lav_engine *engine, void *out, uint64_t out_bytes, uint
   if (!out) return LAV_OK; /* asks how many */
   if ((uintptr_t)out % 8 != 0 || out_bytes < *bytes) return LAV_ERROR_ROOM;
   memset(out, 0, (size_t)*bytes);
+  at = (unsigned char *)out + sizeof(image_t);
   memcpy(at, size, 40);
   {
     double *real = (double *)(void *)(at + 40);
