@@ -1,7 +1,7 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A (`lavender_ext/few/chain.pyx`), islands of few rows under friction, however many
-(`lavender_ext/few/islands.pyx`), generalised coordinates where Newton's method is counted to cost little
+Few rows of bodies or of A (`lavender_ext/few/chain.pyx`), islands of few rows under friction, as many as are swept in
+`LONGEST` (`lavender_ext/few/islands.pyx`), generalised coordinates where Newton's method is counted to cost little
 (`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or not at all:
 then the solver runs as on any problem, from the beginning.
 """
