@@ -12,8 +12,8 @@ from twins import block_diagonal
 
 import lavender as lv
 from lavender import suite
-from lavender.solvers._newton import systems
-from lavender.solvers._newton.systems import System, make_system
+from lavender.solvers.newton_systems import systems
+from lavender.solvers.newton_systems.systems import System, make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.newton.solve import PHASES
 
@@ -103,14 +103,14 @@ def test_augmented_system_is_the_same_newton_system(law, seed):
 
 def without(monkeypatch, *phases):
     """Newton's method goes without these."""
-    given = System._solve
+    given = System.new_solve
 
     def solve(self, *args):
         made = given(self, *args)
         made.without = sum(PHASES[name] for name in phases)
         return made
 
-    monkeypatch.setattr(System, "_solve", solve)
+    monkeypatch.setattr(System, "new_solve", solve)
 
 
 # -- scenes at rest: many redundant points, few of which slip -------------------------------------------

@@ -15,8 +15,8 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import suite
 from lavender.cones import CONTACT_SPIN, ROW
-from lavender.solvers._newton import pattern, sparse, systems
-from lavender.solvers._newton.systems import make_system
+from lavender.solvers.newton_systems import pattern, sparse, systems
+from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.factor import symbolic
 from lavender_ext.factor.sparse import SparsePanels
