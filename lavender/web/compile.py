@@ -166,7 +166,7 @@ def build(
             raise BuildFailed(str(error)) from None
         data = _compiled(source, names, ["--import-memory"] if beside else [])
     _check(data, LARGEST if largest is None else largest)
-    data += _section(SECTION, source_hash(root, modules).encode())
+    data += section(SECTION, source_hash(root, modules).encode())
     # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
     out = out.resolve()  # a link stays, what is behind it is replaced
     part = out.with_name(out.name + f".{os.getpid()}")
@@ -250,7 +250,7 @@ def _check(module: bytes, largest: int) -> None:
         raise BuildFailed(f"the module has {len(module)} bytes; below {largest} are allowed")
 
 
-def _section(name: str, content: bytes) -> bytes:
+def section(name: str, content: bytes) -> bytes:
     # A custom section; lengths below 128 are one byte in LEB128.
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:
