@@ -174,41 +174,6 @@ class Simulation:
         sizes = (8 * self.lengths[0], 4 * self.lengths[1], 8 * max(self.lengths[2], 1))
         return [self.k.view(at, n, np.uint8).tobytes() for at, n in zip(self.buffers[1:], sizes, strict=True)]
 
-    def restore(self, everything):
-        for at, data in zip(self.buffers[1:], everything, strict=True):
-            self.k.view(at, len(data), np.uint8)[:] = np.frombuffer(data, np.uint8)
-
-
-class Newton:
-    """The module newton.wasm in the memory of `kernels`."""
-
-    def __init__(self, data, kernels):
-        module = compiled(data)
-        self.k = kernels
-        self.exports = wasmtime.Instance(kernels.store, module, [kernels.memory]).exports(kernels.store)
-        assert self.exports["__heap_base"].value(kernels.store) <= kernels.exports["__heap_base"].value(
-            kernels.store
-        )
-        self.said, self.trace = kernels.alloc(32), kernels.alloc(24 * 256)
-
-    def call(self, name, *arguments):
-        return self.exports[name](self.k.store, *arguments)
-
-    def step(self, simulation, tol):
-        """One step; what its last solve said (4,): sweeps, factorisations, relative residual, scores."""
-        k, s = self.k, simulation
-        for _ in range(s.substeps):
-            while k.call("lav_engine_prepare", *s.buffers) == NEED_ROOM:
-                s.grow()
-            k.call("lav_engine_solve", *s.buffers, 0)
-            top = k.top  # scratch is given back after each solve
-            whole = k.alloc(4 * self.call("lav_newton_index_room", *s.buffers))
-            room = k.alloc(8 * self.call("lav_newton_plan", *s.buffers, whole))
-            self.call("lav_newton_substep", *s.buffers, tol, whole, room, self.trace, self.said)
-            k.top = top
-            assert k.call("lav_engine_finish", *s.buffers) == 0
-        return k.view(self.said, 4, np.float64).copy()
-
 
 class Recording:
     def __init__(self, folder):

@@ -1,6 +1,5 @@
 """The kernels in WebAssembly give the bits of the native ones: under Node, and under wasmtime from Python."""
 
-import hashlib
 import json
 import os
 import shutil
@@ -252,11 +251,6 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
 # -- wasmtime --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="session")
-def recorded(recording, host):
-    return host.Recording(recording)
-
-
 def same_bits(found, expected):
     return np.asarray(found, expected.dtype).tobytes() == expected.tobytes()
 
@@ -282,55 +276,6 @@ def test_wasmtime_structs_are_those_of_c_and_of_the_native_build(module, host):
             assert sizes[name] == -(-at // widest) * widest, name
 
 
-def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
-    steps = 0
-    for scene in recorded.contents["scenes"]:
-        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
-        assert simulation.read_settings() == bytes(scene["settings"])
-        values = recorded.array(scene["values"]).reshape(-1, 8)
-        states = recorded.array(scene["states"]).reshape(len(values), -1)
-        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
-        assert len(values) >= 600
-        for step in range(len(values)):
-            if str(step) in scene["changes"]:
-                simulation.set(**scene["changes"][str(step)])
-            assert simulation.step() == 0
-            where = f"{scene['name']}, step {step + 1}"
-            assert same_bits(simulation.values(), values[step]), where
-            state = np.concatenate([simulation.array(name) for name in recorded.contents["body_arrays"]])
-            assert same_bits(state, states[step]), where
-            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
-            steps += 1
-        assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
-    assert steps == 10800
-
-
-def test_wasmtime_solves_by_newton_are_the_same_to_the_bit(module, newton_module, host, recorded):
-    for scene in recorded.contents["newton"]:
-        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
-        newton = host.Newton(newton_module, simulation.k)
-        values = recorded.array(scene["values"]).reshape(-1, 8)
-        said = recorded.array(scene["said"]).reshape(-1, 4)
-        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
-        for step in range(40):  # Node goes on to the end
-            if str(step) in scene["changes"]:
-                simulation.set(**scene["changes"][str(step)])
-            where = f"{scene['name']}, step {step + 1}"
-            assert same_bits(newton.step(simulation, 1e-6), said[step]), where
-            assert same_bits(simulation.values(), values[step]), where
-            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
-
-
-def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
-    for problem in recorded.contents["problems"]:
-        found = host.run_problem(host.Kernels(module, recorded.contents["layout"]), problem, recorded)
-        for name, place in problem["expected"].items():
-            assert same_bits(found[name], recorded.array(place)), (problem["name"], name)
-        assert [found[key] for key in ("energy", "velocity", "worst")] == [
-            problem[key] for key in ("energy", "velocity", "worst")
-        ]
-
-
 def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
     for name in ("stack", "chain"):
         simulation = lv.Simulation(lv.Scene(name, substeps=1))
@@ -354,25 +299,6 @@ def test_wasmtime_packed_sweeps_are_the_plain_ones(module, host):
         for _ in range(60):
             assert plain.step() == packed.step(packed=True) == 0
         assert plain.everything() == packed.everything(), scene["name"]
-
-
-def test_wasmtime_snapshot_leads_back(module, host):
-    (scene,) = (s for s in page_scenes()["scenes"] if s["name"] == "pyramid")
-    simulation = host.Simulation(host.Kernels(module, layout()), scene)
-    for _ in range(10):
-        simulation.step()
-    kept = simulation.everything()
-    ends = []
-    for _ in range(2):
-        for _ in range(10):
-            simulation.step()
-        ends.append(simulation.everything())
-        simulation.restore(kept)
-        simulation.set(warm_start=0)
-        simulation.step()
-        assert simulation.values()[3] == 0.0
-        simulation.restore(kept)
-    assert ends[0] == ends[1] != kept
 
 
 # -- scenes and command ----------------------------------------------------------------------------------------
