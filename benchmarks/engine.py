@@ -41,7 +41,7 @@ def detail(steps: int = 960) -> str:
     )
     rows: list[tuple[Any, ...]] = []
     for label, more in levels:
-        state = settled(lv.Scene("pile", n=200, dt=DT, **more), steps)._state
+        state = settled(lv.Scene("pile", n=200, dt=DT, **more), steps).state
         (seconds,) = least(lambda state=state: state.kernel.substeps(1))
         sizes = []
         for bodies, contacts in ((0, 0), (0, 1000), (1000, 0)):
@@ -92,7 +92,7 @@ def models(names: tuple[str, ...] = tuple(SCENES), steps: int = 240, seconds: fl
                     scene.add_joint("ball", -1, far, anchor=(90.0, 0.0, 7.0))
                 sims.append(settled(scene, steps))
             best = least(*(sim.step for sim in sims), seconds=seconds)
-            cells = (f"{1e6 * t:.1f} ({int(s._state.head[0])})" for t, s in zip(best, sims, strict=True))
+            cells = (f"{1e6 * t:.1f} ({int(s.state.head[0])})" for t, s in zip(best, sims, strict=True))
             rows.append((label, sweeps, *cells, *[""] * (len(MODELS) - len(sims))))
     return markdown(("µs a step (contacts)", "sweeps", *MODELS), rows)
 

@@ -89,8 +89,8 @@ def sweeps(problem: Problem, name: str, n: int, **options: Any) -> tuple[Callabl
     """A call of n more sweeps of a prepared solver, and the impulses (m,) [N s] that it moves."""
     prepared = prepare(problem, name, **options)
     lam = problem.start()
-    prepared._solver.run(prepared._state, lam, _ADD, 0.0)
-    return partial(prepared._solver.run, prepared._state, lam, n, 0.0), lam
+    prepared.solver.run(prepared.state, lam, _ADD, 0.0)
+    return partial(prepared.solver.run, prepared.state, lam, n, 0.0), lam
 
 
 def _count(work: float) -> int:
@@ -240,7 +240,7 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     simulation = Simulation(Scene(scene, dt=1 / 240, solver_iterations=16, **parameters))
     for _ in range(240):
         simulation.step()
-    state = simulation._state.copy()
+    state = simulation.state.copy()
     kernel = state.kernel
     calls: dict[str, Callable[[], Any]] = {
         "pairs": kernel.pairs,
@@ -253,7 +253,7 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     best = dict.fromkeys(calls, float("inf"))
     begun = perf_counter()
     while best["finish"] == float("inf") or perf_counter() - begun < seconds:
-        state.take(simulation._state)
+        state.take(simulation.state)
         for name, call in calls.items():
             start = process_time_ns()
             call()
