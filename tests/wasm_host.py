@@ -91,8 +91,6 @@ class Simulation:
         for name, values in scene["arrays"].items():
             self.array(name)[:] = values
         self.done = kernels.alloc(8)
-        self.out = kernels.alloc(64)
-        self.settings_place = kernels.alloc(kernels.sizes["settings_t"])
         self.curve = kernels.alloc(16 * 65)
 
     def allocate(self, size):
@@ -127,20 +125,14 @@ class Simulation:
     def array(self, name):
         return self.k.view(*self.places[name])
 
-    def read_settings(self):
-        self.k.call("lav_engine_read_settings", *self.buffers, self.settings_place)
-        return self.k.view(self.settings_place, self.k.sizes["settings_t"], np.uint8).tobytes()
-
     def set(self, **changes):
         """Settings that are whole numbers."""
-        self.read_settings()
         for name, value in changes.items():
-            self.k.view(self.settings_place + self.k.offsets["settings_t", name], 1, np.int32)[0] = value
-        self.k.call("lav_engine_write_settings", *self.buffers, self.settings_place)
+            self.array("head")[self.k.layout["head"][name]] = value
 
     def values(self):
-        self.k.call("lav_engine_values", *self.buffers, self.out)
-        return self.k.view(self.out, 8, np.float64).copy()
+        out = self.k.layout["setting"]["out"]
+        return self.array("setting")[out : out + 8].copy()
 
     def grow(self):
         old = self.buffers
