@@ -20,7 +20,8 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.driver.driver cimport NEWTON, asked_t, lav_room, lav_start, lav_step, room_t, said_t, view_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport NEWTON, asked_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport Judged, do_nothing, judge_into, relative_of
 from lavender_ext.judge.measure import same_bits
