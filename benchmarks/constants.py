@@ -31,7 +31,7 @@ from lavender.residuals import reference
 NOISE = 0.02
 LIMITS = (1e-4, 1e-3, 1e-2)  # s
 LONG = 0.3  # s: a problem that takes longer is left out
-ROOMS = ("auto", "_plan", "_schedule", "_methods", "_log", "_few", "_structure")
+ROOMS = ("auto", "costs", "schedule", "methods", "solve_log", "small", "structure")
 Drawn = list[tuple[str, Problem]]
 
 

@@ -98,7 +98,7 @@ def lavender_row(name: str, sweeps: int) -> Row:
         int(observation["solver"][2]),
         max(
             observation["contacts"]["depth"].max(initial=0.0),
-            np.abs(sim._state.a["joint_error"]).max(initial=0.0),
+            np.abs(sim.state.a["joint_error"]).max(initial=0.0),
         ),
         float(np.abs(observation["velocities"][:, :3]).max()),
         residual,
@@ -108,7 +108,7 @@ def lavender_row(name: str, sweeps: int) -> Row:
 
 def phases(sim: lv.Simulation) -> dict[str, float]:
     """Time [s] of each phase: differences of least times from the same state."""
-    state = sim._state.copy()
+    state = sim.state.copy()
     kernel = state.kernel
     calls = (
         kernel.pairs,
@@ -120,7 +120,7 @@ def phases(sim: lv.Simulation) -> dict[str, float]:
     )
     best = np.full(len(calls), np.inf)
     for _ in range(100):
-        state.take(sim._state)
+        state.take(sim.state)
         for i, call in enumerate(calls):
             start = perf_counter()
             call()
@@ -277,17 +277,17 @@ def detail() -> None:
         sim = lv.Simulation(lv.Scene("pile", n=200, dt=DT, **more))
         for _ in range(960):
             sim.step()
-        seconds = least(lambda sim=sim: sim._state.kernel.substeps(1))
+        seconds = least(lambda sim=sim: sim.state.kernel.substeps(1))
         sizes = []
         for bodies, contacts in ((0, 0), (0, 1000), (1000, 0)):
-            size = sim._state.size.copy()
+            size = sim.state.size.copy()
             size[[0, 1, 9]] += (bodies, bodies, contacts)
             size[6] += bodies if size[6] else 0
             sizes.append(State(size).nbytes)
-        c = int(sim._state.head[0])
+        c = int(sim.state.head[0])
         rows.append(
             (
-                label, int(sim._state.size[7]), (sizes[2] - sizes[0]) // 1000, (sizes[1] - sizes[0]) // 1000, c,
+                label, int(sim.state.size[7]), (sizes[2] - sizes[0]) // 1000, (sizes[1] - sizes[0]) // 1000, c,
                 f"{1e6 * seconds:.0f}", f"{1e9 * seconds / c:.0f}",
             )
         )  # fmt: skip
@@ -331,7 +331,7 @@ def models() -> None:
             for _ in range(20):
                 for i, sim in enumerate(sims):
                     best[i] = min(best[i], least(sim.step, batches=10))
-            cells = (f"{1e6 * t:.1f} ({int(s._state.head[0])})" for t, s in zip(best, sims, strict=True))
+            cells = (f"{1e6 * t:.1f} ({int(s.state.head[0])})" for t, s in zip(best, sims, strict=True))
             rows.append((label, sweeps, *cells, *[""] * (len(MODELS) - len(sims))))
     click.echo(markdown(("µs a step (contacts)", "sweeps", *MODELS), rows))
 

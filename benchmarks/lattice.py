@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 import lavender as lv
 from benchmarks.clock import cpu
 from lavender.problem import Problem
-from lavender.solvers._newton import systems
+from lavender.solvers.newton_systems import systems
 from lavender.suite.build import Bodies, Contacts
 from lavender.suite.families import SPHERE
 

@@ -34,7 +34,7 @@ from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
 from lavender.scene.gallery import SCENES
 from lavender.solvers import newton
-from lavender.solvers._newton import sparse, systems
+from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.warm_start import Tried
 from lavender_ext.newton.solve import PHASES
 

@@ -104,12 +104,12 @@ def _at_rest(n: int, sweeps: int, h: float, order: str, friction: float, gap: fl
     sim = Simulation(scene)
     weight = scene.bodies[1].mass * -scene.parameters.gravity[2] * h
     for last in (False, True):  # the first substep makes the cache
-        a = sim._state.a
+        a = sim.state.a
         a["x"][1:] = [(0.0, 0.0, 0.5 + i + gap * (i + 1)) for i in range(n)]
         a["q"][1:], a["v"][:] = (1.0, 0.0, 0.0, 0.0), 0.0
         if not last:
             sim.step()
-    state = sim._state
+    state = sim.state
     found = int(state.head[HEAD["cached"]])
     if found != 4 * n:
         raise InputError(

@@ -75,13 +75,13 @@ def give_room(simulation: lv.Simulation, substeps: int) -> None:
     """Buffers in which the coming substeps fit, so that no repetition has to grow them."""
     while True:
         start = simulation.snapshot()
-        if simulation._state.kernel.substeps(substeps)[1] == substeps:
+        if simulation.state.kernel.substeps(substeps)[1] == substeps:
             simulation.restore(start)
             return
-        room = State(simulation._state.grown().size)
+        room = State(simulation.state.grown().size)
         buffers = (start.size, start.real.copy(), start.index.copy(), start.keys.copy())
         memory.move(*buffers, room.size, room.real, room.index, room.keys)
-        simulation._state = room
+        simulation.state = room
 
 
 def start_of(writer: Writer, start: Snapshot) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def start_of(writer: Writer, start: Snapshot) -> dict[str, Any]:
 
 def native_substeps(simulation: lv.Simulation, substeps: int) -> float:
     """Seconds of one substep."""
-    kernel = simulation._state.kernel
+    kernel = simulation.state.kernel
     start = perf_counter()
     _, done = kernel.substeps(substeps)
     time = perf_counter() - start

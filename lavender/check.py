@@ -194,7 +194,7 @@ def cross_check(
         except LavenderError as error:  # refused only after a look at the numbers
             rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
             continue
-        rows.append(_compare(problem, name, solution, optimum))
+        rows.append(compare(problem, name, solution, optimum))
     return CrossCheck(problem, tol, chosen, note, tuple(rows))
 
 
@@ -262,7 +262,7 @@ def _multiplier(problem: Problem, solution: Solution) -> FloatArray:
     return -solution.residual.slack
 
 
-def _compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
+def compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
     r = solution.residual
     note = "; ".join(
         x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x

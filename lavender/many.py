@@ -19,7 +19,7 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import check_budget, of_batch, solve, solve_small
-from lavender.solvers._newton import general
+from lavender.solvers.newton_systems import general
 from lavender_ext.few.many import Batch
 
 __all__ = ["solve_many"]

@@ -10,7 +10,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem
 from lavender.registry import get
 from lavender.residuals import reference
-from lavender.solvers._plan import Plan, made
+from lavender.solvers.costs import Plan, made
 
 __all__ = ["Plan", "explain"]
 

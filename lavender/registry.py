@@ -232,15 +232,16 @@ def _importable(module: str) -> bool:
         return False
 
 
-_registered: dict[str, SolverSpec] = {}
+registered: dict[str, SolverSpec] = {}
 
 
 @cache
-def _load_builtin_and_plugins() -> None:
+def load() -> None:
+    """Fill `registered` once: what is built in, and what plug-ins offer."""
     for table in TABLES:
         for spec in importlib.import_module(table).SPECS:
             object.__setattr__(spec, "own", True)
-            _registered.setdefault(spec.name, spec)
+            registered.setdefault(spec.name, spec)
     for entry in entry_points(group="lavender.solvers"):
         try:
             spec = entry.load()
@@ -260,24 +261,24 @@ def register(spec: SolverSpec, *, replace: bool = False) -> None:
     InputError
         Not a SolverSpec, or the name is taken.
     """
-    _load_builtin_and_plugins()
+    load()
     _add(spec, replace)
 
 
 def _add(spec: SolverSpec, replace: bool) -> None:
     if not isinstance(spec, SolverSpec):
         raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
-    if spec.name in _registered and not replace:
+    if spec.name in registered and not replace:
         raise InputError(
             f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"
         )
-    _registered[spec.name] = spec
+    registered[spec.name] = spec
 
 
 def specs() -> dict[str, SolverSpec]:
     """Every registered solver by name, installed or not."""
-    _load_builtin_and_plugins()
-    return dict(_registered)
+    load()
+    return dict(registered)
 
 
 def get(name: str) -> SolverSpec:
@@ -290,8 +291,8 @@ def get(name: str) -> SolverSpec:
     SolverUnavailable
         Its package is not installed; the message says what to install.
     """
-    _load_builtin_and_plugins()
-    spec = _registered.get(name) if isinstance(name, str) else None
+    load()
+    spec = registered.get(name) if isinstance(name, str) else None
     if spec is None:
         raise UnknownName("solver", name, specs())
     reason = spec.missing()

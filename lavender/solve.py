@@ -170,7 +170,7 @@ class Prepared:
         self.options = dict(options)
         self.problem = problem
         self._lock = Lock()
-        self._solver = _make(spec, options)
+        self.solver = _make(spec, options)
         self._set_up(problem, anew=True)
         self.setup_time = perf_counter() - start
         self._fresh = True
@@ -224,13 +224,13 @@ class Prepared:
             lam = given.on_disk(problem.impulse_array(impulse))
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
-        if time_limit is not None and hasattr(self._solver, "ready"):
+        if time_limit is not None and hasattr(self.solver, "ready"):
             start = perf_counter()
-            self._solver.ready(self._state, time_limit)
+            self.solver.ready(self.state, time_limit)
             self.setup_time += perf_counter() - start
         records: list[Record] | None = [] if history else None
         return _Loop(
-            problem=problem, solver=self._solver, state=self._state, impulse=lam, tol=tol, time_limit=time_limit,
+            problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, time_limit=time_limit,
             callback=callback, records=records,
         )  # fmt: skip
 
@@ -246,7 +246,7 @@ class Prepared:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
-            float(getattr(self._state, "sweeps_per_decade", math.nan)),
+            float(getattr(self.state, "sweeps_per_decade", math.nan)),
         )  # fmt: skip
         return solution if self._given is problem else solution.unstretched(self._given)
 
@@ -272,11 +272,11 @@ class Prepared:
         anew, self._broken = anew or bool(self._broken), ""
         try:
             if anew:
-                self._state = self._solver.prepare(problem)
+                self.state = self.solver.prepare(problem)
             else:
-                self._state = self._solver.update(self._state, problem)
+                self.state = self.solver.update(self.state, problem)
         except BREAKDOWN as error:
-            self._state, self._broken = None, _last_words(error)
+            self.state, self._broken = None, _last_words(error)
 
 
 def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:

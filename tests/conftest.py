@@ -42,7 +42,7 @@ def register(monkeypatch):
     """As `lavender.register`, for one test, and in the place of a solver of the same name."""
     from lavender import registry
 
-    monkeypatch.setattr(registry, "_registered", registry.specs())
+    monkeypatch.setattr(registry, "registered", registry.specs())
     return partial(registry.register, replace=True)
 
 
@@ -75,7 +75,7 @@ def plug_in(register):
 def interrupted_newton(monkeypatch) -> list[float]:
     """Ctrl-C after newton's fifth turn of one factorisation; the list fills with the best residual after each."""
     from lavender.solvers import newton
-    from lavender.solvers._newton.systems import MatrixSystem, VelocitySystem
+    from lavender.solvers.newton_systems.systems import MatrixSystem, VelocitySystem
 
     looks: list[float] = []
 

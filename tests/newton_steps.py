@@ -20,7 +20,7 @@ class NewtonSteps:
         self.simulation = lv.Simulation(scene)
         self.substeps = scene.parameters.substeps
         self.tol, self.ended, self.told, self.trace = tol, [], None, None
-        self._take(self.simulation._state)
+        self._take(self.simulation.state)
 
     def _take(self, state):
         self.state = state

@@ -17,8 +17,8 @@ import numpy as np
 from benchmarks.auto.curves import Curve
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
-from lavender.solvers._plan import READ, Costs
-from lavender.solvers._structure import Structure
+from lavender.solvers.costs import READ, Costs
+from lavender.solvers.structure import Structure
 
 __all__ = ["DRAWN", "LEAST", "count_rates", "fit", "gathered", "least_squares", "middle"]
 

@@ -1,6 +1,6 @@
 """The schedule of `auto` on recorded curves: what a solve would have taken, by other rates too, without solving.
 
-The candidates are those of `lavender/solvers/_methods.py`, with a curve in place of a solver; turns, remainders and
+The candidates are those of `lavender/solvers/methods.py`, with a curve in place of a solver; turns, remainders and
 their order are made by the same code. Beside the curves' own times a call and each turn cost what Python takes.
 """
 
@@ -15,10 +15,10 @@ from benchmarks.auto.curves import LEVELS, Curve
 from benchmarks.auto.regret import SHIFT
 from lavender import registry
 from lavender.solution import Claim, Status
-from lavender.solvers._methods import FIRST, Candidate, first_turn
-from lavender.solvers._plan import METHODS, Costs, candidates
-from lavender.solvers._schedule import race
-from lavender.solvers._structure import Structure
+from lavender.solvers.costs import METHODS, Costs, candidates
+from lavender.solvers.methods import FIRST, Candidate, first_turn
+from lavender.solvers.schedule import race
+from lavender.solvers.structure import Structure
 from lavender_ext.few.looks import sweeps_left
 
 __all__ = ["CALL", "TURN", "regret", "replayed"]

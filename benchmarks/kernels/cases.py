@@ -72,8 +72,8 @@ def sweeps(
     """A call of n more sweeps of a prepared solver, that solver, and the impulses (m,) [N s] that it moves."""
     prepared = prepare(problem, name, **options)
     lam = problem.start()
-    prepared._solver.run(prepared._state, lam, _ADD, 0.0)
-    return partial(prepared._solver.run, prepared._state, lam, n, 0.0), prepared, lam
+    prepared.solver.run(prepared.state, lam, _ADD, 0.0)
+    return partial(prepared.solver.run, prepared.state, lam, n, 0.0), prepared, lam
 
 
 def _count(work: float) -> int:
@@ -239,7 +239,7 @@ def _settled(scene: str, parameters: dict[str, Any]) -> Simulation:
 def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     # Phases as differences of least times from one state.
     simulation = _settled(scene, parameters)
-    state = simulation._state.copy()
+    state = simulation.state.copy()
     kernel = state.kernel
     calls: dict[str, Callable[[], Any]] = {
         "pairs": kernel.pairs,
@@ -252,7 +252,7 @@ def _engine(scene: str, seconds: float, **parameters: Any) -> list[Row]:
     best = dict.fromkeys(calls, float("inf"))
     begun = perf_counter()
     while best["finish"] == float("inf") or perf_counter() - begun < seconds:
-        state.take(simulation._state)
+        state.take(simulation.state)
         for name, call in calls.items():
             start = process_time_ns()
             call()

@@ -65,7 +65,7 @@ class Process:
         )
         self._command = [sys.executable, "-c", start, *map(str, arguments)]
         self._environment = environment or {}
-        self._process: subprocess.Popen[bytes] | None = None
+        self.popen: subprocess.Popen[bytes] | None = None
         self._lifeline = -1  # the writing end of a pipe that ends when this process does
         self._answers: queue.Queue[Any] = queue.Queue()
         self._room = 0  # bytes of numbers that an answer may have
@@ -73,7 +73,7 @@ class Process:
     @property
     def alive(self) -> bool:
         """It was started, not ended, and has not ended."""
-        return self._process is not None and _ended(self._process, 0.0) is None
+        return self.popen is not None and _ended(self.popen, 0.0) is None
 
     def start(self) -> str:
         """Start it where it does not run, and wait until it is ready; why it is not, or nothing."""
@@ -101,7 +101,7 @@ class Process:
             alive, self._lifeline = os.pipe()
             more = {"start_new_session": True, "pass_fds": (alive,)}
         try:
-            self._process = subprocess.Popen(
+            self.popen = subprocess.Popen(
                 [*self._command, str(alive)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
@@ -119,7 +119,7 @@ class Process:
             if alive >= 0:
                 os.close(alive)
         self._answers = queue.Queue()
-        stream = self._process.stdout
+        stream = self.popen.stdout
         assert stream is not None
         # A process of the backend's that left the group may keep the pipe open for ever: this thread then waits
         # alone, and nobody waits for it.
@@ -154,7 +154,7 @@ class Process:
         return found
 
     def _send(self, message: bytes, limit: float) -> None:
-        process = self._process
+        process = self.popen
         assert process is not None and process.stdin is not None
         stream, data = process.stdin, memoryview(message)
 
@@ -185,7 +185,7 @@ class Process:
 
     def _cause(self) -> str:
         """How it ended, after it was ended with all that it started."""
-        process = self._process
+        process = self.popen
         assert process is not None
         code = _ended(process, 1.0)
         self.end()
@@ -198,7 +198,7 @@ class Process:
 
     def end(self) -> None:
         """End it and what it started."""
-        process, self._process = self._process, None
+        process, self.popen = self.popen, None
         lifeline, self._lifeline = self._lifeline, -1
         if process is None:
             return

@@ -34,7 +34,7 @@ from lavender.many import solve_many
 from lavender.problem import Problem
 from lavender.residuals import judged, reference, residual
 from lavender.solve import solve
-from lavender.solvers._newton import general
+from lavender.solvers.newton_systems import general
 
 TARGET = 1e-6  # judged relative residual that both sides must reach
 STRICT = 1e-9  # that ours is asked for besides

@@ -186,7 +186,7 @@ class Store:
             try:
                 self.records = read(self.path) if self.path.exists() else Records()
                 _cut_torn_line(self.path)
-                self._file = self.path.open("a", encoding="utf-8")
+                self.file = self.path.open("a", encoding="utf-8")
             except BaseException:
                 self._lock.release()
                 raise
@@ -206,10 +206,10 @@ class Store:
         """
         line = json.dumps(to_json(entry), allow_nan=False)
         try:
-            self._file.write(line + "\n")
-            self._file.flush()
+            self.file.write(line + "\n")
+            self.file.flush()
             if time.monotonic() - self._synced > SYNC:
-                os.fsync(self._file.fileno())
+                os.fsync(self.file.fileno())
                 self._synced = time.monotonic()
         except OSError as error:
             raise InputError(
@@ -221,7 +221,7 @@ class Store:
     def close(self) -> None:
         """Close the file and let others write it; what the disk had no room for was reported when it was written."""
         with contextlib.suppress(OSError):
-            self._file.close()
+            self.file.close()
         self._lock.release()
 
     def __enter__(self) -> Store:

@@ -62,7 +62,7 @@ class Simulation(Stepping):
         contacts of such a problem stand in the order in which they are swept. The step publishes the
         impulses of its last substep.
         """
-        state = self._state.copy()
+        state = self.state.copy()
         if self._restored:
             make_pairs_anew(state)
         while state.kernel.prepare() == NEED_ROOM:
@@ -71,7 +71,7 @@ class Simulation(Stepping):
 
     def sweep_seed(self) -> int:
         """`seed` for `lavender.solve(..., order="random")` that gives the next substep's order."""
-        head = self._state.head
+        head = self.state.head
         return (int(head[HEAD["seed"]]) << 32) ^ int(head[HEAD["step"]])
 
     @alone
@@ -186,16 +186,16 @@ class Simulation(Stepping):
     @alone
     def start_film(self) -> Film:
         """A film of the present poses, to which every step is added until `end_film`."""
-        film = Film(header_of(self.scene, self._state))
+        film = Film(header_of(self.scene, self.state))
         film.add(self.time, self._observe())
-        self._films.append(film)
+        self.films.append(film)
         return film
 
     @alone
     def end_film(self, film: Film) -> None:
         """No step is added to that film any more."""
         film.ended = True
-        self._films = [other for other in self._films if other is not film]
+        self.films = [other for other in self.films if other is not film]
 
     def frames(self, path: str | PathLike[str], steps: int = 120, **more: Any) -> Path:
         """Step `steps` times and write pictures: `.gif`, `.mp4` an animation, `.png`, `.svg`, `.pdf` a strip.
@@ -270,7 +270,7 @@ class Simulation(Stepping):
         """
         if self._over == HALF:
             raise LavenderError(f"{HALF}; reset() or restore a snapshot")
-        s = self._state
+        s = self.state
         return Snapshot(
             fingerprint=self._fingerprint,
             steps=self._steps,
@@ -299,7 +299,7 @@ class Simulation(Stepping):
             raise InputError("the snapshot is of another scene: bodies, joints or parameters differ")
         well_formed(snapshot)
         size = snapshot.size.copy()
-        same_scene(self._state, size)
+        same_scene(self.state, size)
         given = (len(snapshot.real), len(snapshot.index), len(snapshot.keys))
         used = lengths(size)
         if given != (used[0], used[1], max(used[2], 1)):
@@ -307,12 +307,12 @@ class Simulation(Stepping):
         state = State(size)
         state.real[:], state.index[:], state.keys[:] = snapshot.real, snapshot.index, snapshot.keys
         lost = snapshot.lost
-        whole_state(self._state, state, self._sweeps, bool(lost))
+        whole_state(self.state, state, self._sweeps, bool(lost))
         if lost != (self._names[state.head[HEAD["lost"]]] if lost else ""):
             raise InputError(
                 f"the snapshot is damaged: {lost[:40]!r} is not the body whose state it says is lost"
             )
-        self._state, self._restored = state, True
+        self.state, self._restored = state, True
         self._steps, self._failed = snapshot.steps, snapshot.failed
         self._last, self._over = None, ""
         self._lost_body()

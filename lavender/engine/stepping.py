@@ -104,14 +104,14 @@ class Stepping:
         self.report_residual = report_residual
         self.report_motion = report_motion
         self._lock, self._inside = RLock(), False
-        self._films: list[Film] = []  # that every step is added to
+        self.films: list[Film] = []  # that every step is added to
         self._load(scene)
 
     def _load(self, scene: Scene) -> None:
         p = self._parameters = scene.parameters
         self._names = tuple(b.name for b in scene.bodies)
         self._joint_names = tuple(j.name for j in scene.joints)
-        self._state = State.of_scene(scene)
+        self.state = State.of_scene(scene)
         self._fingerprint = scene.fingerprint()
         self._own_sweeps = p.solver == "sequential_impulses"
         self._sweeps = get_stepper(p.stepper).sweeps if self._own_sweeps else (1, 2**31 - 1)
@@ -142,12 +142,12 @@ class Stepping:
     @property
     def solver_iterations(self) -> int:
         """Budget of the velocity solve."""
-        return int(self._state.head[HEAD["iterations"]])
+        return int(self.state.head[HEAD["iterations"]])
 
     @property
     def warm_start(self) -> bool:
         """Whether impulses are carried over from the cache."""
-        return bool(self._state.head[HEAD["warm_start"]])
+        return bool(self.state.head[HEAD["warm_start"]])
 
     @property
     @alone
@@ -163,7 +163,7 @@ class Stepping:
     @property
     def nbytes(self) -> int:
         """Bytes of the engine's arrays."""
-        return self._state.nbytes
+        return self.state.nbytes
 
     @alone
     def set_solver_iterations(self, n: int) -> None:
@@ -175,14 +175,14 @@ class Stepping:
             Not a whole number of 4 to 64 for sequential_impulses (1 to 64 under other steppers than "impulses"), of at
             least 1 for other solvers.
         """
-        self._state.head[HEAD["iterations"]] = whole_number("solver_iterations", n, *self._sweeps)
+        self.state.head[HEAD["iterations"]] = whole_number("solver_iterations", n, *self._sweeps)
 
     @alone
     def set_warm_start(self, flag: bool) -> None:
         """Warm starting from the next step on; the cache is kept up to date either way."""
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"warm_start is {flag!r}; True or False is needed")
-        self._state.head[HEAD["warm_start"]] = bool(flag)
+        self.state.head[HEAD["warm_start"]] = bool(flag)
 
     @alone
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -199,8 +199,8 @@ class Stepping:
         if seed is not None:
             self.scene = self.scene.with_parameters(seed=whole_number("seed", seed))
         self._load(self.scene)
-        self._state.head[HEAD["iterations"]] = sweeps
-        self._state.head[HEAD["warm_start"]] = warm
+        self.state.head[HEAD["iterations"]] = sweeps
+        self.state.head[HEAD["warm_start"]] = warm
         return self._observe(), self._info()
 
     def step(self, action: None = None) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -250,15 +250,15 @@ class Stepping:
                 self._advance()
                 lost = self._lost_body()
                 observation = self._observe()
-                if self._films:
-                    for film in self._films:
+                if self.films:
+                    for film in self.films:
                         film.add(self.time, observation)
                 return observation, 0.0, bool(lost), False, self._info(lost)
             finally:
                 self._inside = False
 
     def _advance(self) -> None:
-        substeps, first = self._parameters.substeps, self._state
+        substeps, first = self._parameters.substeps, self.state
         begun, failed = first.head.item(HEAD["step"]), self._failed
         # A registered solver may raise or be stopped in any substep, which then must be as if none had been;
         # until the first has ended, nothing has changed that the next step starts from.
@@ -274,13 +274,13 @@ class Stepping:
             else:
                 self._solve_substeps()
         except BaseException as error:
-            done = (self._state.head.item(HEAD["step"]) - begun) % (LAST_STEP + 1)
+            done = (self.state.head.item(HEAD["step"]) - begun) % (LAST_STEP + 1)
             if done == substeps or self._lost_body():
                 self._steps += 1  # it was whole
                 raise
             if done and keeps:
                 first.kernel.put_back()
-                self._state = first
+                self.state = first
             if done and not keeps:
                 self._over = HALF
             self._failed = failed
@@ -291,7 +291,7 @@ class Stepping:
 
     def _lost_body(self) -> str:
         # name of the body whose state is not finite, or empty; no step follows
-        lost = self._state.head.item(HEAD["lost"])
+        lost = self.state.head.item(HEAD["lost"])
         if lost < 0:
             return ""
         self._over = f"the state of {self._names[lost]!r} is not finite"
@@ -300,27 +300,28 @@ class Stepping:
     def _sweep_substeps(self) -> None:
         left = self._parameters.substeps
         while True:
-            status, done = self._state.kernel.substeps(min(left, CHUNK))
+            status, done = self.state.kernel.substeps(min(left, CHUNK))
             left -= done
             if status == NEED_ROOM:
-                self._state = self._state.grown()
+                self.state = self.state.grown()
             elif left == 0 or status != OK:
                 return
 
-    def _prepare(self) -> None:
-        while self._state.kernel.prepare() == NEED_ROOM:
-            self._state = self._state.grown()
+    def prepare_substep(self) -> None:
+        """Collide and build the rows of the next substep in `state`."""
+        while self.state.kernel.prepare() == NEED_ROOM:
+            self.state = self.state.grown()
 
     def _solve_substeps(self) -> None:
         warm = self._warm_tol > 0.0 and get("newton").factory == NEWTON
         for _ in range(self._parameters.substeps):
             self._last = None
-            self._prepare()
-            kernel, a = self._state.kernel, self._state.a
+            self.prepare_substep()
+            kernel, a = self.state.kernel, self.state.a
             kernel.solve(False)
             if not (warm and self._solve_in_place()):
                 try:
-                    problem = self._problem(self._state)
+                    problem = self._problem(self.state)
                 except InputError:  # its numbers are not finite
                     self._lose()
                     return
@@ -332,25 +333,25 @@ class Stepping:
 
     def _lose(self) -> None:
         # no solver takes the prepared problem: the run ends here, at the body that finish() finds
-        self._state.kernel.apply()
-        if self._state.kernel.finish() == OK:
-            bodies = [*self._state.a["contact_pair"][:1].ravel().tolist(), int(self._state.a["body_of"][0])]
-            self._state.head[HEAD["lost"]] = next(i for i in bodies if self._state.a["dyn"][i] >= 0)
+        self.state.kernel.apply()
+        if self.state.kernel.finish() == OK:
+            bodies = [*self.state.a["contact_pair"][:1].ravel().tolist(), int(self.state.a["body_of"][0])]
+            self.state.head[HEAD["lost"]] = next(i for i in bodies if self.state.a["dyn"][i] >= 0)
 
     def _solve_in_place(self) -> bool:
         # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
         start = perf_counter()
-        how, sweeps, factorisations = self._state.warm.solve(self._warm_tol)
+        how, sweeps, factorisations = self.state.warm.solve(self._warm_tol)
         if how:
             self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
         return bool(how)
 
     def _told(self, pending: _Pending) -> Solution:
         # The arrays of the last substep's problem stay as they were until the next one.
-        problem = self._problem(self._state, steps=self._steps)
+        problem = self._problem(self.state, steps=self._steps)
         claim = claim_of(Tried(pending.how, pending.sweeps, pending.factorisations))
         assert claim is not None
-        impulse = self._state.a["impulse"][: problem.m].copy()
+        impulse = self.state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)
         options.pop("tol", None)
         return finish(
@@ -377,7 +378,7 @@ class Stepping:
         return 0.5 * (guess + solution.impulse) if p.on_failure == "damp" else solution.impulse
 
     def _observe(self) -> dict[str, Any]:
-        s = self._state
+        s = self.state
         c, rows = s.head.item(HEAD["contacts"]), s.head.item(HEAD["contact_rows"])
         seen = s.seen(c, rows)
         impulses = seen.impulses() if seen.impulses is not None else self._spread(c, seen.per)
@@ -399,7 +400,7 @@ class Stepping:
 
     def _spread(self, c: int, per: int) -> FloatArray:
         # contacts that lack some of the scene's rows have zeros there
-        a, kj = self._state.a, int(self._state.size[SIZE["joints"]])
+        a, kj = self.state.a, int(self.state.size[SIZE["joints"]])
         out = np.zeros((c, per))
         first, end = a["ptr"][kj : kj + c], a["ptr"][kj + 1 : kj + c + 1]
         for row in range(per):
@@ -414,7 +415,7 @@ class Stepping:
         info: dict[str, Any] = {"time": self.time, "step": self._steps, "failed_solves": self._failed}
         if lost:
             info["lost_body"] = lost
-        elif self._state.head.item(HEAD["solved"]):
+        elif self.state.head.item(HEAD["solved"]):
             if self.report_residual:
                 info["residual"] = self._judged()
             if self.report_motion:
@@ -436,10 +437,10 @@ class Stepping:
 
     def _solved(self) -> tuple[Problem, FloatArray]:
         # the problem of the last substep, and its impulses (m,) [N s]
-        if not self._state.head[HEAD["solved"]]:
+        if not self.state.head[HEAD["solved"]]:
             raise InputError("no step has been done yet, or the last was stopped; call step() and ask again")
-        problem = self._problem(self._state)
-        return problem, self._state.a["impulse"][: problem.m].copy()
+        problem = self._problem(self.state)
+        return problem, self.state.a["impulse"][: problem.m].copy()
 
     def __repr__(self) -> str:
         return f"<Simulation of {self.scene!r}, step {self._steps}>"

@@ -22,7 +22,7 @@ from lavender.export.library import HERE, put
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.io.stored import write_bytes
 from lavender.report.verdict import verdict
-from lavender.solvers._plan import METHODS as METHODS_OF_PLANS
+from lavender.solvers.costs import METHODS as METHODS_OF_PLANS
 
 __all__ = ["chosen", "pack", "pack_problem", "write", "write_packed"]
 

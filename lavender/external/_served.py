@@ -1,4 +1,4 @@
-"""The other side of `_apart.py`: a process that runs backends by their names."""
+"""The other side of `apart.py`: a process that runs backends by their names."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from lavender.apart import served as apart
-from lavender.external._apart import ARRAYS, WORDS
-from lavender.external._running import Answer, quiet
+from lavender.external.apart import ARRAYS, WORDS
+from lavender.external.running import Answer, quiet
 
 __all__ = ["serve"]
 
 
 def serve(lifeline: int) -> None:
-    """Answer the calls of `_apart.call`, until they end."""
+    """Answer the calls of `apart.call`, until they end."""
     apart.serve(lifeline, _runner)
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.external._running import Answer, Call, Limits, proof, quiet
 from lavender.external.as_qp import QP, bound_rows
+from lavender.external.running import Answer, Call, Limits, proof, quiet
 from lavender.solution import Status
 
 __all__ = ["Backend"]

@@ -11,10 +11,10 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from lavender.external._running import Limits, at_least
 from lavender.external.backend import Backend
 from lavender.external.native import clarabel, daqp, highs, osqp, qpalm
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
+from lavender.external.running import Limits, at_least
 from lavender.registry import SolverSpec
 
 __all__ = ["BACKENDS", "SPECS"]

@@ -10,10 +10,10 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError, InputError
-from lavender.external import _apart
-from lavender.external._running import ask
+from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
+from lavender.external.running import ask
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 
@@ -86,17 +86,17 @@ class QPSolver:
         if not qp.fits:
             words = "as a quadratic program the problem has numbers that overflow; the backend was not called"
             return Claim(Status.NUMERICAL_ERROR, 0, none, words, qp.form)
-        apart = _apart.Elsewhere(b) if self.isolate and time_limit is not None else None
-        claim = ask(qp, impulse, apart or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
+        elsewhere = apart.Elsewhere(b) if self.isolate and time_limit is not None else None
+        claim = ask(qp, impulse, elsewhere or b.run, max_iter, tol, time_limit, self.settings, b.noisy)
         if time_limit is None or b.stoppable:
             return claim
-        where = "to its end" if apart is None else apart.where
+        where = "to its end" if elsewhere is None else elsewhere.where
         return replace(claim, message=f"{claim.message}; takes no time limit and ran {where}")
 
     def ready(self, qp: QP, time_limit: float) -> None:
         """A time limit was given, and its clock has not begun: have that process ready."""
         if self.isolate:
-            _apart.ready()
+            apart.ready()
 
 
 def refusal(problem: Problem) -> str | None:

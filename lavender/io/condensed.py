@@ -9,9 +9,9 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray
-from lavender._lu import sparse_lu
 from lavender.errors import InputError
 from lavender.io.stored import Budget
+from lavender.lu import sparse_lu
 
 __all__ = ["ENTRY", "condensed", "most_entries"]
 

@@ -108,7 +108,7 @@ def _problem(
             f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); joints, "
             "contacts at points and joint limits are known here"
         )
-    dynamics, v_free = _free_motion(plant, context, dt)
+    dynamics, v_free = free_motion(plant, context, dt)
     contacts = _contacts(plant, context)
     limits = _limits(plant, context)
     nv = int(plant.num_velocities())
@@ -153,7 +153,7 @@ class _Limit:
     sign: float
 
 
-def _free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
+def free_motion(plant: Any, context: Any, dt: float) -> tuple[FloatArray, FloatArray]:
     """A (nv, nv) and v* (nv,) of SAP."""
     from pydrake.multibody.tree import JacobianWrtVariable, JointActuatorIndex, JointIndex, MultibodyForces_
 

@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from scipy.linalg import lapack
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._lu import sparse_lu
+from lavender.lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored

@@ -26,13 +26,13 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers import _rates as rates
+from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
-from lavender.solvers._newton.pattern import block_pattern
-from lavender.solvers._newton.sparse import BACKWARD
-from lavender.solvers._newton.systems import DENSE_FILL, factor_cost
 from lavender.solvers.islands import block_bodies
+from lavender.solvers.newton_systems.pattern import block_pattern
+from lavender.solvers.newton_systems.sparse import BACKWARD
+from lavender.solvers.newton_systems.systems import DENSE_FILL, factor_cost
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
@@ -46,7 +46,7 @@ _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho find
 
 
 _LATE = "the next factorisation, or the analysis before it, would end after the time limit"
-_AT_ONCE = (
+AT_ONCE = (
     5e-3  # s, that scaling, analysis and the first factor may be expected to take for `prepare` to do them
 )
 _ENTRY = 4e-8  # s, of the first two, for each entry of A
@@ -77,7 +77,7 @@ class AdmmState:
         self.is_scaled = False
         self.seconds = _opening(problem)  # of what comes next: to open it, then of the next factor
         with suppress(_TooLate):
-            self.open(_AT_ONCE)
+            self.open(AT_ONCE)
 
     def open(self, most: float = np.inf) -> None:
         """Scale, analyse and factor within `most` [s], as far as that can be told; what is left, the next call does."""
@@ -211,7 +211,7 @@ def _opening(problem: Problem) -> float:
         entries = 24 * problem.m if _is_over_bodies(problem) else int(assemble.bound(problem.data)[0])
     formed = 0.0
     if problem.generalized is not None:
-        formed = 1e-9 * (rates.FORMED_START + rates.FORMED * float(problem.metric.entries_of_a))
+        formed = 1e-9 * (weights.FORMED_START + weights.FORMED * float(problem.metric.entries_of_a))
     return _ENTRY * entries + formed
 
 

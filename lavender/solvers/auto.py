@@ -1,8 +1,8 @@
 """The only solver that hands over to others: each in its turn, by what it is expected to cost from here on.
 
-    few rows     one compiled call that ends most of them (`_few.py`)
-    others       the candidates of the table (`_plan.py`), each with a cost that is counted from the problem's structure
-                 with fitted rates; always the one with the least expected remainder (`_schedule.py`)
+    few rows     one compiled call that ends most of them (`small.py`)
+    others       the candidates of the table (`costs.py`), each with a cost that is counted from the problem's structure
+                 with fitted rates; always the one with the least expected remainder (`schedule.py`)
 
 Costs are counted, never timed: the same problem is solved the same way everywhere; the clock ends a solve, and shortens
 turns under a time limit. The best impulse of all is the result. What is left unsolved is asked for a certificate that
@@ -21,12 +21,12 @@ from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim, Status
-from lavender.solvers._certify import certify
-from lavender.solvers._few import AUTO, call_ends_within, prepared
-from lavender.solvers._log import SolveLog
-from lavender.solvers._methods import Candidate, Sweeps, in_short_time, make
-from lavender.solvers._plan import Costs, Plan, candidates
-from lavender.solvers._schedule import race
+from lavender.solvers.certify import certify
+from lavender.solvers.costs import Costs, Plan, candidates
+from lavender.solvers.methods import Candidate, Sweeps, in_short_time, make
+from lavender.solvers.schedule import race
+from lavender.solvers.small import AUTO, call_ends_within, prepared
+from lavender.solvers.solve_log import SolveLog
 
 # Relative residual of a start up to which sweeps go on from it, though doing nothing has less: which rows it holds free
 # is worth it. Under limits of 1 and 10 ms residuals from stale guesses are then 1.8 and 1.3 times smaller.

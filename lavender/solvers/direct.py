@@ -34,8 +34,8 @@ from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
-from lavender.solvers._few import DIRECT
 from lavender.solvers.pivoting import PivotState
+from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
 from lavender_ext.pivot.direct import PASSED, SPENT
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK

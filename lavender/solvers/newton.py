@@ -12,12 +12,12 @@
 4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
    law, whose convex problem moves with every step.
 
-Problems in generalised coordinates go over their velocities first (`_newton/general.py`), where A is never formed; what
-that leaves goes on as above, over the rows of A, unless form="velocity".
+Problems in generalised coordinates go over their velocities first (`newton_systems/general.py`), where A is never
+formed; what that leaves goes on as above, over the rows of A, unless form="velocity".
 
 1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and taken in turns; the clock, Ctrl-C and proofs are asked for in
-between. Their systems stand in `_newton/`. Form "velocity" factors I + K^T V K over the bodies and never squares J;
-"impulse" factors over the rows.
+between. Their systems stand in `newton_systems/`. Form "velocity" factors I + K^T V K over the bodies and never
+squares J; "impulse" factors over the rows.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import quick
 from lavender.solution import Claim, Status
-from lavender.solvers._few import NEWTON
-from lavender.solvers._newton import general
-from lavender.solvers._newton.systems import System, make_system
+from lavender.solvers.newton_systems import general
+from lavender.solvers.newton_systems.systems import System, make_system
+from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.newton.solve import COUNTED, OUTCOMES
 

@@ -18,9 +18,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._lu import sparse_lu
 from lavender.cones import ROW
 from lavender.errors import InputError
+from lavender.lu import sparse_lu
 from lavender.problem import Problem
 
 __all__ = ["Wide", "at_rest", "solve_boxed", "solve_linear"]

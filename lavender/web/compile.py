@@ -170,7 +170,7 @@ def build(
         data = _compiled(source, names, ["--import-memory"] if beside else [])
     found = read_module(data)
     _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
-    data += _section(SECTION, source_hash(root, modules).encode())
+    data += section(SECTION, source_hash(root, modules).encode())
     # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
     out = out.resolve()  # a link stays, what is behind it is replaced
     part = out.with_name(out.name + f".{os.getpid()}")
@@ -344,7 +344,7 @@ def _number(data: bytes, at: int, signed: bool = False) -> tuple[int, int]:
     return value, at
 
 
-def _section(name: str, content: bytes) -> bytes:
+def section(name: str, content: bytes) -> bytes:
     # A custom section; lengths below 128 are one byte in LEB128.
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:

@@ -101,7 +101,7 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
 
 
 cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """`general_cost` of lavender/solvers/_few.py, in the same order of operations, is no more than the gate lets in."""
+    """`general_cost` of lavender/solvers/small.py, in the same order of operations, is no more than the gate lets in."""
     cdef double flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
     if j.law == 2:
         flops = 2.0 * flops

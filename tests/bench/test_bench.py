@@ -226,7 +226,7 @@ def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
     full = OSError(28, "No space left on device")
     counter = itertools.count()
     opened = bench.Store(path)
-    write = opened._file.write
+    write = opened.file.write
 
     class Disk:
         def __getattr__(self, name):
@@ -238,8 +238,8 @@ def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
                 raise full
             return write(text)
 
-    opened_file = opened._file
-    opened._file = Disk()
+    opened_file = opened.file
+    opened.file = Disk()
     with pytest.raises(lv.InputError, match="No space left"):
         bench.run([stack(6)], ["pgs", "direct"], QUICK, opened)
     opened.close()

@@ -15,7 +15,7 @@ from benchmarks.auto.replay import CALL, Costs, candidates, replayed
 from benchmarks.drawn import wild
 from lavender import suite
 from lavender.errors import InputError, LavenderError
-from lavender.solvers._plan import rates as plan_rates
+from lavender.solvers.costs import rates as plan_rates
 
 ONE = regret.Regret(
     case="x",

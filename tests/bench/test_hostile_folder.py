@@ -412,12 +412,12 @@ def hostile(tmp_path, monkeypatch):
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: hostile-backends\nVersion: 1.0\n")
     points = [f"x_{n} = hostile_backends:{n.upper()}" for n in HARM]
     (info / "entry_points.txt").write_text("[lavender.solvers]\n" + "\n".join(points) + "\n")
-    monkeypatch.setattr(registry, "_registered", dict(registry.specs()))
+    monkeypatch.setattr(registry, "registered", dict(registry.specs()))
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setenv("FAKE_NOTE", str(tmp_path / "note"))
-    registry._load_builtin_and_plugins.cache_clear()
+    registry.load.cache_clear()
     yield tmp_path / "note"
-    registry._load_builtin_and_plugins.cache_clear()
+    registry.load.cache_clear()
 
 
 @pytest.fixture

@@ -21,9 +21,9 @@ def manifold(a, b, **more):
     for kind, size, keywords in (a, b):
         getattr(scene, f"add_{kind}")(size, **keywords)
     sim = lv.Simulation(scene)
-    sim._prepare()
-    c = int(sim._state.head[HEAD["contacts"]])
-    return {k: sim._state.a[k][:c].copy() for k in ("contact_pair", "point", "normal", "gap", "key")}
+    sim.prepare_substep()
+    c = int(sim.state.head[HEAD["contacts"]])
+    return {k: sim.state.a[k][:c].copy() for k in ("contact_pair", "point", "normal", "gap", "key")}
 
 
 def support(body, d):
@@ -147,13 +147,13 @@ def test_a_centre_inside_a_box_leaves_by_the_nearest_face():
 
 
 def pairs_of(sim):
-    sim._prepare()
-    return {tuple(p) for p in sim._state.a["pair"][: sim._state.head[HEAD["pairs"]]].tolist()}
+    sim.prepare_substep()
+    return {tuple(p) for p in sim.state.a["pair"][: sim.state.head[HEAD["pairs"]]].tolist()}
 
 
 def overlapping(sim):
     """All pairs whose boxes of the pair list meet, tested one by one."""
-    a, bodies = sim._state.a, sim.scene.bodies
+    a, bodies = sim.state.a, sim.scene.bodies
     out = set()
     for i, j in itertools.combinations(range(len(bodies)), 2):
         if bodies[i].is_static and bodies[j].is_static:
@@ -192,7 +192,7 @@ def test_the_pair_list_is_that_of_testing_all(seed, n, spread, decades):
     sim = lv.Simulation(scene)
     found = pairs_of(sim)
     assert found == overlapping(sim)
-    listed = sim._state.a["pair"][: len(found)].tolist()
+    listed = sim.state.a["pair"][: len(found)].tolist()
     assert listed == sorted(listed)
 
 
@@ -207,18 +207,18 @@ def test_far_away_bodies_do_not_break_the_grid():
 def test_contacts_do_not_depend_on_the_age_of_the_pair_list():
     one, two = (lv.Simulation(lv.Scene("pile", n=40, kind="mixed")) for _ in range(2))
     for _ in range(120):
-        two._state.head[HEAD["pairs_valid"]] = 0  # made anew in every step
+        two.state.head[HEAD["pairs_valid"]] = 0  # made anew in every step
         a, b = one.step()[0], two.step()[0]
         np.testing.assert_array_equal(a["positions"], b["positions"])
         np.testing.assert_array_equal(a["contacts"]["pair"], b["contacts"]["pair"])
-    assert one._state.head[HEAD["rebuilds"]] < 0.7 * two._state.head[HEAD["rebuilds"]]
+    assert one.state.head[HEAD["rebuilds"]] < 0.7 * two.state.head[HEAD["rebuilds"]]
 
 
 def test_ten_thousand_bodies_cost_a_hundred_times_a_hundred():
     def work(n):
         sim = lv.Simulation(lv.Scene("pile", n=n, walls=False))
-        sim._prepare()
-        return int(sim._state.head[HEAD["pairs"]]) / n
+        sim.prepare_substep()
+        return int(sim.state.head[HEAD["pairs"]]) / n
 
     # Pairs per body stay what they are: the list, and with it the time, is linear.
     assert work(10_000) < 1.5 * work(1000) < 20
@@ -250,7 +250,7 @@ def test_shuffled_and_false_keys_do_no_harm():
     for kind in ("none", "shuffled", "false", "rotated impulses"):
         sim = lv.Simulation(start.scene)
         sim.restore(cold)
-        a, n = sim._state.a, int(sim._state.head[HEAD["cached"]])
+        a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
         if kind == "shuffled":
             for i in range(0, n, 4):  # among the points of one pair: the distance guard sees it
                 a["cache_key"][i : i + 4] = rng.permutation(a["cache_key"][i : i + 4])
@@ -269,7 +269,7 @@ def test_shuffled_and_false_keys_do_no_harm():
 
 def test_an_entry_far_from_the_contact_is_stale():
     sim = settled(n=2, substeps=1)
-    a, n = sim._state.a, int(sim._state.head[HEAD["cached"]])
+    a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
     a["cache_local"][:n] += 10.0
     assert sim.step()[0]["solver"][3] == 0
     assert sim.step()[0]["solver"][3] == n
@@ -284,7 +284,7 @@ def test_a_point_whose_key_changes_keeps_its_impulse():
     keys = set()
     for step in range(12):
         observation = sim.step()[0]
-        keys |= set(sim._state.a["key"][:4].tolist())
+        keys |= set(sim.state.a["key"][:4].tolist())
         assert observation["solver"][3] == (4 if step else 0)
     assert len(keys) > 4
     assert observation["positions"][box, 0] > 0.5
@@ -311,7 +311,7 @@ def test_capacity_is_asked_for_in_one_go():
     sim = lv.Simulation(lv.Scene("pile", n=200, kind="boxes"))
     grown = 0
     for _ in range(100):
-        before = int(sim._state.size[CAP_CONTACT])
+        before = int(sim.state.size[CAP_CONTACT])
         sim.step()
-        grown += int(sim._state.size[CAP_CONTACT]) != before
+        grown += int(sim.state.size[CAP_CONTACT]) != before
     assert grown <= 3

@@ -90,9 +90,9 @@ def test_warm_starts_begin_closer_and_are_missed_when_switched_off():
 def test_warm_starts_keep_their_matches_for_ten_minutes():
     sim = lv.Simulation(lv.Scene("stack", solver_iterations=4))
     for _ in range(600):
-        status, done = sim._state.kernel.substeps(240)
+        status, done = sim.state.kernel.substeps(240)
         assert (status, done) == (0, 240)
-        head = sim._state.head
+        head = sim.state.head
         assert head[HEAD["contacts"]] == head[HEAD["matches"]] == 24
 
 

@@ -47,9 +47,9 @@ def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared(tmp_path):
         sim.step()
     assert set(check.GIVEN) | set(check.CARRIED) | {"head", "setting", "ptr"} == set(KEPT)
     for name in check.GIVEN:
-        if not sim._state.a[name].size:
+        if not sim.state.a[name].size:
             continue
-        state = sim._state.copy()
+        state = sim.state.copy()
         state.a[name].reshape(-1).view(np.uint8)[0] ^= 1
         shot = sim.snapshot()
         bad = lv.Snapshot(shot.fingerprint, 5, 0, "", state.size, state.real, state.index, state.keys)
@@ -96,7 +96,7 @@ def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name):
         assert getattr(shot, field).tobytes() == getattr(again, field).tobytes()
     expected, problem = trajectory(sim, 5), sim.constraint_problem()
     # a list that hides every pair changes nothing
-    state = sim._state.copy()
+    state = sim.state.copy()
     state.real[:], state.index[:], state.keys[:] = shot.real, shot.index, shot.keys
     state.head[HEAD["pairs"]] = 0
     sim.restore(
@@ -198,7 +198,7 @@ class Watched:
 
 def test_ctrl_c_between_very_many_substeps_is_told():
     sim = lv.Simulation(lv.Scene("stack", n=2, substeps=10**6))  # whose arrays need not grow
-    start, kernel, asked = sim.snapshot(), sim._state.kernel, []
+    start, kernel, asked = sim.snapshot(), sim.state.kernel, []
 
     def substeps(most):
         asked.append(most)
@@ -206,7 +206,7 @@ def test_ctrl_c_between_very_many_substeps_is_told():
             _thread.interrupt_main()  # the flag of the signal: Python looks at it before its next line
         return kernel.substeps(most)
 
-    sim._state.kernel = Watched(kernel, substeps=substeps)
+    sim.state.kernel = Watched(kernel, substeps=substeps)
     with pytest.raises(KeyboardInterrupt):
         sim.step()
     assert len(asked) == 4
@@ -280,7 +280,7 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
     scene = lv.Scene("bridge", n=4, solver="caller", substeps=3, solver_iterations=1)
     sim, twin = lv.Simulation(scene), lv.Simulation(scene)
     trajectory(sim, 3), trajectory(twin, 3)
-    before = sim._state.copy()
+    before = sim.state.copy()
     solver = sim_solver(scene)
     solver.now, solver.at = staticmethod(stop), solver.runs + at
     with pytest.raises(KeyboardInterrupt):
@@ -288,12 +288,12 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
     assert sim.steps == 3
     assert sim.last_solution is None
     for name in CARRIED:
-        np.testing.assert_array_equal(sim._state.a[name], before.a[name], err_msg=name)
+        np.testing.assert_array_equal(sim.state.a[name], before.a[name], err_msg=name)
     with pytest.raises(lv.InputError, match="stopped"):
         sim.residual()
     assert trajectory(sim, 4) == trajectory(twin, 4)
     for name in CARRIED:
-        np.testing.assert_array_equal(sim._state.a[name], twin._state.a[name], err_msg=name)
+        np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
 
 
 def sim_solver(scene):
@@ -340,7 +340,7 @@ threading.Thread(target=interrupt).start()
 try:
     sim.step()
 except KeyboardInterrupt:
-    assert sim.steps == 0 and sim._state.head[11] == 0
+    assert sim.steps == 0 and sim.state.head[11] == 0
 else:
     raise SystemExit("not stopped")
 """
@@ -363,8 +363,8 @@ def test_the_state_is_copied_only_where_a_registered_solver_may_stop_half_way(mo
     ):
         kept.clear()
         sim = lv.Simulation(lv.Scene("stack", n=2, **more))
-        keep = sim._state.kernel.keep
-        sim._state.kernel = Watched(sim._state.kernel, keep=lambda keep=keep: kept.append(keep()))
+        keep = sim.state.kernel.keep
+        sim.state.kernel = Watched(sim.state.kernel, keep=lambda keep=keep: kept.append(keep()))
         sim.step()
         assert len(kept) == copies, more
 
@@ -399,9 +399,9 @@ def test_coincident_spheres_touch_or_are_refused():
 
 def test_room_for_more_contacts_than_memory_is_refused():
     sim = lv.Simulation(lv.Scene("stack", n=2))
-    sim._state.head[HEAD["need_contacts"]] = 2**28
+    sim.state.head[HEAD["need_contacts"]] = 2**28
     with pytest.raises(lv.InputError, match="GiB"):
-        sim._state.grown()
+        sim.state.grown()
 
 
 # -- numbers at the edge of float64 --------------------------------------------------------------------

@@ -23,7 +23,7 @@ SCENES = [
 
 
 def impulses(sim, observation):
-    s = sim._state
+    s = sim.state
     return np.concatenate([observation["joint_impulses"], _contact_rows(s)])
 
 

@@ -149,12 +149,13 @@ def test_a_closed_system_keeps_its_momentum(kind):
     before = momentum(sim.reset()[0])
     contacts = 0
     for _ in range(240):
-        contacts += int(run(sim, 1)["solver"][2])
-    after = momentum(sim._observe())
+        last = run(sim, 1)
+        contacts += int(last["solver"][2])
+    after = momentum(last)
     assert contacts > 0 or kind != "collisions"
     # Rounding of a few hundred additions near 10 kg m^2/s.
     np.testing.assert_allclose(after, before, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(sim._observe()["quaternions"], axis=1), 1.0, atol=1e-15)
+    np.testing.assert_allclose(np.linalg.norm(last["quaternions"], axis=1), 1.0, atol=1e-15)
 
 
 def test_a_tumbling_body_keeps_its_energy_to_second_order():
@@ -186,7 +187,7 @@ def test_joints_hold(name):
     worst = 0.0
     for _ in range(600):
         run(sim, 1)
-        worst = max(worst, sim._state.setting[SETTING["joint_error"]])
+        worst = max(worst, sim.state.setting[SETTING["joint_error"]])
     # A substep drifts by (h omega)^2 r / 2 to first order, about 4 mm here; a fifth of the error is removed in each.
     assert worst < 0.025
 
@@ -227,8 +228,8 @@ def test_with_the_friction_disk_it_falls_too_and_friction_acts():
 def steady(sweeps, steps=60, **more):
     # one direction of sweeping and whole steps, as the dense twin has it
     sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, substeps=1, order="given", **more))
-    rows = [(run(sim, 1)["solver"], sim._observe()["contacts"]["depth"].max()) for _ in range(steps)]
-    return np.array([r[0] for r in rows[20:]]), np.array([r[1] for r in rows[20:]])
+    rows = [run(sim, 1) for _ in range(steps)][20:]
+    return np.array([r["solver"] for r in rows]), np.array([r["contacts"]["depth"].max() for r in rows])
 
 
 def test_a_cold_stack_in_the_steady_state_carries_its_weight_through_the_sweeps():

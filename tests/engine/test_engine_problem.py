@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
+from lavender.engine import stepping
 from lavender.engine.layout import HEAD, SETTING
 from lavender.scene.scene import SCENE_ORDERS
 
@@ -48,8 +49,8 @@ def test_every_substep_of_the_defaults_has_the_bits_of_the_front_door():
     for _ in range(40):
         problem = sim.constraint_problem()
         expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
-        assert sim._state.kernel.substeps(1) == (0, 1)
-        np.testing.assert_array_equal(sim._state.a["impulse"][: problem.m], expected)
+        assert sim.state.kernel.substeps(1) == (0, 1)
+        np.testing.assert_array_equal(sim.state.a["impulse"][: problem.m], expected)
 
 
 @pytest.mark.parametrize("order", SCENE_ORDERS)
@@ -234,25 +235,25 @@ def test_substeps_are_steps_of_a_fraction():
 def test_arrays_grow_without_changing_the_trajectory():
     scene = lv.Scene("pile", n=60, kind="boxes")
     sim, tight = lv.Simulation(scene), lv.Simulation(scene)
-    small = tight._state.size.copy()
+    small = tight.state.size.copy()
     small[8:10] = 3  # room for three pairs and three contacts
-    state = type(tight._state)(small)
-    for name, array in tight._state.a.items():
+    state = type(tight.state)(small)
+    for name, array in tight.state.a.items():
         goal = state.a[name]
         goal[...] = array[tuple(slice(n) for n in goal.shape)]
-    tight._state = state
+    tight.state = state
     for _ in range(80):
         a, b = sim.step()[0], tight.step()[0]
         np.testing.assert_array_equal(a["positions"], b["positions"])
-    assert tight._state.size[9] >= a["solver"][2] > 3
+    assert tight.state.size[9] >= a["solver"][2] > 3
 
 
 def test_what_lacks_room_says_so_before_any_state_has_changed():
     sim = lv.Simulation("stack")
-    size = sim._state.size.copy()
+    size = sim.state.size.copy()
     size[9] = 5
-    state = type(sim._state)(size)
-    for name, array in sim._state.a.items():
+    state = type(sim.state)(size)
+    for name, array in sim.state.a.items():
         goal = state.a[name]
         goal[...] = array[tuple(slice(n) for n in goal.shape)]
     before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
@@ -291,25 +292,25 @@ def test_direct_steps_a_chain_like_many_sweeps():
 def test_a_failed_solve_is_counted_and_dealt_with(policy):
     # One sweep of pgs cannot reach 1e-6 on six boxes.
     sim = lv.Simulation(lv.Scene("stack", solver="pgs", solver_iterations=1, on_failure=policy))
-    sim._state.head[HEAD["warm_start"]] = 1
+    sim.state.head[HEAD["warm_start"]] = 1
     if policy == "raise":
         twin = lv.Simulation(lv.Scene("stack", solver="pgs", solver_iterations=1, on_failure="use"))
         with pytest.raises(lv.SolveFailed, match="step 0"):
             sim.step()
         assert sim.steps == 0
         for name in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse"):
-            np.testing.assert_array_equal(sim._state.a[name], twin._state.a[name])
+            np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name])
         # The same where a later substep fails.
         scene = lv.Scene(dt=0.2, substeps=4, solver="pgs", solver_iterations=1, on_failure="raise")
         scene.add_plane()
         scene.add_box(position=(0, 0, 0.62), quaternion=(1, 0.02, 0.03, 0))
         sim = lv.Simulation(scene)
-        before = sim._state.copy()
+        before = sim.state.copy()
         with pytest.raises(lv.SolveFailed):
             sim.step()
-        assert sim._state.head[HEAD["step"]] == 0
+        assert sim.state.head[HEAD["step"]] == 0
         for name in ("setting", "x", "q", "v", "cache_key", "cache_impulse", "joint_impulse"):
-            np.testing.assert_array_equal(sim._state.a[name], before.a[name])
+            np.testing.assert_array_equal(sim.state.a[name], before.a[name])
         return
     problem = sim.constraint_problem()
     found = lv.solve(problem, "pgs", max_iter=1).impulse
@@ -395,11 +396,11 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
 
 def test_setting_places_are_those_of_the_kernels():
     sim = lv.Simulation(lv.Scene("stack", dt=0.02, substeps=2, gravity=3.0))
-    assert sim._state.setting[SETTING["h"]] == 0.01
+    assert sim.state.setting[SETTING["h"]] == 0.01
     sim.step()
     # free fall of the top box over two substeps, had it nothing below: v = -g h at least once
-    assert sim._state.a["v_free"][:, 2].min() <= -0.03 + 1e-12
-    assert sim._state.head[HEAD["contacts"]] == 24 and sim._state.head[HEAD["step"]] == 2
+    assert sim.state.a["v_free"][:, 2].min() <= -0.03 + 1e-12
+    assert sim.state.head[HEAD["contacts"]] == 24 and sim.state.head[HEAD["step"]] == 2
 
 
 def test_the_motion_of_a_step_is_the_motion_error_of_its_problem():
@@ -417,7 +418,7 @@ def test_the_motion_of_a_step_is_the_motion_error_of_its_problem():
 
 
 def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
-    monkeypatch.setattr(lv.Simulation, "_moved", None)
+    monkeypatch.setattr(stepping, "moved", None)
     *_, info = lv.Simulation("stack").step()
     assert "motion" not in info
 

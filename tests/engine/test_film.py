@@ -126,8 +126,8 @@ def test_a_port_that_is_taken_is_refused_and_nothing_is_filmed():
         port = int(viewer.address.split(":")[2].split("/")[0])
         with pytest.raises(lv.InputError, match=f"port {port}"):
             sim.view(port=port, browser=False)
-        assert len(sim._films) == 1
-    assert sim._films == []
+        assert len(sim.films) == 1
+    assert sim.films == []
 
 
 @pytest.mark.parametrize(("dt", "rate"), [(1 / 60, 30), (1 / 7, 30), (1 / 240, 24)])

@@ -83,7 +83,7 @@ def test_what_a_scene_does_not_declare_is_not_allocated():
         scene = lv.Scene(**more)
         scene.add_plane()
         scene.add_sphere(position=(0, 0, 0.5))
-        return lv.Simulation(scene)._state
+        return lv.Simulation(scene).state
 
     smooth, rough, spin = size(friction=0.0), size(), size(patch_radius=0.1)
     rows = SIZE["rows_per_contact"]
@@ -97,7 +97,7 @@ def test_what_a_scene_does_not_declare_is_not_allocated():
     scene.add_plane()
     scene.add_sphere()
     scene.add_body(friction=1.0)
-    assert lv.Simulation(scene)._state.size[rows] == 1
+    assert lv.Simulation(scene).state.size[rows] == 1
 
 
 def test_contacts_of_one_scene_may_have_different_rows():
@@ -322,8 +322,8 @@ def test_anchors_lie_where_they_were_given():
         np.testing.assert_allclose(body.position + r @ anchor, [0.5, 0.5, 0.5], atol=1e-15)
         np.testing.assert_allclose(r @ axis, np.array([1, 2, 3]) / np.sqrt(14), atol=1e-15)
     sim = lv.Simulation(scene)
-    sim._prepare()
-    np.testing.assert_allclose(sim._state.a["joint_error"], 0.0, atol=1e-15)
+    sim.prepare_substep()
+    np.testing.assert_allclose(sim.state.a["joint_error"], 0.0, atol=1e-15)
 
 
 def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(monkeypatch):

@@ -15,15 +15,15 @@ FELL = 0.05  # m, from where a box began
 def drift(name, seconds=MINUTE, *, dt=1 / 60, **parameters):
     """Largest distance [m] of a body from where it was after two seconds, looked at ten times a second."""
     sim = lv.Simulation(lv.Scene(name, dt=dt, **parameters))
-    every, start, most, first = round(0.1 / dt), None, 0.0, sim._state.a["x"].copy()
+    every, start, most, first = round(0.1 / dt), None, 0.0, sim.state.a["x"].copy()
     for step in range(every, round(seconds / dt) + 1, every):
         left = every * sim.scene.parameters.substeps
         while left:
-            status, done = sim._state.kernel.substeps(left)
+            status, done = sim.state.kernel.substeps(left)
             left -= done
             if status == 1:
-                sim._state = sim._state.grown()
-        x = sim._state.a["x"]
+                sim.state = sim.state.grown()
+        x = sim.state.a["x"]
         if np.abs(x - first).max() > FELL:  # also before it counts
             return np.inf
         if step * dt >= 2.0 - 1e-9:
@@ -113,7 +113,7 @@ def test_contacts_of_an_alternating_scene_turn_round_every_substep():
     for _ in range(6):
         problem = sim.constraint_problem()
         contacts = sim.step()[0]["contacts"]
-        assert sim._state.a["key"][: len(contacts["pair"])].tolist() == problem.key.tolist()
+        assert sim.state.a["key"][: len(contacts["pair"])].tolist() == problem.key.tolist()
         seen.append(problem.key.tolist())
     assert seen[0] != sorted(seen[0])[::-1]
     for even, odd in zip(seen[::2], seen[1::2], strict=True):
@@ -126,12 +126,12 @@ def test_contacts_of_an_alternating_scene_turn_round_every_substep():
 def test_a_bearing_contact_is_in_place_within_the_slop():
     """Target of the normal row, equations (1) and (2) of the engine's contacts, read from the problem."""
     sim = lv.Simulation(lv.Scene("stack", n=1, substeps=1, dt=0.01, gravity=10.0))
-    p, beta = sim.scene.parameters, sim._state.setting[SETTING["beta"]]
+    p, beta = sim.scene.parameters, sim.state.setting[SETTING["beta"]]
     for _ in range(5):
         sim.step()
 
     def targets(gap, warm):
-        a, head = sim._state.a, sim._state.head
+        a, head = sim.state.a, sim.state.head
         kept = a["x"].copy(), head[HEAD["warm_start"]]
         a["x"][1, 2] = 0.5 + gap
         head[HEAD["warm_start"]] = warm

@@ -218,7 +218,7 @@ def dense_descent(sim, passes, keep, stiffening):
     rows, h = p.rows, sim.scene.parameters.dt
     j = rows.jacobian(p.cones).toarray()
     n = rows.n_bodies
-    state = sim._state.copy()
+    state = sim.state.copy()
     state.kernel.prepare()
     gap = state.a["gap"][: rows.n_contacts]
     mass = np.zeros((6 * n, 6 * n))
@@ -314,7 +314,7 @@ def test_stages_one_by_one_are_the_substep(name):
     sim = lv.Simulation(lv.Scene("pyramid", base=4, stepper=name, substeps=1, solver_iterations=8))
     for _ in range(20):
         sim.step()
-    one, two = sim._state.copy(), sim._state.copy()
+    one, two = sim.state.copy(), sim.state.copy()
     for _ in range(10):
         assert one.kernel.substeps(1)[1] == 1
         two.kernel.prepare()
@@ -374,7 +374,7 @@ def test_a_stopped_prepare_leaves_no_softness_behind():
     sim = lv.Simulation("stack", stepper="soft_step")
     for _ in range(5):
         sim.step()
-    state = sim._state.copy()
+    state = sim.state.copy()
     state.kernel.prepare()
     first = state.a["b"].copy(), state.a["d"].copy()
     state.kernel.prepare()

@@ -10,7 +10,7 @@ import lavender as lv
 from lavender import registry, suite
 from lavender.certificates import check_certificate
 from lavender.external import backends, qp_solver
-from lavender.external._running import Answer
+from lavender.external.running import Answer
 from lavender.measures import qp_residual
 
 BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
@@ -239,12 +239,12 @@ APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACK
 
 @pytest.mark.parametrize("name", BACKENDS)
 def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeypatch):
-    from lavender.external import _apart
+    from lavender.external import apart
 
     problem = lv.Problem.lcp(*spd(12, seed=3))
     plain = lv.solve(problem, name)
-    calls, call = [], _apart.call
-    monkeypatch.setattr(_apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
+    calls, call = [], apart.call
+    monkeypatch.setattr(apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
     apart = lv.solve(problem, name, time_limit=600.0)
     assert calls and all(answer is not None for answer in calls)
     calls.clear()
@@ -293,18 +293,18 @@ def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
 def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
-    from lavender.external import _apart
+    from lavender.external import apart
 
     problem = lv.Problem.lcp(*spd(5))
     lv.solve(problem, APART[0], time_limit=600.0)
-    kept = list(_apart._idle)
+    kept = list(apart.idle)
     assert len(kept) == 1
     lv.solve(problem, APART[0], time_limit=600.0)
-    assert _apart._idle == kept
-    kept[0]._process.kill()
-    kept[0]._process.wait()
+    assert apart.idle == kept
+    kept[0].popen.kill()
+    kept[0].popen.wait()
     assert lv.solve(problem, APART[0], time_limit=600.0).success
-    assert _apart._idle != kept
+    assert apart.idle != kept
 
 
 @pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")

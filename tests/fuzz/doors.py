@@ -240,7 +240,7 @@ def plug_in(spec):
             problem, "liar", impulse=first.impulse if np.isfinite(first.impulse).all() else None
         )
     finally:
-        del registry._registered["liar"]
+        del registry.registered["liar"]
     for solution in (first, second):
         judged = lv.residual(twin, solution.impulse).relative
         if solution.success and not np.isfinite(solution.impulse).all():

@@ -78,7 +78,7 @@ def test_settings_are_those_of_the_scene():
 
 def test_settings_read_and_written_change_nothing_else():
     simulation = running("pyramid", base=4)
-    state, before = simulation._state, simulation.snapshot()
+    state, before = simulation.state, simulation.snapshot()
     given = np.frombuffer(memory.read_settings(*buffers(state)), SETTINGS).copy()
     memory.write_settings(*buffers(state), given)
     assert state.real.tobytes() == before.real.tobytes()
@@ -95,7 +95,7 @@ def test_settings_read_and_written_change_nothing_else():
 
 def test_room_is_made_as_the_simulation_makes_it():
     simulation = running("pyramid", steps=0, base=8)
-    state = simulation._state
+    state = simulation.state
     assert state.kernel.prepare() == 1  # the first pair list does not fit
     expected = state.grown()
     size = memory.more_room(*buffers(state))
@@ -109,12 +109,12 @@ def test_room_is_made_as_the_simulation_makes_it():
 
 def test_moving_while_running_keeps_the_motion():
     simulation, twin = (running("pile", n=40, kind="mixed") for _ in range(2))
-    state = simulation._state
+    state = simulation.state
     size = state.size.copy()
     size[8:] += 100
     moved = State(size)
     memory.move(*buffers(state), *buffers(moved))
-    simulation._state = moved
+    simulation.state = moved
     for _ in range(30):
         a, b = simulation.step()[0], twin.step()[0]
         assert a["positions"].tobytes() == b["positions"].tobytes()
@@ -125,7 +125,7 @@ def test_moving_while_running_keeps_the_motion():
 @pytest.mark.parametrize("order", ["given", "random", "top_down"])
 def test_watched_sweeps_are_the_sweeps(name, order):
     simulation = running(name, order=order, solver_iterations=12)
-    watched, plain = simulation._state.copy(), simulation._state.copy()
+    watched, plain = simulation.state.copy(), simulation.state.copy()
     for state in (watched, plain):
         assert state.kernel.prepare() == 0
     curve = np.full((13, 2), np.nan)

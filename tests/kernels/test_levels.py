@@ -12,7 +12,7 @@ from lavender_ext.accelerate.accelerated import Pairs
 def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
     """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
     prepared = lv.prepare(problem, name, **options)
-    solver, state = prepared._solver, prepared._state
+    solver, state = prepared.solver, prepared.state
     state.space = (*state.space[:4], Pairs(packs))
     rng = np.random.default_rng(problem.m)
     lam = 0.05 * np.abs(rng.normal(size=problem.m))
@@ -80,4 +80,4 @@ def test_hostile_numbers_do_no_harm():
     prepared = lv.prepare(problem, "nncg", order="symmetric")
     for bad in (np.nan, np.inf, 1e300, -1e300):
         lam = np.full(problem.m, bad)
-        prepared._solver.run(prepared._state, lam, 40, 0.0)
+        prepared.solver.run(prepared.state, lam, 40, 0.0)

@@ -51,7 +51,7 @@ def test_packed_contacts_change_no_bit(name, more, sweeps):
     sim.set_solver_iterations(sweeps)
     for _ in range(25):
         sim.step()
-        before = sim._state.copy()
+        before = sim.state.copy()
         twin = before.copy()
         assert before.kernel.substeps(1) == (0, 1)
         assert one_by_one(twin) == 0
@@ -64,7 +64,7 @@ def test_packed_contacts_keep_every_order(name, order):
     sim = lv.Simulation(lv.Scene(name, order=order, seed=3))
     for _ in range(12):
         sim.step()
-        before, twin = sim._state.copy(), sim._state.copy()
+        before, twin = sim.state.copy(), sim.state.copy()
         assert before.kernel.substeps(1) == (0, 1)
         assert one_by_one(twin) == 0
         same(before, twin)
@@ -96,7 +96,7 @@ def test_packed_contacts_of_boxes_thrown_together(mixed):
     most, rows_of = 0, set()
     for _ in range(150):
         sim.step()
-        before, twin = sim._state.copy(), sim._state.copy()
+        before, twin = sim.state.copy(), sim.state.copy()
         if before.kernel.substeps(1)[0] == 1:  # more contacts than there is room for: `step` makes it
             continue
         assert one_by_one(twin) == 0
@@ -154,7 +154,7 @@ def in_chunks(problem, order, counts, start, *, packs=True):
     if order == "array":
         order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
     prepared = lv.prepare(problem, "sequential_impulses", order=order)
-    solver, state = prepared._solver, prepared._state
+    solver, state = prepared.solver, prepared.state
     if not packs:
         state.packing = None
     lam = start.copy()
@@ -240,9 +240,9 @@ def test_checks_between_packed_sweeps_see_what_they_would(tol):
     for packs in (True, False):
         prepared = lv.prepare(pile, "sequential_impulses")
         if not packs:
-            prepared._state.packing = None
+            prepared.state.packing = None
         solutions.append(prepared.solve(tol=tol, max_iter=300))
-        assert not packs or prepared._state.packing.shape[0] > 0
+        assert not packs or prepared.state.packing.shape[0] > 0
     a, b = solutions
     assert (a.status, a.iterations) == (b.status, b.iterations)
     np.testing.assert_array_equal(a.impulse.view(np.uint8), b.impulse.view(np.uint8))
@@ -253,14 +253,14 @@ def test_a_new_problem_takes_over_the_room():
     other = replace(problem, b=problem.b + 0.01)
     prepared = lv.prepare(problem, "sequential_impulses")
     prepared.solve(tol=0.0, max_iter=20)
-    state, lam = prepared._state, np.zeros(problem.m)
+    state, lam = prepared.state, np.zeros(problem.m)
     again = prepared.solve(other, tol=0.0, max_iter=20)
     fresh = lv.solve(other, "sequential_impulses", tol=0.0, max_iter=20)
     np.testing.assert_array_equal(again.impulse.view(np.uint8), fresh.impulse.view(np.uint8))
     # what was there before goes on one by one
     assert state.packing.shape == (0, 0)
     state.velocity = None
-    prepared._solver.run(state, lam, 20, 0.0)
+    prepared.solver.run(state, lam, 20, 0.0)
     one = in_chunks(problem, "given", [20], np.zeros(problem.m), packs=False)[0]
     np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
 
@@ -284,4 +284,4 @@ def test_contacts_of_one_body_are_not_packed():
 
 @pytest.mark.parametrize("order", ["symmetric", "random"])
 def test_orders_that_change_are_not_packed(order):
-    assert lv.prepare(tangled(2, 60, 10), "sequential_impulses", order=order)._state.packing is None
+    assert lv.prepare(tangled(2, 60, 10), "sequential_impulses", order=order).state.packing is None

@@ -15,10 +15,10 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import generalized as coordinates
 from lavender import registry
-from lavender.solvers._newton import general
-from lavender.solvers._plan import candidates
-from lavender.solvers._structure import Structure
+from lavender.solvers.costs import candidates
 from lavender.solvers.islands import islands, restrict, rows_of
+from lavender.solvers.newton_systems import general
+from lavender.solvers.structure import Structure
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.generalized.newton import ENDS
 

@@ -1,6 +1,8 @@
 """Habits of this package that no linter knows."""
 
 import ast
+import re
+from pathlib import Path
 
 from worked import syntax_of_package
 
@@ -43,3 +45,53 @@ def test_no_object_of_many_fields_is_made_by_place():
 def test_a_long_call_is_seen():
     source = "a = Solution(1, 2, 3, 4, 5, 6)\nb = m.Solution(1, 2, 3, 4, 5)\nc = other(1, 2, 3, 4, 5, 6)"
     assert list(long_calls(ast.parse(source), {"Solution"})) == [(1, "Solution")]
+
+
+#: Documented in spite of their underscore: named tuples, ctypes, IPython, sys and os.
+DOCUMENTED = {"_replace", "_fields_", "_repr_html_", "_current_frames", "_exit"}
+PRIVATE = re.compile(r"_[a-zA-Z]\w*")
+
+
+def private_names(tree):
+    """Line and text of every private module, name or attribute that is taken from elsewhere."""
+    for node in ast.walk(tree):
+        taken = []
+        if isinstance(node, ast.ImportFrom):
+            taken = [*(node.module or "").split("."), *(name.name for name in node.names)]
+            taken = taken if taken[0] in ("lavender", "lavender_ext", "benchmarks") else []
+        elif isinstance(node, ast.Import):
+            taken = [part for name in node.names for part in name.name.split(".")[1:]]
+        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
+            taken = [node.attr]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
+            "setattr",
+            "getattr",
+        ):
+            words = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
+            taken = [part for word in words[:1] for part in word.split(".")]
+        if any(PRIVATE.fullmatch(part) and part not in DOCUMENTED for part in taken):
+            yield node.lineno, ".".join(taken)
+
+
+def test_tests_take_public_names_only():
+    """A layout that tests have taken hold of cannot change: what needs a test is its room's public name."""
+    tests = Path(__file__).resolve().parent.parent
+    found = [
+        f"{path.relative_to(tests)}:{line}: {name}"
+        for path in sorted(tests.rglob("*.py"))
+        for line, name in private_names(ast.parse(path.read_text(encoding="utf-8")))
+    ]
+    assert found == [], f"take a public way, or make public:\n{chr(10).join(found)}"
+
+
+def test_a_private_name_is_seen():
+    source = """
+from lavender.solvers._plan import plan
+from lavender.solve import _claim
+import lavender._plan
+problem._state, self._state, numpy.float64, named._replace
+monkeypatch.setattr(registry, "_registered", {})
+monkeypatch.setattr("lavender.solve._claim", None)
+import _thread
+"""
+    assert [line for line, _ in private_names(ast.parse(source))] == [2, 3, 4, 6, 7, 5]

@@ -130,7 +130,7 @@ def test_pivots_across_panels():
     a = np.diag(np.full(m, -0.1))
     a[i, i + 1], a[i + 1, i] = 1.0, -0.999
     problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
-    state = lv.prepare(problem, "admm")._state
+    state = lv.prepare(problem, "admm").state
     assert not isinstance(state, str), state
     assert state.full
     r = np.linspace(-1.0, 1.0, m)
@@ -143,7 +143,7 @@ def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
     a = sp.diags_array([np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1])
     problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
     prepared = lv.prepare(problem, "admm")
-    assert (prepared._state.factor is None) == (m > 1000), "of 60 rows at once"
+    assert (prepared.state.factor is None) == (m > 1000), "of 60 rows at once"
     # A minute is enough for 60 rows on any machine; of 1200 the factor is expected to take longer than 50 ms.
     solution = prepared.solve(time_limit=60.0 if m == 60 else 0.05, max_iter=30)
     assert (solution.status is lv.Status.TIME_LIMIT and solution.iterations == 0) == (m > 1000)
@@ -234,7 +234,7 @@ def test_work_is_told_once_however_a_run_is_cut(m):
 def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     problem = box_stack(20, 10.0, 0.5)
     prepared = lv.prepare(problem, "admm")
-    solver, state = prepared._solver, prepared._state
+    solver, state = prepared.solver, prepared.state
     impulse, made = problem.start(), state.factorisations
     state.factor = None  # as of a problem whose first factor is large
     solver.until(state, Deadline(-1.0))
@@ -251,9 +251,9 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
 def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
     problem = box_stack(8, 10.0)
     before = lv.solve(problem, "admm", max_iter=200, tol=1e-8)
-    monkeypatch.setattr("lavender.solvers.admm._AT_ONCE", -1.0)
+    monkeypatch.setattr("lavender.solvers.admm.AT_ONCE", -1.0)
     prepared = lv.prepare(problem, "admm")
-    assert prepared._state.factor is None
+    assert prepared.state.factor is None
     after = prepared.solve(max_iter=200, tol=1e-8)
     assert after.impulse.tobytes() == before.impulse.tobytes()
     assert after.work == before.work

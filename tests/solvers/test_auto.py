@@ -9,10 +9,10 @@ from random_problems import as_matrix, good, random_contact_problem, random_lcp,
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry, suite
-from lavender.solvers._certify import certify
-from lavender.solvers._log import SolveLog
-from lavender.solvers._newton import general
+from lavender.solvers.certify import certify
 from lavender.solvers.islands import islands, restrict, rows_of
+from lavender.solvers.newton_systems import general
+from lavender.solvers.solve_log import SolveLog
 
 
 def several(count, seed=0, friction="coulomb"):
@@ -135,7 +135,7 @@ def test_small_islands_of_generalized_velocities_go_to_newton_at_once():
 
 
 def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
-    from lavender.solvers._newton import general
+    from lavender.solvers.newton_systems import general
 
     problem = wild(seed=7).problem
     kernel = general.prepare(problem)

@@ -56,10 +56,10 @@ def test_a_residual_that_is_too_small_breaks_the_inequality():
     honest = lv.residual(problem, wrong)
     # As if the judge had lost a factor of a thousand.
     faulty = replace(honest, error=1e-3 * honest.error, relative=1e-3 * honest.relative)
-    row = check._compare(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
+    row = check.compare(problem, "faulty", replace(optimum, impulse=wrong, residual=faulty), optimum)
     assert row.verdict == check.BREACH
     assert row.contradicted
-    fair = check._compare(
+    fair = check.compare(
         problem, "fair", replace(optimum, impulse=wrong, residual=honest, contradicted=""), optimum
     )
     assert fair.verdict == check.NOT_SOLVED

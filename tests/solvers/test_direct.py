@@ -10,8 +10,8 @@ from random_problems import good, random_lcp, seeds, without_solution
 
 import lavender as lv
 from benchmarks.drawn import wild
-from lavender._lu import sparse_lu
 from lavender.certificates import check_certificate
+from lavender.lu import sparse_lu
 from lavender.solvers.pivoting import PivotState
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import direct, principal
@@ -406,7 +406,7 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     y = rng.normal(size=(90, 100))
     problem = lv.Problem.lcp(y @ y.T, rng.normal(size=90))  # more than the compiled factor takes
     prepared = lv.prepare(problem, "direct")
-    pivot = prepared._state.pivot
+    pivot = prepared.state.pivot
     pivot.outside.seconds = 1e9  # by which its first factor would be refused
     refused = prepared.solve(time_limit=10.0)
     assert refused.status is lv.Status.TIME_LIMIT
@@ -490,7 +490,7 @@ def test_auto_does_not_begin_a_factor_that_fills(even):
     a = sp.coo_array((np.r_[x, x if even else y], (np.r_[i, j], np.r_[j, i])), shape=(m, m)).tocsr()
     a = sp.csr_array(a + sp.diags_array(2.0 * np.abs(a).sum(axis=1) + 1.0))
     problem = lv.Problem.linear(0.5 * (a + a.T) if even else a, rng.normal(size=m))
-    factor = SparsePanels(*problem._compressed[:2], not even)
+    factor = SparsePanels(problem.csr.indptr, problem.csr.indices, not even)
     assert factor.work > 1e8
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success and "factorisations" not in solution.work, solution

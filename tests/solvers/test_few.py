@@ -20,9 +20,9 @@ from benchmarks.drawn import wild
 from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
-from lavender.solvers import _rates as rates
-from lavender.solvers._few import AUTO, ISLAND, Few, call_ends_within, general_cost
-from lavender.solvers._newton import general
+from lavender.solvers import weights
+from lavender.solvers.newton_systems import general
+from lavender.solvers.small import AUTO, ISLAND, Few, call_ends_within, general_cost
 from lavender_ext.few.many import solve_first
 
 SHORT = ("auto", "direct", "newton")
@@ -236,7 +236,7 @@ def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
     found = solve_first(problem.metric, None, np.inf, AUTO.gate, general.ROOM)
     cost = general_cost(problem, general.prepare(problem).largest)
-    assert (found is not None) == (cost <= rates.GENERAL_FIRST[problem.law])
+    assert (found is not None) == (cost <= weights.GENERAL_FIRST[problem.law])
 
 
 def side_by_side(parts):

@@ -209,5 +209,5 @@ def test_a_prepared_solve_that_is_cut_keeps_no_path():
     prepared = lv.prepare(random_lcp(3, 60), "lemke")
     cut = prepared.solve(max_iter=2)
     assert cut.status is lv.Status.MAX_ITERATIONS
-    assert prepared._state.walk is None  # a dictionary of every row
+    assert prepared.state.walk is None  # a dictionary of every row
     assert prepared.solve().iterations == lv.solve(random_lcp(3, 60), "lemke").iterations

@@ -13,12 +13,12 @@ from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
 from lavender.residuals import reference
-from lavender.solvers._certify import certify
-from lavender.solvers._log import SolveLog
-from lavender.solvers._methods import Sweeps
-from lavender.solvers._plan import METHODS, TABLE, Costs, candidates
-from lavender.solvers._structure import Structure
 from lavender.solvers.auto import Auto, solve
+from lavender.solvers.certify import certify
+from lavender.solvers.costs import METHODS, TABLE, Costs, candidates
+from lavender.solvers.methods import Sweeps
+from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.structure import Structure
 from lavender.suite.build import Bodies, Contacts, contact_problem
 
 NAMES = (
@@ -55,7 +55,7 @@ def test_a_plan_is_counted_and_a_solve_goes_by_it(name, monkeypatch):
 
 
 def test_nothing_is_run(monkeypatch):
-    from lavender.solvers._methods import Candidate
+    from lavender.solvers.methods import Candidate
 
     monkeypatch.setattr(Candidate, "run", None)
     for name in NAMES:
@@ -179,7 +179,7 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
-    monkeypatch.setattr("lavender.solvers._certify._proof", lambda *asked: 1 / 0)
+    monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
     certify(log)
     assert not log.turns
 

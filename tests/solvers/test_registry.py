@@ -142,8 +142,8 @@ def raises():
 def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypatch):
     entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
     monkeypatch.setattr(registry, "entry_points", lambda group: entries)
-    monkeypatch.setattr(registry, "_registered", {})
-    registry._load_builtin_and_plugins.cache_clear()
+    monkeypatch.setattr(registry, "registered", {})
+    registry.load.cache_clear()
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
@@ -153,7 +153,7 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
         assert "'broken'" in str(warning.message)
         assert sign in str(warning.message)
     finally:
-        registry._load_builtin_and_plugins.cache_clear()
+        registry.load.cache_clear()
         monkeypatch.undo()
         registry.specs()
 

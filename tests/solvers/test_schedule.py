@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lavender.solvers._schedule import AGAIN, BELIEVED, race, remainder
+from lavender.solvers.schedule import AGAIN, BELIEVED, race, remainder
 
 costs = st.floats(1e-3, 1e6)
 

@@ -30,7 +30,7 @@ def test_writing_out_changes_no_bit(order, pile, monkeypatch):
     monkeypatch.setattr("lavender.ordering.NEAR", 0)
     plain = sweeps(pile, order=order)
     monkeypatch.setattr(layout, "LARGE", 1)
-    state = lv.prepare(pile, "sequential_impulses", order=order)._state
+    state = lv.prepare(pile, "sequential_impulses", order=order).state
     assert state.layout is not None
     np.testing.assert_array_equal(sweeps(pile, order=order), plain)
 
@@ -56,7 +56,7 @@ def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkey
     monkeypatch.setattr(layout, "LARGE", 1)
     solver = lv.prepare(pile, "sequential_impulses", order="local")
     solver.solve(tol=1e-30, max_iter=40)
-    relative, impulse = solver._state.best
+    relative, impulse = solver.state.best
     assert lv.residual(pile, impulse).relative == pytest.approx(relative, rel=1e-9)
 
 
@@ -64,7 +64,7 @@ def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch)
     monkeypatch.setattr(layout, "LARGE", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
     blocks = np.arange(problem.n_blocks)[::-1]
-    state = lv.prepare(problem, "sequential_impulses", order=blocks)._state
+    state = lv.prepare(problem, "sequential_impulses", order=blocks).state
     assert state.layout is None
 
 
@@ -82,7 +82,7 @@ def test_threads_change_no_bit(name, large, pile, monkeypatch):
 def test_a_leader_needs_no_helper(pile):
     """Helpers that never come, or come when all is done, change nothing."""
     prepared = lv.prepare(pile, "sequential_impulses", order="colored")
-    state, lam = prepared._state, pile.start()
+    state, lam = prepared.state, pile.start()
     velocity = np.zeros(6 * (state.data.n_bodies + 1))
     team = Team(state.data, state.watch, lam, state.order.blocks, state.order.color_ptr, 8, velocity)
     assert team.lead(5, 0.0) == (0, 5)
@@ -96,7 +96,7 @@ def test_a_leader_needs_no_helper(pile):
 def test_small_problems_stay_on_one_thread():
     problem = lattice_pile(60)
     solver = lv.prepare(problem, "sequential_impulses", order="colored", threads=2)
-    assert not solver._solver.uses_threads(solver._state)
+    assert not solver.solver.uses_threads(solver.state)
 
 
 def test_local_brings_bodies_that_touch_together(pile, monkeypatch):

@@ -183,11 +183,11 @@ def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, mo
         LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
     ):
         pages.module()
-    other = b"\0asm\1\0\0\0" + wasm._section(wasm.SECTION, b"0" * 64)
+    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, b"0" * 64)
     (tmp_path / "lavender.wasm").write_bytes(other)
     with pytest.raises(LavenderError, match="is of other kernels"):
         pages.module()
-    fresh = b"\0asm\1\0\0\0" + wasm._section(wasm.SECTION, wasm.source_hash(ROOT).encode())
+    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, wasm.source_hash(ROOT).encode())
     (tmp_path / "lavender.wasm").write_bytes(fresh)
     assert pages.module() == fresh
 
@@ -370,7 +370,7 @@ def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
             host.Kernels(module, layout()), {"substeps": 1, **describe(simulation.snapshot())}
         )
         for _ in range(20):
-            state = simulation._state.copy()
+            state = simulation.state.copy()
             assert state.kernel.prepare() == 0
             curve = np.zeros((simulation.solver_iterations + 1, 2))
             state.kernel.solve_watched(curve)

@@ -177,7 +177,7 @@ def test_plots_hold_the_native_errors(visit):
     simulation = lv.Simulation("stack")
     for _ in range(9):
         simulation.step()
-    state = simulation._state.copy()
+    state = simulation.state.copy()
     assert state.kernel.substeps(1) == (0, 1)  # the last substep of two is watched
     assert state.kernel.prepare() == 0
     curve = np.zeros((17, 2))
@@ -558,7 +558,7 @@ def test_a_run_is_shown_live_and_again(browser, width):
         v.page.wait_for_function("lavender.frames.length === 61")
         assert v.page.text_content("#clock") == "0.500 s, frame 61 of 61"
         shown = v.js("Array.from(lavender.state.array('x'))")
-        assert shown == simulation._state.a["x"].astype(np.float32).ravel().tolist()
+        assert shown == simulation.state.a["x"].astype(np.float32).ravel().tolist()
         # something is painted, in the middle of the picture and not at its edge
         painted = """(() => {
             const c = document.querySelector("canvas");

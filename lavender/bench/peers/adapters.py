@@ -30,11 +30,11 @@ from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import InputError
 from lavender.external import clarabel_cone
-from lavender.external._running import Limits
 from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
+from lavender.external.running import Limits
 from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference

@@ -11,7 +11,7 @@ from typing import Any
 
 from lavender.bench.peers.contest import SCRATCH, TARGETS, Contestant, Result
 from lavender.bench.running.timing import one_thread
-from lavender.external._running import quiet
+from lavender.external.running import quiet
 from lavender.problem import Problem
 from lavender.residuals import residual
 

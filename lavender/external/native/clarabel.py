@@ -8,9 +8,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender.external._running import Answer, Limits
 from lavender.external.as_qp import QP, bound_rows
 from lavender.external.native._shared import set_all
+from lavender.external.running import Answer, Limits
 from lavender.solution import Status
 
 

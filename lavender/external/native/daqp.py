@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.external._running import Answer, Limits, at_least, proof
 from lavender.external.as_qp import QP, two_sided
+from lavender.external.running import Answer, Limits, at_least, proof
 from lavender.solution import Status
 
 

@@ -9,8 +9,8 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.external._running import Answer, Limits, at_least
 from lavender.external.as_qp import QP, two_sided
+from lavender.external.running import Answer, Limits, at_least
 from lavender.solution import Status
 
 

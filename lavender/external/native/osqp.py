@@ -9,9 +9,9 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.external._running import Answer, Limits
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.native._shared import certificate
+from lavender.external.running import Answer, Limits
 from lavender.solution import Status
 
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.external._running import Answer, Limits
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.native._shared import certificate, set_all
+from lavender.external.running import Answer, Limits
 from lavender.solution import Status
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError
-from lavender.external._running import quiet
+from lavender.external.running import quiet
 from lavender.phenomena.engines import Stepping
 from lavender.phenomena.engines.tree import parents, relative, xyzw
 from lavender.scene import Body, Box, Joint, Plane, Scene, Sphere

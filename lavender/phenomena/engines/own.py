@@ -35,7 +35,7 @@ class Engine(Stepping):
 
     def left(self) -> tuple[int, float, float]:
         """See `Stepping.left`."""
-        gap = np.abs(self.sim._state.a["joint_error"]).max(initial=0.0)
+        gap = np.abs(self.sim.state.a["joint_error"]).max(initial=0.0)
         depth = max(self.seen["contacts"]["depth"].max(initial=0.0), gap)
         return int(self.seen["solver"][2]), float(depth), float(self.sim.residual()["relative"])
 

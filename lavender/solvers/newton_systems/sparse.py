@@ -17,7 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._lu import sparse_lu
+from lavender.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph

@@ -15,14 +15,14 @@ import numpy as np
 
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
-from lavender.solvers import _rates as weights
+from lavender.solvers import weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
-from lavender.solvers._few import general_cost, prepared
-from lavender.solvers._newton import general
-from lavender.solvers._newton.systems import System, make_system
 from lavender.solvers.islands import block_bodies
+from lavender.solvers.newton_systems import general
+from lavender.solvers.newton_systems.systems import System, make_system
+from lavender.solvers.small import general_cost, prepared
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph

@@ -16,12 +16,12 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
-from lavender.solvers._log import SolveLog
-from lavender.solvers._newton import general
-from lavender.solvers._plan import BOTH_WAYS, METHODS, TABLE, Cost, Costs
-from lavender.solvers._schedule import AGAIN, remainder
+from lavender.solvers.costs import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
+from lavender.solvers.newton_systems import general
+from lavender.solvers.schedule import AGAIN, remainder
+from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.few.looks import Looks, sweeps_left
 

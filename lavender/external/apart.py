@@ -19,9 +19,9 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.apart.process import Ended, Process
 from lavender.errors import InputError
-from lavender.external._running import Answer, Failed, Limits
 from lavender.external.as_qp import QP
 from lavender.external.backend import Backend
+from lavender.external.running import Answer, Failed, Limits
 from lavender.solution import Status
 
 __all__ = ["ARRAYS", "Elsewhere", "call", "ready"]
@@ -33,7 +33,7 @@ GRACE = 2.0  # limits after which a backend that was told its own is ended
 HAND_OVER = 3e8  # bytes in a second that go to another process: pickled, through a pipe, and back into arrays
 
 _lock = Lock()
-_idle: list[Process] = []  # started, and not asked anything
+idle: list[Process] = []  # started, and not asked anything
 _owner = 0  # id of the process that started them: a fork's copies are not its own
 
 
@@ -126,10 +126,10 @@ def _take() -> Process | None:
     global _owner
     with _lock:
         if _owner != os.getpid():
-            _idle.clear()
+            idle.clear()
             _owner = os.getpid()
-        while _idle:
-            process = _idle.pop()
+        while idle:
+            process = idle.pop()
             if process.alive:
                 return process
             process.end()
@@ -138,11 +138,11 @@ def _take() -> Process | None:
 
 def _keep(process: Process) -> None:
     with _lock:
-        _idle.append(process)
+        idle.append(process)
 
 
 @atexit.register
 def _end() -> None:
     if _owner == os.getpid():
-        while _idle:
-            _idle.pop().end()
+        while idle:
+            idle.pop().end()

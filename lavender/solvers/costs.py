@@ -2,7 +2,7 @@
 
     cost = start + formed * entries + count * (row * m + work * w)                                            (1)
 
-m rows; w multiply-adds of one iteration, counted from the structure (`_structure.py`); start, row, work [ns] and count,
+m rows; w multiply-adds of one iteration, counted from the structure (`structure.py`); start, row, work [ns] and count,
 iterations to the end, are rates of `rates.json`, which `python -m benchmarks auto --fit` writes from runs of single
 solvers. No clock is read: the same problem has the same plan everywhere.
 """
@@ -20,7 +20,7 @@ from typing import Any
 
 from lavender.errors import InputError
 from lavender.problem import Problem
-from lavender.solvers._structure import Structure
+from lavender.solvers.structure import Structure
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
 
@@ -297,9 +297,9 @@ def candidates(structure: Structure) -> tuple[str, ...]:
 
 def made(problem: Problem, tol: float) -> Plan:
     """The plan of a problem to `tol`, counted in full; nothing is run."""
-    from lavender.solvers._log import SolveLog
-    from lavender.solvers._methods import make
-    from lavender.solvers._schedule import first
+    from lavender.solvers.methods import make
+    from lavender.solvers.schedule import first
+    from lavender.solvers.solve_log import SolveLog
 
     costs = Costs(problem, tol)
     methods = make(SolveLog(problem, tol, 2**31 - 1), costs, candidates(costs.structure))

@@ -12,8 +12,8 @@ from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
-from lavender.solvers._few import said
 from lavender.solvers.islands import islands
+from lavender.solvers.small import said
 from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]

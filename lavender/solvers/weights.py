@@ -1,7 +1,7 @@
 """Weights of factors and sweeps as kernels make them, and where the compiled calls for few rows have their limits.
 
 Nanoseconds of one core; constants, the same on every machine: no clock is read. What `auto` expects of a solver as a
-whole are the fitted rates of `rates.json` (`_plan.py`).
+whole are the fitted rates of `rates.json` (`costs.py`).
 """
 
 from __future__ import annotations

@@ -21,12 +21,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
-from lavender._lu import sparse_lu
+from lavender.lu import sparse_lu
 from lavender_ext.newton.panel import scaled_jacobian
 from lavender_ext.newton.solve import WHATS
 
 if TYPE_CHECKING:
-    from lavender.solvers._newton.systems import VelocitySystem
+    from lavender.solvers.newton_systems.systems import VelocitySystem
 
 __all__ = ["Augmented"]
 

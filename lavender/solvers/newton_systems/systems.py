@@ -16,10 +16,10 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solvers._newton.augmented import Augmented
-from lavender.solvers._newton.pattern import block_pattern, dissected, postordered
-from lavender.solvers._newton.sparse import Coupled, SparseRows
 from lavender.solvers.islands import block_bodies
+from lavender.solvers.newton_systems.augmented import Augmented
+from lavender.solvers.newton_systems.pattern import block_pattern, dissected, postordered
+from lavender.solvers.newton_systems.sparse import Coupled, SparseRows
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.elements import Elements
@@ -79,7 +79,7 @@ class System:
             sc.a_t, sc.a_s, s, sc.a_r,
         )  # fmt: skip
 
-    def _solve(self, matrix: Any, symmetric: bool, cones: bool, others: Any = None) -> Solve:
+    def new_solve(self, matrix: Any, symmetric: bool, cones: bool, others: Any = None) -> Solve:
         sc = self.sc
         reference(self.problem)
         return Solve(
@@ -159,7 +159,7 @@ class VelocitySystem(System):
         cones = len(sc.kind) < sc.m
         lu = cones and self.problem.law == "coulomb"
         factor = Factor(*self.structure, self.s, lu, self.panels, WIDE)
-        return self._solve(factor, True, cones and not sc.theta.any(), Augmented(self))
+        return self.new_solve(factor, True, cones and not sc.theta.any(), Augmented(self))
 
 
 class MatrixSystem(System):
@@ -176,7 +176,7 @@ class MatrixSystem(System):
             a = a[sc.keep][:, sc.keep]
         self.symmetric = problem.is_symmetric
         self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
-        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
+        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `weights.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
@@ -214,9 +214,9 @@ class MatrixSystem(System):
         """Newton's method on it; of a sparse H others factor."""
         cones = len(self.sc.kind) < self.sc.m
         if self.dense:
-            return self._solve(self.h, self.symmetric, cones)
+            return self.new_solve(self.h, self.symmetric, cones)
         others = SparseRows(self.sparse, self.symmetric)
-        made = self._solve((self.h.indptr, self.h.indices, self.h.data), self.symmetric, cones, others)
+        made = self.new_solve((self.h.indptr, self.h.indices, self.h.data), self.symmetric, cones, others)
         others.small = made
         return made
 

@@ -16,8 +16,8 @@ from lavender._arrays import FloatArray
 from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender.solvers._log import SolveLog
 from lavender.solvers.islands import blocks_of_each, restrict, rows_of
+from lavender.solvers.solve_log import SolveLog
 
 __all__ = ["certify"]
 
@@ -41,7 +41,7 @@ def certify(log: SolveLog) -> None:
             return
         if not _is_open(part):
             continue
-        y = _proof(part, log.deadline)
+        y = find_direction(part, log.deadline)
         proof = None
         if y is not None:
             proof = np.zeros(problem.m)
@@ -71,7 +71,7 @@ def _is_open(problem: Problem) -> bool:
     return bool(np.all(free | ((cones.lower == 0.0) & np.isposinf(cones.upper))))
 
 
-def _proof(problem: Problem, deadline: Deadline) -> FloatArray | None:
+def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     """What a linear program finds, y (m,), to be checked."""
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 

@@ -20,10 +20,10 @@ from lavender.problem import LAWS, Problem
 from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
-from lavender.solvers import _rates as rates
+from lavender.solvers import weights
 from lavender.solvers._counts import sweep_cost
-from lavender.solvers._newton import general
 from lavender.solvers.islands import islands
+from lavender.solvers.newton_systems import general
 from lavender_ext.few.chain import Chain
 from lavender_ext.few.islands import Islands
 from lavender_ext.few.many import Gate, solve_first
@@ -40,18 +40,20 @@ FACTORED = 0.05  # ns of a multiply-add of factors of islands
 LONGEST = 2.5e8  # ns of SWEPT sweeps of all islands at most
 # All that `general_cost` reads, by law.
 GENERAL = (
-    rates.GENERAL_START,
-    tuple(rates.GENERAL_ROW[law] for law in LAWS),
-    tuple(rates.GENERAL[law] for law in LAWS),
-    tuple(rates.GENERAL_COUNT[law] for law in LAWS),
+    weights.GENERAL_START,
+    tuple(weights.GENERAL_ROW[law] for law in LAWS),
+    tuple(weights.GENERAL[law] for law in LAWS),
+    tuple(weights.GENERAL_COUNT[law] for law in LAWS),
 )
 
 
 def general_cost(problem: Problem, largest: int) -> float:
     """Newton over generalised velocities, `largest` of them in one island [ns]."""
     law = problem.law
-    step = rates.GENERAL_ROW[law] * problem.m + rates.GENERAL[law] * general.factor_flops(problem, largest)
-    return rates.GENERAL_START + rates.GENERAL_COUNT[law] * step
+    step = weights.GENERAL_ROW[law] * problem.m + weights.GENERAL[law] * general.factor_flops(
+        problem, largest
+    )
+    return weights.GENERAL_START + weights.GENERAL_COUNT[law] * step
 
 
 def first_look(per: float) -> int:
@@ -235,6 +237,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", Gate(GENERAL, tuple(rates.GENERAL_FIRST[law] for law in LAWS)), True, True, looks=True)
+AUTO = Few("auto", Gate(GENERAL, tuple(weights.GENERAL_FIRST[law] for law in LAWS)), True, True, looks=True)
 DIRECT = Few("direct", None, True, False)
-NEWTON = Few("newton", Gate(GENERAL, len(LAWS) * (rates.GENERAL_MOST,)), False, False)
+NEWTON = Few("newton", Gate(GENERAL, len(LAWS) * (weights.GENERAL_MOST,)), False, False)
