@@ -12,7 +12,7 @@
 Bertsekas 1982. (3) is monotone, so no set comes back: what pivoting lacks on a nearly singular A. A call does at most
 as many rounds as it is asked for, and the host looks at its clock in between.
 """
-from libc.math cimport INFINITY, fabs
+from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
@@ -22,7 +22,7 @@ from lavender_ext.core.block cimport blocks_t, clip
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport Judged, judge_view, judged_from, relative_of, scratch_of
+from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.pivot.direct cimport HALVED, PASSED, SPENT, direct_t
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivoting_t,
