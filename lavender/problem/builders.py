@@ -249,7 +249,9 @@ class Builders(Operators):
         cones = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
         if rows.n_joints:
             none = np.zeros(rows.n_joints)
-            cones = Cones(rows.joint_ptr, none.astype(np.int32), low, high, none, none) + cones
+            kind = none.astype(np.int32)
+            own = Cones(ptr=rows.joint_ptr, kind=kind, lower=low, upper=high, mu=none, patch_radius=none)
+            cones = own + cones
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
@@ -412,6 +414,8 @@ def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: An
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
     kind = np.full(c, CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT, np.int32)
     free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)
-    radius = none if patch_radius is None else patch_radius
-    cones = Cones(ptr, kind, -free, free, mu, radius, none if rolling is None else rolling)
+    cones = Cones(
+        ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu,
+        patch_radius=none if patch_radius is None else patch_radius, rolling=none if rolling is None else rolling,
+    )  # fmt: skip
     return cones.shaped("box") if shape == "box" else cones
