@@ -70,7 +70,7 @@ def factors(problem: Problem) -> None:
         solve = system.solve
         solve.v[:] = 10.0 ** rng.uniform(-2.0, 2.0, len(solve.v))
         time = cpu(lambda solve=solve: solve.factor("barrier"), 5)
-        bits.append(solve.solve("barrier", rng.normal(size=system.sc.m)).tobytes())
+        bits.append(solve.solve("barrier", rng.normal(size=solve.m)).tobytes())
         print(
             f"  {label:<18}{1e3 * time:8.2f} ms, {system.cost / time / 1e9:5.2f} G multiply-adds/s of {system.cost:.3g}"
         )
