@@ -5,7 +5,7 @@ from libc.string cimport memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.core.block cimport COULOMB, has_friction
+from lavender_ext.core.block cimport has_friction
 from lavender_ext.core.problem cimport Data
 from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t, view_t
 from lavender_ext.factor.tiles cimport has_wide
