@@ -7,7 +7,8 @@ import numpy as np
 from lavender_ext.core.arrays cimport address
 from lavender_ext.core.block cimport has_friction
 from lavender_ext.core.problem cimport Data
-from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t, view_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish as furnish_flow, marks_of, need_t, numbers_of, settle
