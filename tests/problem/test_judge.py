@@ -2,11 +2,12 @@
 
 import dataclasses
 
+import judge_twin
 import numpy as np
 import pytest
-import twins
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from judge_twin import spec_of
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
 from scipy.linalg import block_diag
@@ -22,18 +23,24 @@ from lavender.residuals import judged, known, remember
 
 def equals_the_twin(problem, lam):
     """Everything the judge says of an impulse, and what it is made of; 1e-9: M and its inverse, roots of many terms."""
-    a, found = problem.dense(), lv.residual(problem, lam)
-    np.testing.assert_allclose(
-        problem.d, twins.diagonal(a, problem.cones, problem.operator != "matrix"), rtol=1e-12
-    )
-    size = np.abs(a) @ np.abs(lam) + np.abs(problem.b)
-    np.testing.assert_allclose(found.slack, a @ lam - problem.b, rtol=0, atol=1e-12 * size.max())
-    e, energy, velocity, row = twins.judged(problem, lam)
-    np.testing.assert_allclose(found.error, e, rtol=0, atol=1e-10 * np.abs(e).max())
-    np.testing.assert_allclose([found.energy, found.velocity], [energy, velocity], rtol=1e-9)
-    assert found.worst_row in row
-    _, energy0, velocity0, _ = twins.judged(problem, problem.start())
-    np.testing.assert_allclose(found.relative, max(energy / energy0, velocity / velocity0), rtol=1e-9)
+    twin, found = judge_twin.Problem(spec_of(problem)), lv.residual(problem, lam)
+    close = 1e-9 if problem.operator == "generalized" else 1e-12
+    np.testing.assert_allclose(problem.disk.d, twin.d.astype(float), rtol=close)
+    np.testing.assert_allclose(problem.disk.metric.nu, twin.nu.astype(float), rtol=close)
+    x = lam / twin.stretch
+    w = twin.slack(x)
+    e, size = twin.error(x, w), (twin.size @ np.abs(x) + twin.b_size).astype(float)
+    np.testing.assert_allclose(found.slack * twin.stretch, w, rtol=0, atol=close * size.max())
+    np.testing.assert_allclose(found.error, twin.stretch * e, rtol=0, atol=1e-10 * np.abs(e).max())
+    said = twin.judge(lam)
+    np.testing.assert_allclose([found.energy, found.velocity], [said.energy, said.velocity], rtol=1e-9)
+    speeds = twin.speeds(e)
+    assert speeds[found.worst_row] == pytest.approx(float(speeds.max()), rel=1e-9)
+    for impulse in (lam, lv.solve(problem, tol=1e-9).impulse):
+        found, said = lv.residual(problem, impulse), twin.judge(impulse)
+        assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed
+        # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
+        assert 0.1 * found.floor <= said.floor <= 10.0 * found.floor
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
