@@ -136,14 +136,16 @@ def read_source(path: Path) -> tuple[list[str], list[str]]:
     return names, breaches
 
 
-def run(*command: str | Path, cwd: Path) -> str:
-    """Standard output of a command; RuntimeError with its messages if it fails."""
+def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
+    """Standard output of a command; RuntimeError with the end of its messages if it fails."""
     done = subprocess.run(
-        [str(part) for part in command], cwd=cwd, capture_output=True, text=True, check=False
-    )
+        [str(part) for part in command],
+        cwd=cwd, env={**os.environ, **env}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
     if done.returncode:
         shown = shlex.join(map(str, command))
-        raise RuntimeError(f"{shown} failed with status {done.returncode}:\n{done.stdout}{done.stderr}")
+        said = (done.stdout + done.stderr)[-3000:]
+        raise RuntimeError(f"{shown} failed with status {done.returncode}:\n{said}")
     return done.stdout
 
 

@@ -20,7 +20,6 @@ NAMES = (
     "gallery",
     "islands",
     "kernels",
-    "lattice",
     "motions",
     "newton",
     "page",

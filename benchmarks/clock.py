@@ -1,9 +1,11 @@
-"""The clock of these benchmarks."""
+"""The clocks of these benchmarks."""
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
-from time import process_time
+from time import perf_counter, perf_counter_ns, process_time, process_time_ns
+from typing import Any
 
 
 def cpu(call: Callable[[], object], repeats: int) -> float:
@@ -14,3 +16,41 @@ def cpu(call: Callable[[], object], repeats: int) -> float:
         call()
         times.append(process_time() - start)
     return min(times)
+
+
+wall = perf_counter_ns  # for `least`, where several threads run
+
+
+def least(
+    *calls: Callable[[], Any], seconds: float = 0.2, clock: Callable[[], int] = process_time_ns
+) -> list[float]:
+    """Least time [s] of one call of each, in turns, in batches of about a millisecond.
+
+    Parameters
+    ----------
+    seconds : float, s
+        Time for all; each is called at least three times.
+    clock : callable
+        Nanoseconds.
+    """
+    counts = []
+    for call in calls:
+        start = perf_counter()
+        call()
+        counts.append(max(1, min(10_000, int(1e-3 / max(perf_counter() - start, 1e-8)))))
+    best = [float("inf")] * len(calls)
+    begun, rounds = perf_counter(), 0
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        while rounds < 3 or perf_counter() - begun < seconds:
+            for i, call in enumerate(calls):
+                start = clock()
+                for _ in range(counts[i]):
+                    call()
+                best[i] = min(best[i], (clock() - start) / counts[i])
+            rounds += 1
+    finally:
+        if collects:
+            gc.enable()
+    return [1e-9 * t for t in best]

@@ -6,8 +6,8 @@ centres of the boxes,
     drift = max over boxes and t >= 2 s of |p(t) - p(2 s)|,                                     (1)
 
 looked at ten times a second. Where a box is half an edge beside or below where it began the tower has fallen and the
-run ends; soft contacts may throw it up at first. Lines of one tower and one letter spend equally many sweeps on a
-second of simulation: sweeps x substeps / dt.
+run ends; soft contacts may throw it up at first. Lines are sorted by what they spend on a second of simulation:
+sweeps x substeps / dt.
 
 LavenderSim is stepped as a user steps it, with its observation; the others by their own call for a step. MuJoCo,
 PyBullet and lavendersim are Python packages; Rapier (`@dimforge/rapier3d-compat`) and Jolt (`jolt-physics`) run under
@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ import numpy as np
 from benchmarks.output import folder_of, markdown, write_json
 from lavender._arrays import FloatArray
 from lavender.bench.machine import versions
+from lavender.cli.options import Names, Numbers
 from lavender.errors import InputError, UnknownName
 from lavender.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
 from lavender.scene import Scene
@@ -173,8 +175,8 @@ def installed() -> list[str]:
     return [name for name in ENGINES if not missing(name)]
 
 
-def measure(engine: str, tower: Tower) -> Line:
-    """Step one tower in one engine, at most `tower.seconds`.
+def check_installed(name: str) -> None:
+    """Refuse an engine that cannot run here.
 
     Raises
     ------
@@ -183,11 +185,15 @@ def measure(engine: str, tower: Tower) -> Line:
     InputError
         It is not installed; the message says what is missing.
     """
-    if engine not in ENGINES:
-        raise UnknownName("engine", engine, ENGINES)
-    lack = missing(engine)
-    if lack:
-        raise InputError(f"{engine} cannot run here: {lack}")
+    if name not in ENGINES:
+        raise UnknownName("engine", name, ENGINES)
+    if missing(name):
+        raise InputError(f"{name} cannot run here: {missing(name)}")
+
+
+def measure(engine: str, tower: Tower) -> Line:
+    """Step one tower in one engine, at most `tower.seconds`; raises as `check_installed`."""
+    check_installed(engine)
     made = ENGINES[engine].make(tower)
     try:
         return _watch(made, tower)
@@ -243,109 +249,85 @@ def lines(
     Engines that iterate to a tolerance have one line for each tower and step; those of others that sweep also one with
     their own number of sweeps.
     """
-    for n in boxes:
-        for rate in rates:
-            for name in engines:
-                c = ENGINES[name]
-                own = c.module == "own" and bool(c.sweeps)
-                budgets: list[int | None] = [*sweeps] if c.sweeps else []
-                if not own:
-                    budgets.append(None)
-                seen = set()
-                for budget in budgets:
-                    for part in substeps if c.substeps else (0,):
-                        for order in orders if own else (None,):
-                            tower = Tower(
-                                boxes=n,
-                                dt=1.0 / rate,
-                                sweeps=budget,
-                                substeps=part or None,
-                                order=order,
-                                seconds=seconds,
-                            )
-                            line = measure(name, tower)
-                            key = (line.engine, line.sweeps, line.substeps)
-                            if key not in seen:
-                                seen.add(key)
-                                yield line
-
-
-def _letters(found: Sequence[Line]) -> dict[tuple[int, float], str]:
-    # towers and sweeps a second that more than one line has
-    count: dict[tuple[int, float], int] = {}
-    for line in found:
-        if line.sweeps:
-            key = (line.boxes, round(line.work, 6))
-            count[key] = count.get(key, 0) + 1
-    out: dict[tuple[int, float], str] = {}
-    for n in {key[0] for key in count}:
-        shared = sorted(key for key, times in count.items() if key[0] == n and times > 1)
-        out |= {key: chr(ord("a") + i) if i < 26 else f"a{i}" for i, key in enumerate(shared)}
-    return out
+    for n, rate, name in product(boxes, rates, engines):
+        c = ENGINES[name]
+        own = c.module == "own" and bool(c.sweeps)
+        budgets: list[int | None] = [*(sweeps if c.sweeps else ()), *(() if own else (None,))]
+        seen = set()
+        for budget, part, order in product(
+            budgets, substeps if c.substeps else (0,), orders if own else (None,)
+        ):
+            tower = Tower(
+                boxes=n, dt=1.0 / rate, sweeps=budget, substeps=part or None, order=order, seconds=seconds
+            )
+            line = measure(name, tower)
+            key = (line.engine, line.sweeps, line.substeps)
+            if key not in seen:
+                seen.add(key)
+                yield line
 
 
 def table(found: Sequence[Line]) -> str:
-    """The map as a markdown table, by tower and step; lines of one tower and letter spend equally many sweeps."""
-    letters = _letters(found)
+    """The map as a markdown table, by tower, step and sweeps a second."""
     head = (
-        "boxes",
-        "dt [s]",
-        "engine",
-        "sweeps",
-        "substeps",
-        "sweeps a second",
-        "stood [s]",
-        "drift [mm]",
+        *("boxes", "dt [s]", "engine", "sweeps", "substeps", "sweeps a second", "stood [s]", "drift [mm]"),
         "µs a step",
     )
-    rows = []
-    for line in sorted(found, key=lambda x: (x.boxes, -x.dt)):
-        sweeps = str(line.sweeps) if line.sweeps else "to a tolerance"
-        work = (
-            f"{line.work:,.0f} {letters.get((line.boxes, round(line.work, 6)), '')}".strip()
-            if line.sweeps
-            else "–"
+    rows = [
+        (
+            line.boxes,
+            f"1/{round(1 / line.dt)}",
+            line.engine,
+            line.sweeps or "to a tolerance",
+            line.substeps,
+            f"{line.work:,.0f}" if line.sweeps else "–",
+            f"{line.seconds:g}" if line.stands else f"**fell at {line.stood:.1f}**",
+            f"{1e3 * line.drift:.2g}" if line.stands else "–",
+            f"{1e6 * line.cost:,.3g}",
         )
-        stood = f"{line.seconds:g}" if line.stands else f"**fell at {line.stood:.1f}**"
-        drift = f"{1e3 * line.drift:.2g}" if line.stands else "–"
-        rows.append(
-            (
-                line.boxes, f"1/{round(1 / line.dt)}", line.engine, sweeps, line.substeps, work, stood, drift,
-                f"{1e6 * line.cost:,.3g}",
-            )
-        )  # fmt: skip
+        for line in sorted(found, key=lambda x: (x.boxes, -x.dt, x.work))
+    ]
     return markdown(head, rows)
 
 
-def _numbers(text: str, what: str, low: int) -> list[int]:
-    words = text.replace(",", " ").split()
-    if not words or not all(w.isdecimal() and int(w) >= low for w in words):
-        raise InputError(f"{what} {text!r}: whole numbers of at least {low} are needed, with commas between")
-    return [int(w) for w in words]
+def _at_least(low: int, **lists: Sequence[int]) -> None:
+    for name, numbers in lists.items():
+        if not numbers or min(numbers) < low:
+            raise InputError(f"--{name}: whole numbers of at least {low} are needed, with commas between")
 
 
 @click.command("stand")
-@click.option("--engines", default=None, help="Names with commas; default: all that are installed.")
-@click.option("--boxes", default="6,10,20", show_default=True, help="Heights of the towers.")
+@click.option("--engines", type=Names(), help="Default: all that are installed.")
 @click.option(
-    "--sweeps", default="4,8,16", show_default=True, help="Sweeps of a substep, for whoever takes a number."
+    "--boxes", type=Numbers(int), default="6,10,20", show_default=True, help="Heights of the towers."
 )
-@click.option("--rates", default="60,120", show_default=True, help="Steps a second.")
 @click.option(
-    "--substeps", default="0,1,2,4", show_default=True, help="Substeps of a step; 0: the engine's own number."
+    "--sweeps",
+    type=Numbers(int),
+    default="4,8,16",
+    show_default=True,
+    help="Sweeps of a substep, for whoever takes a number.",
 )
-@click.option("--orders", default=None, help="Sweep orders of LavenderSim; default: that of the scene.")
+@click.option("--rates", type=Numbers(int), default="60,120", show_default=True, help="Steps a second.")
+@click.option(
+    "--substeps",
+    type=Numbers(int),
+    default="0,1,2,4",
+    show_default=True,
+    help="Substeps of a step; 0: the engine's own number.",
+)
+@click.option("--orders", type=Names(), help="Sweep orders of LavenderSim; default: that of the scene.")
 @click.option(
     "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="JSON of the lines.")
 def command(
-    engines: str | None,
-    boxes: str,
-    sweeps: str,
-    rates: str,
-    substeps: str,
-    orders: str | None,
+    engines: tuple[str, ...] | None,
+    boxes: tuple[int, ...],
+    sweeps: tuple[int, ...],
+    rates: tuple[int, ...],
+    substeps: tuple[int, ...],
+    orders: tuple[str, ...] | None,
     seconds: float,
     out: Path | None,
 ) -> None:
@@ -354,23 +336,17 @@ def command(
     Rapier and Jolt take part where npm has installed them in this folder: npm install @dimforge/rapier3d-compat
     jolt-physics.
     """
-    names = installed() if engines is None else engines.replace(",", " ").split()
+    names = installed() if engines is None else engines
     for name in names:
-        if name not in ENGINES:
-            raise UnknownName("engine", name, ENGINES)
-        if missing(name):
-            raise InputError(f"{name} cannot run here: {missing(name)}")
-    asked: list[str | None] = [None] if orders is None else [*orders.replace(",", " ").split()]
-    for order in asked:
-        if order is not None and order not in SCENE_ORDERS:
+        check_installed(name)
+    for order in orders or ():
+        if order not in SCENE_ORDERS:
             raise UnknownName("order", order, SCENE_ORDERS)
+    _at_least(1, boxes=boxes, sweeps=sweeps, rates=rates)
+    _at_least(0, substeps=substeps)
     folder_of(out)
-    plan = (
-        _numbers(boxes, "--boxes", 1), _numbers(sweeps, "--sweeps", 1), _numbers(rates, "--rates", 1),
-        _numbers(substeps, "--substeps", 0),
-    )  # fmt: skip
     found = []
-    for line in lines(names, *plan, seconds=seconds, orders=asked):
+    for line in lines(names, boxes, sweeps, rates, substeps, seconds=seconds, orders=orders or (None,)):
         found.append(line)
         how = (
             f"stood {line.seconds:g} s, {1e3 * line.drift:.3g} mm"

@@ -23,7 +23,9 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 os.environ.setdefault("MPLBACKEND", "Agg")
 
 import docstrings
+import matplotlib
 import tried
+from docstrings import table
 
 import lavender as lv
 import lavender_ext
@@ -34,6 +36,8 @@ from lavender.ordering import ORDERS
 from lavender.problem import LAWS
 from lavender.report import advice, claims, contents, geometric_means, reaches
 from lavender.report.curves import figures as report_figures
+from lavender.report.curves import work_precision
+from lavender.report.draw import matplotlib_panels
 from lavender.report.page import page as report_page
 from lavender.report.style import looks
 from lavender.report.tables import SHIFT
@@ -106,14 +110,6 @@ class Site:
                 path.unlink()
 
 
-def table(head, rows):
-    """A markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(
-        lines + ["| " + " | ".join(str(c).replace("|", "\\|") for c in row) + " |" for row in rows]
-    )
-
-
 def join_laws(spec):
     """Laws of a spec in the order of the classes."""
     return ", ".join(law for law in LAWS if law in spec.laws)
@@ -145,72 +141,17 @@ def fingerprint():
 # -- figures ----------------------------------------------------------------------------------------
 
 
-def pareto(runs):
-    """Runs in order of time, each better than all before it: what a solver can do in a time."""
-    best, kept = float("inf"), []
-    for run in sorted(runs, key=lambda r: r.time_min):
-        if run.relative < best:
-            best = run.relative
-            kept.append(run)
-    return kept
-
-
 def law_figures(records):
     """Law -> SVG text: error against time, a panel for each case, lines with the solver's name as id."""
-    import matplotlib
-    from matplotlib.figure import Figure
-
     look = looks(r.solver for r in records)
     out = {}
     for law in LAWS:
-        cases = [c for c, info in records.cases.items() if info.law == law]
-        if not cases:
-            continue
-        columns = min(3, len(cases))
-        lines = -(-len(cases) // columns)
-        canvas = Figure(figsize=(3.2 * columns, 2.6 * lines), layout="constrained")
-        shown = {}
-        for i, axes in enumerate(canvas.subplots(lines, columns, squeeze=False).flat):
-            if i >= len(cases):
-                axes.set_axis_off()
-                continue
-            axes.set(title=cases[i], xscale="log", yscale="log", ylim=(1e-17, 3.0))
-            floors = []
-            for solver, k in look.items():
-                runs = [r for r in records if r.case == cases[i] and r.solver == solver and r.usable]
-                if not runs:
-                    continue
-                runs = pareto(runs)
-                (line,) = axes.plot(
-                    [r.time_min for r in runs],
-                    [min(max(r.relative, 1e-17), 3.0) for r in runs],
-                    color=k.color, marker=k.marker, markersize=4, markeredgewidth=0.0, linewidth=1.0,
-                    linestyle=k.line, label=solver,
-                )  # fmt: skip
-                line.set_gid(f"{solver}--{i}")
-                shown.setdefault(solver, line)
-                floors.append(min((r.relative, r.floor) for r in runs))
-            floor = min(floors, default=(0.0, 0.0))[1]
-            if floor > 0.0:
-                axes.axhline(floor, color="0.3", linewidth=0.8, linestyle=":")
-            axes.title.set_fontsize(8)
-            axes.tick_params(labelsize=7)
-            axes.grid(True, linewidth=0.3)
-        canvas.supxlabel("time: set-up and solve [s]", fontsize=8)
-        canvas.supylabel("relative residual [-]", fontsize=8)
-        legend = canvas.legend(
-            shown.values(),
-            shown.keys(),
-            loc="outside right upper",
-            fontsize=6,
-            frameon=False,
-            labelspacing=0.3,
-        )
-        legend.set_gid("legend")
-        text = io.StringIO()
-        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
-            canvas.savefig(text, format="svg", metadata={"Date": None})
-        out[law] = text.getvalue()
+        some = [work_precision(records, c) for c, info in records.cases.items() if info.law == law]
+        if some:
+            text = io.StringIO()
+            with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
+                matplotlib_panels(some, look).savefig(text, format="svg", metadata={"Date": None})
+            out[law] = text.getvalue()
     return out
 
 
@@ -225,16 +166,7 @@ def highlighted(svg, solver):
         f'[id^="{solver}--"] use {{fill: #5b2a9d !important}}'
         "#legend {display: none}</style>"
     )
-    return (
-        svg.replace("</metadata>", "</metadata>" + style, 1)
-        if "</metadata>" in svg
-        else _after_head(svg, style)
-    )
-
-
-def _after_head(svg, style):
-    head = re.search(r"<svg[^>]*>", svg)
-    return svg[: head.end()] + style + svg[head.end() :]
+    return svg.replace("</metadata>", "</metadata>" + style, 1)
 
 
 def image(path, text):

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from docstrings import table
 
 import lavender as lv
 from lavender import registry, suite
@@ -11,12 +12,6 @@ from lavender.bench import level_name
 from lavender.report.text import residual, seconds
 
 PLUGIN = Path(__file__).resolve().parent.parent / "examples" / "plugin"
-
-
-def table(head, rows):
-    """A markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(lines + ["| " + " | ".join(map(str, row)) + " |" for row in rows])
 
 
 def accelerated_gradient(levels):
@@ -55,19 +50,6 @@ def accelerated_gradient(levels):
         f"It is the fastest of the five in {first} of {len(rows)} lines, and needs fewer iterations than "
         f"`anderson` in {fewer}."
     )
-
-
-def undamped_jacobi():
-    """Jacobi with omega = 1 against the safe damping on a contact repeated k times."""
-    rows = []
-    for k in (1, 2, 3, 8):
-        problem = suite.case(f"duplicated(k={k})").problem
-        plain = lv.solve(problem, "jacobi", omega=1.0, max_iter=200)
-        safe = lv.solve(problem, "jacobi", max_iter=200)
-        rows.append(
-            (k, plain.status.name, residual(plain.residual.relative), safe.status.name, safe.work["sweeps"])
-        )
-    return table(("k", "ω = 1", "residual", "safe ω", "sweeps"), rows)
 
 
 def _tangents(step, tangents, push, sweeps=2000):
@@ -143,71 +125,6 @@ def forms():
     return table(("case", "backend", "impulse form", "time", "velocity form", "time"), rows)
 
 
-def mass_ratios():
-    """Work to 1e-6 as the top box of a stack gets heavier."""
-    counted = {
-        "pgs": "sweeps",
-        "nncg": "sweeps",
-        "anderson": "sweeps",
-        "admm": "iterations",
-        "newton": "factorisations",
-        "direct": "factorisations",
-    }
-    rows = []
-    for ratio in ("1", "10", "100", "1e3", "1e6"):
-        problem = suite.case(f"box_stack(n=6, mass_ratio={ratio})").problem
-        cells = [ratio]
-        for name, kind in counted.items():
-            more = {"max_iter": 50_000} if registry.specs()[name].resumable else {}
-            s = lv.solve(problem, name, tol=1e-6, time_limit=0.5, **more)
-            count = s.iterations if kind == "iterations" else s.work.get(kind, 0)
-            reached = s.success or s.residual.relative <= 2.0 * s.residual.floor
-            cells.append(f"{count:,}" if reached else f"{s.status.name} at {residual(s.residual.relative)}")
-        rows.append(cells)
-    return table(("mass ratio", *(f"{name}, {kind}" for name, kind in counted.items())), rows)
-
-
-def relaxation():
-    """The answer of relaxed friction, judged by Coulomb's law."""
-    rows = []
-    for name in (
-        "ramp(angle=20)",
-        "ramp(angle=30)",
-        "slider(mu=0.3)",
-        "granularF(n=3)",
-        "pyramidF(k=6, sliding=0.5)",
-    ):
-        problem = suite.case(name).problem
-        relaxed = lv.solve(problem.relaxed("cone"), "newton", tol=1e-9)
-        judged = lv.residual(problem, relaxed.impulse)
-        touching = relaxed.impulse[::3] > 0.0
-        slip = np.hypot(relaxed.slack[1::3], relaxed.slack[2::3])[touching].max(initial=0.0)
-        lift = relaxed.slack[::3][touching].max(initial=0.0)
-        rows.append((
-            f"`{name}`", residual(relaxed.residual.relative), residual(judged.relative), f"{slip:.2g}", f"{lift:.2g}",
-        ))  # fmt: skip
-    return table(
-        ("case", "by its own law", "by Coulomb's law", "fastest slip [m/s]", "fastest lift [m/s]"), rows
-    )
-
-
-def symmetric_order():
-    """nncg over sweeps in one direction and in both."""
-    rows = []
-    for name in ("stack(n=64)", "box_stack(n=10)", "granular(n=9)", "pyramid(k=10)"):
-        problem = suite.case(name).problem
-        cells = [f"`{name}`"]
-        for solver, order in (("pgs", "given"), ("nncg", "given"), ("nncg", "symmetric")):
-            s = lv.solve(problem, solver, tol=1e-9, max_iter=100_000, time_limit=1.0, order=order)
-            cells.append(
-                f"{s.work['sweeps']:,}"
-                if s.success
-                else f"{s.status.name} at {residual(s.residual.relative)}"
-            )
-        rows.append(cells)
-    return table(("case", "pgs", "nncg, given order", "nncg, symmetric order"), rows)
-
-
 PAGE = """# What was tried and lost
 
 A solver stays in the registry where error against time shows a family of problems on which nothing else
@@ -224,13 +141,6 @@ impulse at once. Time to a relative residual, and iterations:
 
 {verdict} Written with NumPy and SciPy, it pays a price to the interpreter in every iteration; the counts
 are free of that.
-
-## Jacobi without damping
-
-One contact repeated k times. With ω = 1 every copy is changed as if it were alone, which together is k
-times too much; the projection turns that into a cycle.
-
-{jacobi}
 
 ## Other steps for the tangents
 
@@ -251,48 +161,13 @@ is never squared). Relative residual and time at tol 1e-9, at most half a second
 {forms}
 
 Neither form is the faster one everywhere, which is why `form="auto"` looks at sizes and mass ratio.
-
-## Plain sweeps for heavy on light
-
-Stacks of six boxes, the top one heavier by the mass ratio, to 1e-6, half a second at most:
-
-{ratios}
-
-## Relaxed friction as the answer
-
-The convex relaxation is solved to its own tolerance, then judged by Coulomb's law. Where everything sticks,
-both laws have the same answer; where something slides, the relaxation lifts it off the surface at μ times
-the speed of sliding.
-
-{relaxation}
-
-## Sweeping both ways
-
-Sweeps to 1e-9; with a symmetric order an iteration is one sweep and the same sweep backwards.
-
-{symmetric}
-
-## Solving, then clamping
-
-Solving A λ = b and setting the negative impulses to zero, once, leaves the neighbours of an opening contact
-with impulses that were computed for one that is no longer there: *toy_stack* in [Examples](examples.md) has
-the numbers.
 """
 
 
 def page(levels):
     """The page, measured now."""
     apgd, verdict = accelerated_gradient(levels)
-    return PAGE.format(
-        apgd=apgd,
-        verdict=verdict,
-        jacobi=undamped_jacobi(),
-        tangents=tangent_steps(),
-        forms=forms(),
-        ratios=mass_ratios(),
-        relaxation=relaxation(),
-        symmetric=symmetric_order(),
-    )
+    return PAGE.format(apgd=apgd, verdict=verdict, tangents=tangent_steps(), forms=forms())
 
 
 if __name__ == "__main__":

@@ -1,49 +1,15 @@
-"""What this machine can do: loops that hold one thing and nothing else, compiled with the kernels' flags.
+"""What this machine can do: sweeps with nothing around them, compiled with the kernels' flags.
 
-    read     sum of a vector                      bytes a second from wherever the vector lies
-    triad    a = b + 3 c                          the same with a third of it written
-    chase    i <- next[i]                         time of a load that waits for the load before it
-    chain    y <- a y + b                         time of a product and a sum, each waiting for the other
     csr      projected Gauss-Seidel, bounds 0..   a sweep over A in compressed rows, one running sum, no blocks
     contact  normal and disk on body velocities   a sweep over contacts of 192 bytes, one record each
 
-The two sweeps are the same mathematics as `sweep/serial.pyx` (their impulses agree to rounding) without what a library
+They are the same mathematics as `sweep/serial.pyx` (their impulses agree to rounding) without what a library
 adds: block kinds, laws, joints, compliance, orders, stopping tests.
 """
 from libc.math cimport sqrt
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t
 
 import numpy as np
-
-
-cdef public void lav_limit_read(const uint64_t* x, int32_t n, uint64_t* out) noexcept nogil:
-    cdef uint64_t s = 0
-    cdef int32_t i
-    for i in range(n):
-        s ^= x[i]
-    out[0] = s
-
-
-cdef public void lav_limit_triad(double* a, const double* b, const double* c, int32_t n) noexcept nogil:
-    cdef int32_t i
-    for i in range(n):
-        a[i] = b[i] + 3.0 * c[i]
-
-
-cdef public int32_t lav_limit_chase(const int32_t* next, int32_t n) noexcept nogil:
-    cdef int32_t i = 0
-    cdef int32_t _k
-    for _k in range(n):
-        i = next[i]
-    return i
-
-
-cdef public double lav_limit_chain(double a, double b, int32_t n) noexcept nogil:
-    cdef double y = 1.0
-    cdef int32_t _k
-    for _k in range(n):
-        y = a * y + b
-    return y
 
 
 cdef public void lav_limit_csr(int32_t m, const int32_t* indptr, const int32_t* indices, const double* data,
@@ -140,33 +106,6 @@ cdef public void lav_limit_contact(limit_contact_t* contacts, limit_body_t* bodi
             for k in range(3):
                 impulse[k] = -impulse[k]
             limit_push(a, c.arm_a, impulse)
-
-
-def read(const uint64_t[::1] x, int n):
-    """Read x n times; something that depends on all of it."""
-    cdef uint64_t s = 0, once
-    cdef int _i
-    for _i in range(n):
-        lav_limit_read(&x[0], <int32_t>x.shape[0], &once)
-        s += once
-    return s
-
-
-def triad(double[::1] a, const double[::1] b, const double[::1] c, int n):
-    """a = b + 3 c, n times."""
-    cdef int _i
-    for _i in range(n):
-        lav_limit_triad(&a[0], &b[0], &c[0], <int32_t>a.shape[0])
-
-
-def chase(const int32_t[::1] next, int32_t n):
-    """n loads, each at the place that the last one gave."""
-    return lav_limit_chase(&next[0], n)
-
-
-def chain(double a, double b, int32_t n):
-    """n dependent products and sums."""
-    return lav_limit_chain(a, b, n)
 
 
 def csr(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const double[::1] b,

@@ -1,4 +1,4 @@
-"""Problems that kernels are timed on, and the bytes that a unit of work moves."""
+"""Problems that kernels are timed on, and the same as records of the bare loops."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lavender.problem import Problem
 from lavender.rows import Rows
 from lavender.suite.families import at_least
 
-__all__ = ["bare_contacts", "contact_bytes", "csr_bytes", "lattice_pile", "raw_bytes", "tridiagonal"]
+__all__ = ["bare_contacts", "lattice_pile", "raw_bytes", "tridiagonal"]
 
 
 def lattice_pile(contacts: int, *, shuffle: bool = False, seed: int = 0) -> Problem:
@@ -109,17 +109,3 @@ def bare_contacts(problem: Problem) -> tuple[np.ndarray, np.ndarray]:
 def raw_bytes(array: np.ndarray) -> Any:
     """An array of records as the bytes that a microbenchmark reads."""
     return array.view(np.uint8).reshape(-1)
-
-
-def contact_bytes(problem: Problem) -> float:
-    """Bytes that a sweep of sequential impulses reads and writes for each contact, bodies left out."""
-    rows, m, c = problem.rows, problem.m, problem.n_blocks
-    assert rows is not None
-    given = sum(x.nbytes for x in (rows.normal, rows.tangent, rows.arm_a, rows.arm_b, rows.contact_body))
-    # per row: swing, compliance, b, step, impulse (read, written); per contact: coupling, mu, order, ptr, kind
-    return (given + m * 8 * (6 + 3 + 2) + c * (5 * 8 + 8 + 3 * 4)) / c
-
-
-def csr_bytes(problem: Problem) -> float:
-    """Bytes of a sweep over A for each entry: value and column, then b, step, bounds, impulse and start of a row."""
-    return 12.0 + problem.m * (6 * 8 + 4) / problem.csr.nnz

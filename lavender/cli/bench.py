@@ -1,77 +1,61 @@
-"""`lavender bench`, and the commands of its own first words."""
+"""`lavender bench mujoco MODEL.xml ...`."""
 
 from __future__ import annotations
 
-import importlib
-from functools import partial
+import json
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
-from lavender.cli.measuring import measure
-from lavender.cli.options import (
-    EXIT_INTERRUPTED,
-    EXIT_UNMET,
-    Asked,
-    ManyValues,
-    console,
-    one_thread,
-    plan_options,
-    refuse_idle,
-    was_given,
-)
+from lavender.cli.options import one_thread
+from lavender.errors import LavenderError
+from lavender.io.stored import write_text
 
 __all__ = ["bench"]
 
 
-class Suites(ManyValues):
-    """`lavender bench mujoco` is a command; other first words are files (or ./mujoco)."""
-
-    OWN = {  # noqa: RUF012 - a constant of the class
-        "mujoco": "lavender.cli.bench_mujoco:mujoco",
-    }
-
-    def make_context(
-        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
-    ) -> click.Context:
-        """The context of the command that the first word names, or of this one."""
-        if not args or args[0] not in self.OWN:
-            return super().make_context(info_name, args, parent, **extra)
-        module, _, attribute = self.OWN[args[0]].partition(":")
-        one_thread()
-        own: click.Command = getattr(importlib.import_module(module), attribute)
-        return own.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
+@click.group()
+def bench() -> None:
+    """Our solvers inside your own simulator's steps; files are measured by `lavender report`."""
 
 
-@click.command(cls=Suites)
-@click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@plan_options
+@bench.command("mujoco")
+@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option("--steps", default=10, show_default=True, help="problems of each model")
+@click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("records.jsonl"),
-    show_default=True,
-    help="File of the records.",
+    "--warm", default=0, show_default=True, help="and so many consecutive steps of each model, warm"
 )
-@click.pass_context
-def bench(
-    context: click.Context,
-    files: tuple[str, ...],
-    asked: Asked,
-    out: Path,
-) -> None:
-    """As `report`, but only the records: a .jsonl file that `lavender report` shows later.
+@click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
+def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
+    """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
+    one_thread()
+    try:
+        import mujoco as mj
+    except ImportError:
+        raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
+    from lavender.bench.machine import cpu_name, versions
+    from lavender.bench.simulators import Step, WarmStep, measure, measure_warm
+    from lavender.report.simulators import table, warm_table
 
-    `lavender bench mujoco` compares with MuJoCo on models of your own instead; see its own --help.
-    """
-    refuse_idle(context, asked.solvers)
-    done = measure(files, asked, asked.plan(files), out, given=partial(was_given, context))
-    shown_on = console()
-    shown_on.print(f"{len(done.records)} runs in {out}", highlight=False, markup=False, soft_wrap=True)
-    if done.note:
-        shown_on.print(done.note.partition(";")[0], highlight=False, markup=False)
-    if done.stopped:
-        raise click.exceptions.Exit(EXIT_INTERRUPTED)
-    if done.lost:
-        raise click.exceptions.Exit(EXIT_UNMET)
+    found: list[Step] = []
+    consecutive: list[WarmStep] = []
+    for path in models:
+        try:
+            new = measure(mj, path, steps, every)
+            after = measure_warm(mj, path, warm)
+        except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
+            click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
+            continue
+        found += new
+        consecutive += after
+        click.echo(f"{path.name}: {len(new)} problems", err=True)
+    if out is not None:
+        lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
+        lines += [json.dumps(asdict(s)) for s in found]
+        lines += [json.dumps(asdict(w)) for w in consecutive]
+        write_text(out, "\n".join(lines) + "\n")
+    click.echo(table(found))
+    if consecutive:
+        click.echo(f"\n{warm_table(consecutive)}")

@@ -66,16 +66,13 @@ def measure(
     fresh: bool = False,
     *,
     given: Callable[[str], bool] = lambda name: False,
-    lines: bool = False,
 ) -> Measured:
-    """Run with a progress bar.
+    """Run with a progress bar, then time the lines that a report would print, in turns.
 
     Parameters
     ----------
     given : callable (name)
         Whether an option stands on the command line.
-    lines : bool
-        Time the lines that a report would print, too, in turns.
 
     Raises
     ------
@@ -108,8 +105,7 @@ def measure(
             try:
                 more = asked.process
                 bench.run(items, asked.solvers, plan, store, watch=watch, into=found, fresh=fresh, **more)
-                if lines:
-                    time_lines(items, found[0], plan, store, watch=watch, fresh=fresh, **more)
+                time_lines(items, found[0], plan, store, watch=watch, fresh=fresh, **more)
             except KeyboardInterrupt:
                 stopped = True
     since = before.get(next(iter(found[0].runs)), "") if reused else ""

@@ -144,7 +144,7 @@ def report(
     else:
         plan = asked.plan(files, time_budgets, sweeps)
         more = {"sequence": given["sequence"], "fresh": given["fresh"], "given": partial(was_given, context)}
-        done = measure(files, asked, plan, path, lines=True, **more)
+        done = measure(files, asked, plan, path, **more)
     engines = [] if campaign else contestants(files, done.records.latest())
     shown: dict[str, Any] = {"old": old, "times": time_budgets, "sweeps": sweeps}
     print_report(done.records, console(), whole=tables, **shown)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from lavender.external import backends, clarabel_cone
-from lavender.registry import SolverSpec
+from lavender.external.backends import SPECS
 
 __all__ = ["SPECS"]
-
-SPECS: tuple[SolverSpec, ...] = (*backends.SPECS, clarabel_cone.SPEC)

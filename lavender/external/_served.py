@@ -19,10 +19,9 @@ def serve(lifeline: int) -> None:
 
 
 def _runner() -> apart.Handler:
-    from lavender.external import clarabel_cone
     from lavender.external.backends import BACKENDS
 
-    by_name = {backend.name: backend for backend in (*BACKENDS, clarabel_cone.BACKEND)}
+    by_name = {backend.name: backend for backend in BACKENDS}
 
     def run(message: Any) -> tuple[dict[str, Any], bytes]:
         name, qp, impulse, limit, settings = message

@@ -41,6 +41,7 @@ class Backend:
     linear: str = "bounds"  # what keeps it at work without constraints: "bounds", "equality", or "" (refused)
     finite: bool = False  # takes no infinite bounds: the finite ones become rows
     noisy: bool = False  # prints even when told not to
+    cones: bool = False  # takes second-order cones, so the convex relaxation of friction
 
     def run(self, qp: QP, impulse: FloatArray, limit: Limits, settings: dict[str, Any]) -> Answer:
         """One run of it, in this process."""

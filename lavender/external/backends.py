@@ -2,6 +2,10 @@
 
     min 1/2 l.A l - b.l,  lower <= l <= upper        (impulse form), or the velocity form of `as_qp`
 
+`clarabel_cone` adds the convex relaxation of friction, disk and spin as second-order cones, a round cone as one:
+
+    l_n >= 0,  |l_t| <= mu l_n,  |l_s| <= mu r l_n,  or the dual cone w_n >= a |w_t| + a_s |w_s|
+
 Backends of which qpsolvers passes on the iterate but not what happened (iterations, exit flag,
 certificates, warm start) are called by their own interface (`native/`), the others through it (`backend.py`).
 """
@@ -124,23 +128,30 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("qpswift", ("qpsolvers", "qpSWIFT"), "qpSWIFT", "interior point",
             "Pandala, Ding, Park 2019, qpSWIFT", dense=True, linear="", finite=True),
     Backend("sip", ("qpsolvers", "sip_qp_python"), "sip-qp-python", "interior point", "SIP manual"),
+    Backend("clarabel_cone", ("clarabel",), "clarabel",
+            "interior point on the convex relaxation of friction, second-order cones",
+            "Goulart, Chen 2024, Clarabel; Tasora, Anitescu 2011 for the relaxation",
+            call=clarabel.call, max_iter=200, stoppable=True, cones=True),
 )  # fmt: skip
 
 
 def _spec(backend: Backend) -> SolverSpec:
+    laws = {"lcp"} | ({"linear"} if backend.linear else set()) | ({"cone"} if backend.cones else set())
     return SolverSpec(
         name=backend.name,
         factory=partial(QPSolver, backend),
-        laws=frozenset({"linear", "lcp"} if backend.linear else {"lcp"}),
+        laws=frozenset(laws),
         boxes=frozenset() if backend.definite else frozenset({"cone"}),  # as edges of cones A is singular
         resumable=False,
         external=True,
         impulse=backend.warm,
+        round_cones=backend.cones,
+        rolling=backend.cones,
         max_iter=backend.max_iter,
         options=OPTIONS,
         requires=backend.modules,
         install=backend.install,
-        summary=f"{backend.summary} (QP backend)",
+        summary=backend.summary if backend.cones else f"{backend.summary} (QP backend)",
         reference=backend.reference,
         refusal=refusal,
     )

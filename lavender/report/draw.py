@@ -35,17 +35,25 @@ def matplotlib_figure(
 
 
 def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look], columns: int = 3) -> Any:
-    """Figures of the same quantities beside each other, with the names of the axes and a legend once."""
+    """Figures of the same quantities beside each other, with the names of the axes and a legend once.
+
+    In an SVG a curve has the id SOLVER--PANEL, and the legend `legend`.
+    """
     rows = -(-len(figures) // columns)
     canvas = _canvas((10.0, 3.1 * rows), layout="constrained")
     places = list(canvas.subplots(rows, columns, squeeze=False).flat)
     for axes in places:
         axes.set_axis_off()
-    for axes, figure in zip(places, figures, strict=False):
+    shown: dict[str, Any] = {}
+    for i, (axes, figure) in enumerate(zip(places, figures, strict=False)):
         axes.set_axis_on()
         _draw(axes, figure, look)
         axes.tick_params(labelsize=7)
-    canvas.axes[0].legend(fontsize=7, frameon=False)
+        for line in axes.get_lines():
+            line.set_gid(f"{line.get_label()}--{i}")
+        shown |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    legend = canvas.legend(shown.values(), shown.keys(), fontsize=6, frameon=False, loc="outside right upper")
+    legend.set_gid("legend")
     canvas.supxlabel(_plain(figures[0].x_title), fontsize=9)
     canvas.supylabel(_plain(figures[0].y_title), fontsize=9)
     return canvas

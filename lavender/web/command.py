@@ -63,8 +63,7 @@ def build(out: Path, part: str) -> None:
     from lavender.web import pages
 
     built = pages.build_module(out, part)
-    needs = f"imports {', '.join(built.imports)}" if built.imports else "no imports"
-    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions, {needs} ({built.compiler})")
+    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions ({built.compiler})")
 
 
 @web.command()

@@ -9,14 +9,13 @@ Only the standard library and Cython are imported, so that setup.py can run this
 
 The core functions `cdef public ... lav_*` of the modules are cut out with what they reach. Three checks make that safe:
 
-* what is reached must not name Python, and no symbol may stay undefined: a core that calls Python, a function of
-  another module by pointer, a variable of a module, libm or malloc does not build;
-* no data may be left (`__data_end == __global_base`);
-* the finished module is read back: no imports (the memory alone, of one that works beside another), exactly the
-  expected functions, a size below its limit.
+* what is reached must not name Python: a core that calls Python, a function of another module by pointer or a
+  variable of a module is not cut out;
+* no symbol may stay undefined, and every function must be there to be exported: libm or malloc do not link;
+* the finished module has no static data, and a size below its limit.
 
-A custom section of the module holds the hash of the sources it was built from, so that one from other sources
-is noticed.
+The last section of the module is the hash of the sources it was built from, so that one from other sources is
+noticed.
 
 The compiler is ziglang's (PyPI, the extra `wasm`), or what LAVENDER_WASM_CC and LAVENDER_WASM_LD name, such
 as `clang --target=wasm32-wasi` and `wasm-ld`.
@@ -46,7 +45,6 @@ __all__ = [
     "Part",
     "build",
     "is_current",
-    "read_module",
     "source_hash",
     "why_not",
 ]
@@ -76,10 +74,10 @@ class Part:
 
 #: Modules of the page by name; the first stands alone.
 PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 130_000, beside=True)}
-MEMORY = "env.memory"
 CUT: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("cut.py")))
-#: Name of the custom section with the hash of the sources.
+#: Name of the custom section with the hash of the sources, which ends the file.
 SECTION = "lavender.sources"
+DATA = 11  # number of the section of static data
 #: What the host needs beside the functions: where free memory begins, and the proof that no data is left.
 EDGES = ("__heap_base", "__data_end", "__global_base")
 
@@ -90,11 +88,10 @@ class BuildFailed(Exception):
 
 @dataclass(frozen=True)
 class Built:
-    """What was built: size [bytes], exported functions, imports."""
+    """What was built: size [bytes], exported functions."""
 
     size: int
     functions: tuple[str, ...]
-    imports: tuple[str, ...]
     compiler: str
 
 
@@ -120,7 +117,7 @@ def source_hash(root: Path, modules: Iterable[str | Path] = MODULES) -> str:
 
 def is_current(path: Path, root: Path, part: Part) -> bool:
     """Whether a module of a part lies at `path` and is of the sources below `root`."""
-    return path.exists() and read_module(path.read_bytes()).sources == source_hash(root, part.modules)
+    return path.exists() and path.read_bytes().endswith(source_hash(root, part.modules).encode())
 
 
 def build(
@@ -144,7 +141,7 @@ def build(
     largest : int, optional
         Size that is refused [bytes]; `LARGEST`.
     beside : bool
-        The module imports its memory, as `MEMORY`: that of one that stands alone.
+        The module imports its memory, as env.memory: that of one that stands alone.
 
     Returns
     -------
@@ -168,8 +165,7 @@ def build(
         except CUT["CutFailed"] as error:
             raise BuildFailed(str(error)) from None
         data = _compiled(source, names, ["--import-memory"] if beside else [])
-    found = read_module(data)
-    _check(found, names, len(data), LARGEST if largest is None else largest, (MEMORY,) if beside else ())
+    _check(data, LARGEST if largest is None else largest)
     data += section(SECTION, source_hash(root, modules).encode())
     # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
     out = out.resolve()  # a link stays, what is behind it is replaced
@@ -182,7 +178,7 @@ def build(
     except OSError as error:
         part.unlink(missing_ok=True)
         raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
-    return Built(len(data), tuple(sorted(names)), found.imports, shlex.join(_tools()[0]))
+    return Built(len(data), tuple(sorted(names)), shlex.join(_tools()[0]))
 
 
 def _compiled(source: Path, names: Iterable[str], more: Iterable[str] = ()) -> bytes:
@@ -222,11 +218,7 @@ def build_library(out: Path, source: Path, names: Iterable[str]) -> None:
     reason = why_not(of_kernels=False)
     if reason:
         raise BuildFailed(reason)
-    data = _compiled(source, names)
-    imports = read_module(data).imports
-    if imports:
-        raise BuildFailed(f"the module imports {', '.join(imports)}; it must stand alone")
-    out.write_bytes(data)
+    out.write_bytes(_compiled(source, names))
 
 
 def _run(command: list[str], folder: Path) -> None:
@@ -238,110 +230,24 @@ def _run(command: list[str], folder: Path) -> None:
         raise BuildFailed(f"{shlex.join(command)} failed:\n{(done.stdout + done.stderr)[-4000:]}")
 
 
-def _check(found: Module, names: list[str], size: int, largest: int, imports: tuple[str, ...]) -> None:
-    if found.imports != imports:
-        may = f"{', '.join(imports)} alone may be" if imports else "it must stand alone"
-        raise BuildFailed(f"the module imports {', '.join(found.imports) or 'nothing'}; {may}")
-    edges = {name: found.globals.get(name) for name in EDGES}
-    if None in edges.values() or edges["__data_end"] != edges["__global_base"] or found.data_segments:
-        raise BuildFailed(
-            "a kernel reads or writes static data, which nothing fills outside Python: "
-            f"{edges}, {found.data_segments} data segments"
-        )
-    missing = sorted(set(names) ^ set(found.functions))
-    if missing:
-        raise BuildFailed(f"exported functions are not those of the sources: {', '.join(missing)}")
-    if size >= largest:
-        raise BuildFailed(f"the module has {size} bytes; below {largest} are allowed")
-
-
-@dataclass(frozen=True)
-class Module:
-    """What a WebAssembly file says of itself: imports, exports, data segments, hash of its sources."""
-
-    imports: tuple[str, ...]
-    functions: tuple[str, ...]
-    globals: dict[str, int]  # exported constants
-    data_segments: int
-    sources: str  # empty where the file does not say
-
-
-def read_module(data: bytes) -> Module:
-    """Read the sections of a WebAssembly module (version 1).
-
-    Parameters
-    ----------
-    data : bytes
-        The file.
-
-    Returns
-    -------
-    Module
-
-    Raises
-    ------
-    BuildFailed
-        Not such a file.
-    """
-    if data[:8] != b"\0asm\1\0\0\0":
-        raise BuildFailed("not a WebAssembly module of version 1")
-    sections = {}
-    sources = ""
-    at = 8
-    while at < len(data):
-        kind = data[at]
-        size, at = _number(data, at + 1)
-        if kind:
-            sections[kind] = (at, at + size)
-        else:
-            name, start = _name(data, at)
-            if name == SECTION:
-                sources = data[start : at + size].decode()
+def _check(module: bytes, largest: int) -> None:
+    """No byte of static data, and a size below the limit; what the linker has left out or added it tells itself."""
+    at = 8  # behind the magic word and the version: number, size and content of each section
+    while at < len(module):
+        kind, size, shift, at = module[at], 0, 0, at + 1
+        while True:  # LEB128
+            byte, at = module[at], at + 1
+            size |= (byte & 0x7F) << shift
+            shift += 7
+            if byte < 0x80:
+                break
+        if kind == DATA:
+            raise BuildFailed(
+                f"a kernel reads static data ({size} bytes), which nothing fills outside Python"
+            )
         at += size
-    imports, functions, constants = [], [], {}
-    if 2 in sections:
-        count, at = _number(data, sections[2][0])
-        if count:
-            name, at = _name(data, at)
-            field, at = _name(data, at)
-            imports.append(f"{name}.{field}" + (f" and {count - 1} more" if count > 1 else ""))
-    values = []
-    if 6 in sections:
-        count, at = _number(data, sections[6][0])
-        for _ in range(count):
-            # type, mutability, then i32.const VALUE end
-            if data[at] != 0x7F or data[at + 2] != 0x41:
-                raise BuildFailed("a global of the module is not a 32-bit constant")
-            value, at = _number(data, at + 3, signed=True)
-            values.append(value)
-            at += 1
-    if 7 in sections:
-        count, at = _number(data, sections[7][0])
-        for _ in range(count):
-            name, at = _name(data, at)
-            kind = data[at]
-            index, at = _number(data, at + 1)
-            if kind == 0:
-                functions.append(name)
-            elif kind == 3:
-                constants[name] = values[index]
-    segments = _number(data, sections[11][0])[0] if 11 in sections else 0
-    return Module(tuple(imports), tuple(functions), constants, segments, sources)
-
-
-def _number(data: bytes, at: int, signed: bool = False) -> tuple[int, int]:
-    # LEB128
-    value = shift = 0
-    while True:
-        byte = data[at]
-        at += 1
-        value |= (byte & 0x7F) << shift
-        shift += 7
-        if byte < 0x80:
-            break
-    if signed and byte & 0x40:
-        value -= 1 << shift
-    return value, at
+    if len(module) >= largest:
+        raise BuildFailed(f"the module has {len(module)} bytes; below {largest} are allowed")
 
 
 def section(name: str, content: bytes) -> bytes:
@@ -350,11 +256,6 @@ def section(name: str, content: bytes) -> bytes:
     if len(body) >= 128:
         raise ValueError("a custom section longer than 127 bytes")
     return bytes([0, len(body)]) + body
-
-
-def _name(data: bytes, at: int) -> tuple[str, int]:
-    size, at = _number(data, at)
-    return data[at : at + size].decode(), at + size
 
 
 if __name__ == "__main__":

@@ -9,8 +9,8 @@ groups under `#if`); a name leads to the declaration that makes it, and what tha
 module imports by pointer is the function itself here. What is reached must not name Python: who uses it is told.
 
 Names lose what Cython puts before them (`__pyx_f_12lavender_ext_4core_5block_clip` is `core_block_clip`), core
-functions `lav_x` become `k_x`, and everything of the kernels is `static`. Uses under `#ifndef LAV_SWEEPS_ONLY` of
-`front` count for the full build alone, and what only they reach stands under the same condition.
+functions `lav_x` become `k_x`, and everything of the kernels is `static`: a build that leaves some of `front` out
+(LAV_SWEEPS_ONLY) leaves out what only that calls, as every compiler does.
 
 Only the standard library is imported, so that setup.py can run this before anything is built.
 """
@@ -34,8 +34,6 @@ __all__ = ["CutFailed", "Item", "core_functions", "cut", "path_of", "read", "sou
 PUBLIC = re.compile(r"^cdef public [^(\n]*?\b(lav_\w+)\(", re.MULTILINE)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
-#: The condition of `front` under which the small build leaves things out.
-SMALL = "LAV_SWEEPS_ONLY"
 #: What stands before everything: how floating point must be compiled, and words of Cython's own.
 PROLOGUE = """\
 #include <float.h>
@@ -65,6 +63,9 @@ PROLOGUE = """\
 #pragma GCC diagnostic ignored "-Wmaybe-uninitialized"
 #endif
 #define CYTHON_UNUSED __attribute__((unused))
+#elif defined(_MSC_VER)
+#pragma warning(disable : 4100 4101 4189 4505)
+#define CYTHON_UNUSED
 #else
 #define CYTHON_UNUSED
 #endif
@@ -99,15 +100,13 @@ class CutFailed(Exception):
 
 @dataclass
 class Item:
-    """One declaration: the names it makes, those it uses (in the full build, in both), its text."""
+    """One declaration: the names it makes, those it uses, its text."""
 
     kind: str  # include, macro, type, prototype, variable, function, group
     text: str
     makes: set[str] = field(default_factory=set)
     uses: set[str] = field(default_factory=set)
-    small: set[str] = field(default_factory=set)  # of `uses`, those of the small build
     origin: str = ""
-    only_full: bool = False
 
 
 @dataclass
@@ -115,30 +114,17 @@ class Token:
     kind: str
     text: str
     before: str  # white space
-    full: bool  # under a condition of the full build
 
 
 def tokens(text: str) -> Iterator[Token]:
     """Words, literals, marks and lines of the preprocessor; comments are white space."""
-    before, conditions = "", [False]
+    before = ""
     for match in TOKEN.finditer(text):
         kind, said = match.lastgroup or "", match.group()
         if kind == "skip":
             before += said if said.isspace() else " "
             continue
-        if kind == "directive":
-            said = said.lstrip()
-            words = WORD.findall(said)
-            if words[:1] in (["if"], ["ifdef"], ["ifndef"]):
-                conditions.append(conditions[-1] or words == ["ifndef", SMALL])
-                yield Token(kind, said, before, conditions[-1])
-                before = ""
-                continue
-            if words[:1] == ["endif"] and len(conditions) > 1:
-                yield Token(kind, said, before, conditions.pop())
-                before = ""
-                continue
-        yield Token(kind, said, before, conditions[-1])
+        yield Token(kind, said.lstrip() if kind == "directive" else said, before)
         before = ""
 
 
@@ -147,12 +133,11 @@ def read(text: str, origin: str = "") -> list[Item]:
     stream = list(tokens(text))
     closing, opened = {}, []
     for at, token in enumerate(stream):
-        if token.kind == "directive":
-            word = WORD.findall(token.text)[:1]
-            if word and word[0] in ("if", "ifdef", "ifndef"):
-                opened.append(at)
-            elif word == ["endif"] and opened:
-                closing[opened.pop()] = at
+        word = _word(token)
+        if word in ("if", "ifdef", "ifndef"):
+            opened.append(at)
+        elif word == "endif" and opened:
+            closing[opened.pop()] = at
     return list(_declarations(stream, closing, 0, len(stream), origin))
 
 
@@ -162,15 +147,9 @@ def _declarations(
     while at < end:
         token = stream[at]
         if token.kind == "directive":
-            word = (WORD.findall(token.text) or [""])[0]
             if at in closing:
                 last = closing[at]
-                if SMALL in token.text:
-                    for item in _declarations(stream, closing, at + 1, last, origin):
-                        item.only_full = True
-                        yield item
-                    at = last + 1
-                elif last >= end - 1 and at < 400:  # the guard of the file: its last branch counts
+                if last >= end - 1 and at < 400:  # the guard of the file: its last branch counts
                     inner = [
                         i
                         for i in range(at + 1, last)
@@ -178,13 +157,12 @@ def _declarations(
                     ]
                     yield from _declarations(stream, closing, (inner[-1] if inner else at) + 1, last, origin)
                     return
-                else:
-                    yield _group(stream[at : last + 1], closing, at, origin)
-                    at = last + 1
+                yield _group(stream[at : last + 1], origin)
+                at = last + 1
                 continue
-            if word == "include":
+            if _word(token) == "include":
                 yield Item("include", token.text.strip(), origin=origin)
-            elif word == "define":
+            elif _word(token) == "define":
                 yield _macro(token, origin)
             at += 1
             continue
@@ -194,6 +172,7 @@ def _declarations(
 
 
 def _word(token: Token) -> str:
+    """The first word of a line of the preprocessor; empty for anything else."""
     return (WORD.findall(token.text) or [""])[0] if token.kind == "directive" else ""
 
 
@@ -238,8 +217,6 @@ def _uses(item: Item, part: list[Token]) -> None:
             words = WORD.findall(token.text)
         last = "->" if last == "-" and token.text == ">" else token.text
         item.uses.update(words)
-        if not token.full:
-            item.small.update(words)
 
 
 def _macro(token: Token, origin: str) -> Item:
@@ -249,7 +226,7 @@ def _macro(token: Token, origin: str) -> Item:
     return made
 
 
-def _group(part: list[Token], closing: dict[int, int], offset: int, origin: str) -> Item:
+def _group(part: list[Token], origin: str) -> Item:
     made = Item("group", _text(part), origin=origin)
     inside: list[Token] = [token for token in part if token.kind != "directive"]
     for item in _declarations(inside, {}, 0, len(inside), origin):
@@ -324,12 +301,14 @@ class _Table:
                 elif held.kind == item.kind == "function" and held.text != item.text:
                     self.twice[name] = f"{held.origin} and {item.origin}"
 
-    def reach(self, roots: Iterable[str], small: bool, done: dict[int, Item]) -> None:
-        """Adds what the names lead to, in an order in which everything stands before its use."""
+    def reach(self, roots: Iterable[str]) -> list[Item]:
+        """What the names lead to, in an order in which everything stands before its use."""
+        done: dict[int, Item] = {}
         for name in sorted(roots):
-            self._visit(name, small, done, ())
+            self._visit(name, done, ())
+        return list(done.values())
 
-    def _visit(self, name: str, small: bool, done: dict[int, Item], path: tuple[str, ...]) -> None:
+    def _visit(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
         item = self.by_name.get(name)
         if item is None or name in PROVIDED or id(item) in done:
             return
@@ -343,9 +322,8 @@ class _Table:
             raise CutFailed(
                 f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
             )
-        for other in sorted((item.small if small else item.uses) - item.makes):
-            if other not in KEYWORDS:
-                self._visit(other, small, done, (*path, name))
+        for other in sorted(item.uses - item.makes - KEYWORDS):
+            self._visit(other, done, (*path, name))
         done[id(item)] = item
 
 
@@ -372,24 +350,13 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
         for item in items:
             _rename(item, kept)
         table.add(item for item in items if item.kind != "include")
-    reached: dict[int, Item] = {}
-    small: dict[int, Item] = {}
     own = read(front, "front")
     made = set().union(*(item.makes for item in own), KEYWORDS)
-    table.reach(set().union(*(item.small for item in own if not item.only_full), kept) - made, True, small)
-    table.reach(set().union(*(item.uses for item in own), kept) - made, False, reached)
+    reached = table.reach(set().union(*(item.uses for item in own), kept) - made)
     missing = sorted(kept - set(table.by_name))
     if missing:
         raise CutFailed(f"no such core functions: {', '.join(missing)}")
-    parts, hidden = [], False
-    for key, item in reached.items():
-        if (key not in small) != hidden:
-            parts.append("#endif" if hidden else f"#ifndef {SMALL}")
-            hidden = not hidden
-        parts.append(_private(item, kept))
-    if hidden:
-        parts.append("#endif")
-    return "\n\n".join([PROLOGUE, *parts, front])
+    return "\n\n".join([PROLOGUE, *(_private(item, kept) for item in reached), front])
 
 
 def _private(item: Item, kept: frozenset[str]) -> str:
@@ -406,7 +373,6 @@ def _rename(item: Item, kept: frozenset[str]) -> None:
     item.text = WORD.sub(lambda match: _plain(match.group(), kept), item.text)
     item.makes = {_plain(name, kept) for name in item.makes}
     item.uses = {_plain(name, kept) for name in item.uses}
-    item.small = {_plain(name, kept) for name in item.small}
 
 
 def _plain(name: str, kept: frozenset[str]) -> str:

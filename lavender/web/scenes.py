@@ -147,14 +147,12 @@ def layout() -> dict[str, Any]:
     Returns
     -------
     dict
-        structs: name -> field -> type ("i4", "f8", "3f8", "p" for a pointer); native: name -> size and offsets
-        [bytes]; arrays: buffer -> names in order; size, head, setting,
-        joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it writes.
+        structs: name -> field -> type ("i4", "f8", "3f8", "p" for a pointer); arrays: buffer -> names in order; size,
+        head, setting, joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it
+        writes.
     """
-    native = {name: {"size": size, "offsets": offsets} for name, (size, offsets) in memory.layout().items()}
     return {
         "structs": memory.STRUCTS,
-        "native": native,
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
         "size": {**SIZE, "cap_pair": CAP_PAIR, "cap_contact": CAP_CONTACT},
         "head": HEAD,

@@ -31,7 +31,6 @@ from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_
                                       rolling_section, round_group, round_section, round_share)
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rolling cimport part_of, part_size
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.supernodal cimport sparse_solve
@@ -143,13 +142,13 @@ cdef inline void project_rolling(const blocks_t* p, const double* root, int32_t 
     cdef double f
     openings(p, root, i, a)
     for g in range(3):
-        q = part_of(n, g)
+        q = 1 if g == 0 else 3 if g == 1 else n - 2
         t[g] = norm2(u[j + q], u[j + q + 1]) if g != 1 else fabs(u[j + q]) if n == 6 else 0.0
     z[j] = rolling_section(a, t, u[j], bound)
     for g in range(3):
         f = bound[g] / t[g] if t[g] > bound[g] else 1.0
-        q = part_of(n, g)
-        for k in range(j + q, j + q + part_size(n, g)):
+        q = 1 if g == 0 else 3 if g == 1 else n - 2
+        for k in range(j + q, j + q + (2 if g != 1 else n - 5)):
             z[k] = f * u[k]
 
 

@@ -1,15 +1,21 @@
 """The iterate of Newton's method over generalised velocities: what is kept of it, and what a point answers (`newton.pxd`).
 
-Rows and blocks of an island stand in runs of panels. lambda(s) and V are those of softened blocks (`soft.pxd`), errors
-those of the judge.
+Rows and blocks of an island stand in runs of panels; errors are those of the judge. With theta > 0 [1/kg] on every row
+and s = J (v - v*) - b [m/s], a block's law determines its impulse:
+
+    z = (rho c - s) / theta
+    row        lambda = clip(z, lower, upper)
+    contact    lambda = Pi(z) of its law in the metric of theta (`core/contact_map.pxd`)                  (1)
+    V          -d lambda / d s, of the block's rows
+
+theta is equal on all tangents of a disk, which makes (1) a closed form.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROW, block_error, blocks_t, ends_apart, n_tangents,
-                                      row_error)
+from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, block_error, blocks_t, n_tangents, row_error
+from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
-from lavender_ext.generalized.soft cimport cone_map, coulomb_map, rolling_response
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
 
@@ -52,6 +58,7 @@ cdef struct flow_t:
     int32_t still               # its y is 0
     double* theta               # (m) theta', > 0
     double* soft                # (m) 1 / theta'
+    double* root                # (m) theta'^1/2
     double* rho                 # (m) >= 0
     double* y                   # (n)
     double* u                   # (n) Y^T lambda
@@ -109,10 +116,33 @@ cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
 # -- lambda(s) and V -------------------------------------------------------------------------------------
 
 
+cdef inline void respond_contact(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
+    """(1) of contact i: z in lam becomes lambda, with V."""
+    cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l, rolls = f.p.kind[i] == CONTACT_ROLLING
+    cdef int32_t nt = n_tangents(f.p.kind[i], n), spin = n - 1 - nt - 2 * rolls
+    cdef const double* root = f.root + j
+    cdef const double* soft = f.soft + j
+    cdef double a[3]
+    cdef double y[6]
+    cdef double out[6]
+    cdef double back[6]                                 # theta^-1/2
+    for k in range(n):
+        back[k] = root[k] * soft[k]
+        y[k] = root[k] * lam[k]
+    a[0] = f.p.mu[i] * root[1] * back[0] if nt else 0.0
+    a[1] = f.p.mu[i] * f.p.patch_radius[i] * root[1 + nt] * back[0] if spin else 0.0
+    a[2] = f.p.rolling[i] * root[n - 2] * back[0] if rolls else 0.0
+    contact_map(f.p.law, nt, spin, rolls, a, y, out, v)
+    for k in range(n):
+        lam[k] = lam[k] if out[k] == y[k] else out[k] * back[k]
+        for l in range(n):
+            v[k * n + l] *= back[k] * back[l]
+
+
 cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const double* s, double* lam,
                          double* v) noexcept nogil:
     """lambda and V of blocks [first, last)."""
-    cdef int32_t i, j, end, k, nt, spin, at
+    cdef int32_t i, j, end, k, at
     # Hoisted: what is stored to might be any of them, for all a compiler knows.
     cdef const int32_t* ptr = f.p.ptr
     cdef const int32_t* kind = f.p.kind
@@ -123,7 +153,6 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
     cdef const double* center = f.center
     cdef const double* soft = f.soft
     cdef double z, low, high
-    cdef bint cone = f.p.law == CONE
     for i in range(first, last):
         j = ptr[i]
         end = ptr[i + 1]
@@ -139,14 +168,7 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
             continue
         for k in range(j, end):
             lam[k] = (rho[k] * center[k] - s[k]) * soft[k]
-        nt = n_tangents(kind[i], end - j)
-        spin = ends_apart(kind[i])
-        if kind[i] == CONTACT_ROLLING:
-            rolling_response(f.p.law, end - j, f.theta + j, f.p.mu[i], f.p.patch_radius[i], f.p.rolling[i], lam + j, v + at)
-        elif cone:
-            cone_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
-        else:
-            coulomb_map(nt, spin, f.theta + j, f.p.mu[i], f.p.patch_radius[i], lam + j, v + at)
+        respond_contact(f, i, lam + j, v + at)
 
 
 cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, double* lam) noexcept nogil:

@@ -224,7 +224,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
     """float64 that `furnish` needs."""
     cdef ssize_t size = need.most[0], values = <ssize_t>need.values
-    return (4 * <ssize_t>f.g.n + 14 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
+    return (4 * <ssize_t>f.g.n + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
             + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1)
 
 
@@ -251,7 +251,8 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
     f.e = x + 11 * m
     f.soft = x + 12 * m
     f.aside = x + 13 * m
-    x += 14 * m
+    f.root = x + 14 * m
+    x += 15 * m
     f.v = x
     f.held = x + nv
     x += 2 * nv

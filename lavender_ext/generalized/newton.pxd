@@ -1,6 +1,6 @@
 """Newton's method over the velocities of generalised coordinates, island by island; A is never formed.
 
-With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of softened blocks (`soft.pxd`):
+With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of softened blocks (`flow.pxd`):
 
     G(y) = y - Y^T lambda(s),    N = I + Y^T V Y,    N p = -G,    y <- y + t p                            (1)
     theta' = theta + rho,        z = (rho c - s) / theta'                                                 (2)
@@ -24,11 +24,11 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
+from lavender_ext.core.contact_map cimport length
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, flow_t, gather, measure, renew, respond_all,
                                             row_end, row_from)
 from lavender_ext.generalized.normal cimport factor, form, newton_step
-from lavender_ext.generalized.soft cimport size_of
 from lavender_ext.generalized.sparse cimport is_worth
 
 
@@ -202,6 +202,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
+                f.root[k] = sqrt(theta[k])
 
 
 cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
@@ -356,11 +357,11 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
 cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
     cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
-    cdef double out = f.p.mu[i] * size_of(f.w + j + 1, nt)
+    cdef double out = f.p.mu[i] * length(f.w + j + 1, nt)
     if n_apart(f.p.kind[i], end - j) & 1:
         out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[j + 1 + nt])
     if f.p.kind[i] == CONTACT_ROLLING:
-        out += f.p.rolling[i] * size_of(f.w + end - 2, 2)
+        out += f.p.rolling[i] * length(f.w + end - 2, 2)
     return out
 
 

@@ -7,7 +7,7 @@ by Newton's method (Coulomb: Alart and Curnier 1991), each step halved while |z 
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.rolling cimport rolling_map
+from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
@@ -32,7 +32,7 @@ cdef inline double residue(int32_t law, int32_t n, const double* H, const double
             x += fabs(H[n * i + j] * z[j])
         y[i] = z[i] - s
         size[0] = x if x > size[0] else size[0]
-    rolling_map(law, n, a, y, y[0] if y[0] > 0.0 else 0.0, out, p)
+    contact_map(law, 2, n - 5, 1, a, y, out, p)
     for i in range(n):
         total += (z[i] - out[i]) * (z[i] - out[i])
     return sqrt(total)

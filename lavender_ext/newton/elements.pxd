@@ -17,12 +17,6 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
 
-cpdef enum:                     # natural maps
-    MAP_CONVEX = 0
-    MAP_COULOMB = 1             # radius a_t z_n; P is then the derivative for fixed radius alone
-    MAP_AUGMENTED = 2           # radius a_t (z_n - s_n), Alart-Curnier
-
-
 cdef struct elements_t:
     int32_t n                   # elements
     int32_t m                   # rows

@@ -17,8 +17,9 @@ the rounds are, and rises where one fails.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.block cimport CONE
 from lavender_ext.judge.score cimport relative
-from lavender_ext.newton.elements cimport MAP_AUGMENTED, MAP_CONVEX, elements_t
+from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.natural_map cimport z_end
 from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
                                       N_AUGMENTED_INTERIOR, N_DE_SAXCE, N_EXCHANGES, N_INTERIOR, N_ROUNDS, POLISH,
@@ -92,7 +93,7 @@ cdef inline bint exchange_once(newton_t* n) noexcept nogil:
     for j in range(n.s.e.m):
         n.rest[j] = x.hz[j] - n.s.e.g[j]
     sides(n.s.e, x.z, x.hz, x.side, False)
-    system_natural(&n.s, x.z, n.rest, MAP_CONVEX, 1e-9, n.f)
+    system_natural(&n.s, x.z, n.rest, CONE, 1e-9, n.f)
     system_factor(&n.s, OF_NATURAL, 1e-9)
     for j in range(n.s.e.m):
         n.f[j] = -n.f[j]
@@ -191,7 +192,7 @@ cdef inline void end_steps(newton_t* n, bint rounds) noexcept nogil:
     if k.lowest < n.best:
         score(n, k.kept)
     if rounds and not k.rows and k.lowest < close_to() and not done(n) and not at_floor(n):
-        begin_rounds(n, 1, k.kept, MAP_CONVEX, 1e-4 if k.lowest > 1e-4 else k.lowest, INNER)
+        begin_rounds(n, 1, k.kept, CONE, 1e-4 if k.lowest > 1e-4 else k.lowest, INNER)
         enter_rounds(n, 1, END)
 
 
@@ -356,7 +357,7 @@ cdef inline void go_rounds(newton_t* n, int32_t which) noexcept nogil:
         if x.solved or x.history[x.n - 1] <= x.history[0]:
             take(n, x.z, n.u)
         x.at = 2
-        if x.law == MAP_CONVEX and x.solved and n.best > 0.5 * x.before and n.best > 1e-8 and ask(n, x):
+        if x.law == CONE and x.solved and n.best > 0.5 * x.before and n.best > 1e-8 and ask(n, x):
             return
     x.at = 0
     if n.proven:
@@ -423,7 +424,7 @@ cdef inline void go_approach(newton_t* n) noexcept nogil:
             leave(n)
             return
         k.steps += 1
-        if k.law == MAP_CONVEX:
+        if k.law == CONE:
             n.counts[N_AUGMENTED_INTERIOR] += 1
         else:
             n.counts[N_AUGMENTED_DE_SAXCE if k.augmented else N_DE_SAXCE] += 1

@@ -11,16 +11,15 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport ROW
+from lavender_ext.core.block cimport CONE, COULOMB, ROW
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.elements cimport MAP_AUGMENTED, MAP_CONVEX
 from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
-from lavender_ext.newton.run cimport (APPROACH, CONVEX, COULOMB, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED,
-                                      N_REFINED, N_RELAXED, POLISH, PROXIMAL, PURSUIT, RELAXED, WALKS, at_floor, begin_apart,
-                                      done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
+from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
+                                      PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, WALKS, at_floor,
+                                      begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
                                       take_back, tries_t, with_products)
 from lavender_ext.newton.steps cimport begin_interior, delta_of, interior_step
 from lavender_ext.newton.system cimport BODIES, DENSE, OF_BARRIER, system_factor, system_natural, system_solve, system_times
@@ -137,7 +136,7 @@ cdef inline void go_ends(newton_t* n) noexcept nogil:
             n.s.augmented = 1
             begin_interior(n, shift_of(), 0.0, False)
             n.s.augmented = 0
-            begin_approach(n, MAP_CONVEX, 1)
+            begin_approach(n, CONE, 1)
         return
     if n.at == 11:
         n.at = 12
@@ -146,7 +145,7 @@ cdef inline void go_ends(newton_t* n) noexcept nogil:
             return
     if n.at == 12 and not done(n):
         n.at = 13
-        begin_rounds(n, 1, n.best_z, MAP_CONVEX, 1e-3, INNER)
+        begin_rounds(n, 1, n.best_z, CONE, 1e-3, INNER)
         enter_rounds(n, 1, LIMITLESS)
         return
     take_back(n)
@@ -213,7 +212,7 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
         n.s.augmented = x.augmented
         begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x.share), False)
         n.s.augmented = 0
-        begin_approach(n, MAP_AUGMENTED, x.augmented)
+        begin_approach(n, COULOMB, x.augmented)
         return
     best = n.look.lowest if x.at == 1 else end_apart(n, n.look.kept)
     if over(n):
@@ -222,7 +221,7 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
         x.at = 0
         x.share += 1
     else:
-        begin_rounds(n, 1, n.look.kept, MAP_AUGMENTED, best if best < (1e-3 if x.at == 1 else 1e-7) else
+        begin_rounds(n, 1, n.look.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
                      (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
         begin_apart(n)
         enter_rounds(n, 1, 15 if x.at == 1 else 12)
@@ -233,7 +232,7 @@ cdef inline void begin_relaxed(newton_t* n) noexcept nogil:
     begin_interior(n, delta_of(), 0.0, False)
     memset(n.trial, 0, n.s.e.m * sizeof(double))
     with_products(n, n.trial, n.rest)
-    n.relaxed = 1e-4 * system_natural(&n.s, n.trial, n.rest, MAP_CONVEX, 0.0, n.f)
+    n.relaxed = 1e-4 * system_natural(&n.s, n.trial, n.rest, CONE, 0.0, n.f)
     n.relaxed_at = 0
     enter(n, RELAXED)
 
@@ -248,7 +247,7 @@ cdef inline void go_relaxed(newton_t* n) noexcept nogil:
             return
     leave(n)
     if not done(n):
-        begin_rounds(n, 1, n.ip.z, MAP_AUGMENTED, 1e-3, INNER)
+        begin_rounds(n, 1, n.ip.z, COULOMB, 1e-3, INNER)
         pursue(n, 1)
 
 
@@ -266,7 +265,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     if at > 0 and over(n):
         at = 6
     if at == 0:
-        begin_rounds(n, 0, n.best_z, MAP_AUGMENTED, 1e-5, INNER)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
+        begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, INNER)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
         pursue(n, 0)
     elif at == 1:
         try_shares(n, 0, 1, 0)
@@ -289,9 +288,9 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
 cdef inline void go(newton_t* n) noexcept nogil:
     """One factorisation of the phase on top, or its end."""
     cdef int32_t phase = n.stack[n.depth - 1]
-    if phase == CONVEX:
+    if phase == PLAN_CONVEX:
         go_convex(n)
-    elif phase == COULOMB:
+    elif phase == PLAN_COULOMB:
         go_coulomb(n)
     elif phase == EXCHANGES:
         go_exchange(n)
@@ -324,7 +323,7 @@ cdef inline void newton_start(newton_t* n, const double* z, bint coulomb) noexce
     take(n, n.best_z, z)
     score(n, z)
     if not done(n):
-        enter(n, COULOMB if coulomb else CONVEX)
+        enter(n, PLAN_COULOMB if coulomb else PLAN_CONVEX)
 
 
 cdef inline int32_t newton_step(newton_t* n, int32_t work) noexcept nogil:

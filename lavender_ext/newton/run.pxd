@@ -17,8 +17,8 @@ from lavender_ext.newton.system cimport system_t, system_times
 
 
 cdef enum:                      # phases
-    CONVEX = 0                  # what is tried when (plan.pxd)
-    COULOMB = 1
+    PLAN_CONVEX = 0             # what is tried when (plan.pxd)
+    PLAN_COULOMB = 1
     EXCHANGES = 2               # phases.pxd
     INTERIOR = 3
     PROXIMAL = 4

@@ -12,7 +12,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.block cimport ROW
+from lavender_ext.core.block cimport CONE, ROW
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.factor.blocks cimport factor_t
@@ -20,7 +20,7 @@ from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
 from lavender_ext.factor.dense cimport PANEL, cholesky_room, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.elements cimport MAP_CONVEX, element_times, element_times_transposed, elements_t
+from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t
 from lavender_ext.newton.natural_map cimport natural
 from lavender_ext.newton.normal_matrix cimport normal_matrix
 from lavender_ext.newton.panel cimport to_bodies, to_rows
@@ -232,7 +232,7 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
         return s.others.factor(s.others.at, s.augmented, what, eps)
     if s.form == DENSE:
         return factor_dense(s, what, eps)
-    lu = what == OF_PAIR or (what == OF_NATURAL and s.law != MAP_CONVEX)
+    lu = what == OF_PAIR or (what == OF_NATURAL and s.law != CONE)
     normal_matrix(s.e, s.v, s.f, lu)
     s.by = BY_LU if lu else BY_CHOLESKY
     return (block_lu(s.f) if lu else block_cholesky(s.f)) == 0

@@ -14,7 +14,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.block cimport COULOMB, blocks_t
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.weights cimport block_weights, joint_weights
@@ -22,7 +22,6 @@ from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
 from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
                                          real_room)
-from lavender_ext.newton.elements cimport MAP_AUGMENTED
 from lavender_ext.newton.phases cimport LIMITLESS, begin_rounds, enter_rounds, go_rounds
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.run cimport INNER, N_ROUNDS, impulse_of, newton_t
@@ -91,7 +90,7 @@ cdef inline void walk(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n
     cdef int32_t j
     for j in range(p.n_rows):
         n.trial[j] = lam[j] / n.scale[j]
-    begin_rounds(n, 0, n.trial, MAP_AUGMENTED, alpha, INNER)
+    begin_rounds(n, 0, n.trial, COULOMB, alpha, INNER)
     enter_rounds(n, 0, limit)
     while n.depth > 0:
         go_rounds(n, 0)

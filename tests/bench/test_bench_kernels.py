@@ -1,4 +1,4 @@
-"""The kernel suite: bare loops do the same work, figures are consistent, the command prints and writes them."""
+"""Kernels and steps timed: bare loops do the same work, figures are consistent, commands print and write them."""
 
 import json
 import shutil
@@ -9,14 +9,18 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks import kernels
-from benchmarks.kernels import limits, microbenchmarks
+from benchmarks import engine
+from benchmarks.clock import least
+from benchmarks.kernels import command, microbenchmarks, problems
+from benchmarks.kernels.cases import job, run
+from benchmarks.kernels.command import table
+from benchmarks.kernels.instructions import COUNTED, instructions
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
 def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
-    problem = kernels.lattice_pile(200, shuffle=shuffle)
-    contacts, bodies = kernels.bare_contacts(problem)
+    problem = problems.lattice_pile(200, shuffle=shuffle)
+    contacts, bodies = problems.bare_contacts(problem)
     microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
     impulse = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=20).impulse
     # The same sweep with I^-1 applied on the way: rounding of 20 sweeps.
@@ -29,7 +33,7 @@ def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
 
 
 def test_the_bare_row_sweep_is_pgs():
-    problem = kernels.tridiagonal(50)
+    problem = problems.tridiagonal(50)
     a, lam = problem.csr, problem.start()
     microbenchmarks.csr(a.indptr, a.indices, a.data, problem.b, problem.data.step.copy(), lam, 30)
     impulse = lv.solve(problem, "pgs", tol=0.0, max_iter=30).impulse
@@ -38,79 +42,71 @@ def test_the_bare_row_sweep_is_pgs():
 
 def test_the_pile_stands_where_it_says():
     for contacts in (1, 50, 3_000):
-        problem = kernels.lattice_pile(contacts)
+        problem = problems.lattice_pile(contacts)
         assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
         assert (problem.rows.contact_body < 0).any()
-    given, shuffled = kernels.lattice_pile(300), kernels.lattice_pile(300, shuffle=True)
+    given, shuffled = problems.lattice_pile(300), problems.lattice_pile(300, shuffle=True)
     assert given.n_blocks == shuffled.n_blocks
     assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
     with pytest.raises(lv.InputError, match="at least 1"):
-        kernels.lattice_pile(0)
-
-
-def test_limits_are_times_of_this_machine():
-    found = kernels.measure_limits(0.002)
-    assert all(x.value > 0.0 for x in found)
-    assert sum(x.name == "chase" for x in found) == len(limits.FOOTPRINTS)
-    assert kernels.stream_time(2e9) > kernels.stream_time(1e9) > 0.0
+        problems.lattice_pile(0)
 
 
 def test_least_is_the_least_of_many():
     clock = iter([0, 5_000, 0, 3_000, 0, 9_000])  # ns; a call of 2 ms is a batch of its own
-    found = kernels.least(lambda: time.sleep(0.002), seconds=0.0, clock=lambda: next(clock))
+    found = least(lambda: time.sleep(0.002), seconds=0.0, clock=lambda: next(clock))
     assert found == [pytest.approx(3e-6)]
 
 
 @pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "jacobi", "block", "solve-1", "engine-box"])
 def test_cases_give_time_work_and_residual(case):
-    rows = list(kernels.run([case], seconds=0.01))
+    rows = list(run([case], seconds=0.01))
     for row in rows:
         assert row.seconds > 0.0 and row.work > 0
         assert row.per_unit == pytest.approx(1e9 * row.seconds / row.work)
     assert any(np.isfinite(r.residual) for r in rows)
-    text = kernels.table(rows)
+    text = table(rows)
     assert all(r.case in text for r in rows)
 
 
 def test_a_wrong_case_is_named():
     with pytest.raises(lv.InputError, match="'nosuch'"):
-        list(kernels.run(["nosuch"]))
-
-
-def test_growing_piles_are_built_and_solved():
-    (row,) = kernels.scaling([200], seconds=0.01)
-    assert row["contacts"] > 100 and row["sweep"] > 0.0 and row["residual"] < 0.5
-    assert "| ns / contact and sweep |" in kernels.scaling_table([row])
-
-
-def test_bytes_are_those_of_the_arrays():
-    problem = kernels.lattice_pile(60)
-    c, m = problem.n_blocks, problem.m
-    per_row = 8 * (6 + 1 + 1 + 1 + 2)  # swing, compliance, b, step, impulse twice
-    per_contact = 8 * (12 + 1 + 5 + 1) + 4 * 3  # axes, arms, bodies, coupling, mu; order, start, kind
-    assert kernels.contact_bytes(problem) == pytest.approx((m * per_row + c * per_contact) / c)
+        list(run(["nosuch"]))
 
 
 def test_command_prints_and_writes(tmp_path):
     out = tmp_path / "kernels.json"
-    done = CliRunner().invoke(kernels.command, ["solve-1", "--seconds", "0.01", "--out", str(out)])
+    done = CliRunner().invoke(command, ["solve-1", "--seconds", "0.01", "--out", str(out)])
     assert done.exit_code == 0, done.output
-    assert "lv.solve" in done.output and "dependent load" in done.output
+    assert "lv.solve" in done.output and "kernel alone" in done.output
     record = json.loads(out.read_text())
     assert record["lines"][0]["ns_per_unit"] > 0.0
-    assert {x["name"] for x in record["limits"]} == {"read", "triad", "chase", "chain"}
+    assert record["lines"][0]["share"] < 1.0  # a whole call takes longer than its kernel
 
 
 def test_counting_says_what_is_missing(monkeypatch):
     with pytest.raises(lv.InputError, match="not counted"):
-        kernels.instructions("build")
+        instructions("build")
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(lv.SolverUnavailable, match="valgrind"):
-        kernels.instructions("pgs")
+        instructions("pgs")
 
 
-@pytest.mark.parametrize("name", kernels.COUNTED)
+@pytest.mark.parametrize("name", COUNTED)
 def test_what_is_counted_runs(name):
-    call, work = kernels.counted(name)
-    call()
-    assert work >= 1.0
+    made = job(name)
+    made.call()
+    assert made.work >= 1.0
+
+
+def test_steps_by_what_a_scene_declares():
+    levels = [line.split("|") for line in engine.detail(steps=5).splitlines()[2:]]
+    assert [int(cells[2]) for cells in levels] == [1, 3, 4, 1, 3, 4]  # rows of a contact
+    text = engine.models(("tower of 6", "chain of 6"), steps=5, seconds=0.0)
+    assert len(text.splitlines()) == 2 + 2 * 3
+    assert all(
+        float(cell.split()[0]) > 0.0
+        for line in text.splitlines()[2:]
+        for cell in line.split("|")[3:4]
+        if cell.strip()
+    )

@@ -47,15 +47,15 @@ def test_a_tower_that_falls_is_said_to_fall():
     assert "**fell at" in table([found])
 
 
-def test_lines_of_equal_sweeps_a_second_share_a_letter():
+def test_lines_are_sorted_by_sweeps_a_second():
     some = [
-        line(),
+        line(sweeps=8),
         line(engine="y", sweeps=16, substeps=1),
-        line(sweeps=8, substeps=4),
         line(sweeps=0, engine="z"),
+        line(boxes=10),
     ]
-    text = table([*some, line(boxes=10)]).splitlines()[2:]
-    assert [row.split("|")[6].strip() for row in text] == ["960 a", "960 a", "1,920", "–", "960"]
+    text = table(some).splitlines()[2:]
+    assert [row.split("|")[6].strip() for row in text] == ["–", "960", "1,920", "960"]
 
 
 def test_the_map_asks_each_engine_for_what_it_takes():
@@ -83,7 +83,7 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
     [
         (["--engines", "lavendr"], "lavender"),
         (["--orders", "upwards"], "order"),
-        (["--boxes", "x"], "--boxes"),
+        (["--boxes", "0"], "--boxes"),
         (["--sweeps", "0"], "--sweeps"),
         (["--engines", "lavender", "--sweeps", "3"], "solver_iterations"),
         (["--out", "/no/such/folder/x.json"], "no such folder"),

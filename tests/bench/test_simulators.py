@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from lavender.bench import simulators
-from lavender.cli.bench_mujoco import mujoco
+from lavender.cli.bench import mujoco
 from lavender.report import simulators as tables
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")

@@ -113,7 +113,7 @@ def test_check_passes_honest_solvers(lavender, path):
 
 
 def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monkeypatch):
-    lavender("bench", path, "--solvers", "pgs", *QUICK[:-1], "--out", tmp_path / "r.jsonl")
+    bench.run([path], ["pgs"], bench.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
     before = (tmp_path / "r.jsonl").read_bytes()
     monkeypatch.setattr(bench, "run", None)
     code, out, _ = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again", "--no-figures")
@@ -185,7 +185,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--solvers", "pgs", "--in-process"), "--in-process has no effect"),
         (("report", "--campaign", "--time-limit", "3"), "--time-limit has no effect with --campaign"),
         (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
-        (("bench", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
+        (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--skip", "3"), "--skip has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
         (("nonsense",), "No such command"),
@@ -361,10 +361,8 @@ def test_a_named_file_that_does_not_load_touches_nothing_and_one_in_a_folder_is_
     assert code == cli.EXIT_BAD_INPUT
     assert "broken.npz" in err
     assert not (tmp_path / "out" / "index.html").exists()
-    for command in ("report", "bench"):
-        out = tmp_path / ("out" if command == "report" else "r.jsonl")
-        code, _, _ = lavender(command, folder, *more[:-1], out)
-        assert code == cli.EXIT_UNMET
+    code, _, _ = lavender("report", folder, *more[:-1], tmp_path / "out")
+    assert code == cli.EXIT_UNMET
     assert (tmp_path / "out" / "index.html").exists()
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     assert lavender("check", broken, "--solvers", "pgs")[0] == cli.EXIT_BAD_INPUT
@@ -460,7 +458,6 @@ def test_files_of_ten_gigabytes_are_refused_by_their_size(lavender, tmp_path):
         ("report", long_file(tmp_path / "records.jsonl")),
         ("report", tmp_path / "records.jsonl", "--out", tmp_path / "out"),
         ("view", long_file(tmp_path / "a.film", b"LAVENDERFILM"), "--no-browser"),
-        ("bench", "two_particles", "--solvers", "pgs", "--out", tmp_path / "records.jsonl"),
     ):
         code, out, err = lavender(*words)
         assert code == 2

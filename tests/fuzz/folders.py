@@ -51,7 +51,7 @@ def folder_specs():
         {
             "kind": st.just("folder"),
             "entries": st.lists(st.one_of(*[good] * 8, raw, odd), min_size=1, max_size=5),
-            "command": st.sampled_from(("report", "report", "report", "bench", "check", "files")),
+            "command": st.sampled_from(("report", "report", "report", "check", "files")),
             "figures": chance(0.1),
             "twice": chance(0.3),
         }
@@ -130,7 +130,6 @@ def check(spec):
                 str(out),
                 *([] if spec["figures"] else ["--no-figures"]),
             ],
-            "bench": ["bench", str(folder), *plan, "--out", str(Path(root, "r.jsonl"))],
             "check": ["check", str(folder), "--solvers", "pgs,nncg"],
             "files": [
                 "report",

@@ -140,7 +140,6 @@ def test_the_path_of_an_open_descriptor_is_no_name(tmp_path):
         ("run", "stack", "--steps", "2", "--trace"),
         ("run", "stack", "--steps", "2", "--plot"),
         ("solve", "stack(n=2)", "--output"),
-        ("bench", "two_particles", "--solvers", "pgs", "--out"),
     ],
 )
 def test_a_command_that_is_to_write_a_device_ends_with_2(words, tmp_path, capsys):

@@ -14,8 +14,7 @@ import lavender as lv
 from lavender import suite
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender_ext.newton.elements import MAP_AUGMENTED as AUGMENTED
-from lavender_ext.newton.elements import MAP_CONVEX as CONVEX
+from lavender_ext.core.problem import LAWS
 from lavender_ext.newton.solve import PHASES
 
 
@@ -84,11 +83,11 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
         assert solve.advance()[0]
 
 
-@pytest.mark.parametrize("law", [CONVEX, AUGMENTED])
+@pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
 @given(seed=seeds)
 @settings(max_examples=15)
 def test_augmented_system_is_the_same_newton_system(law, seed):
-    problem = problem_of(seed, True, "cone" if law == CONVEX else "coulomb")
+    problem = problem_of(seed, True, "cone" if law == LAWS["cone"] else "coulomb")
     system = make_system(problem, "velocity")
     solve, m = system.solve, system.sc.m
     rng = np.random.default_rng(seed)

@@ -115,7 +115,7 @@ def problems(
     Parameters
     ----------
     words : names
-        As `lavender bench` takes them; `mujoco:SCENE:CONE` and `scene:SCENE` with a scene of
+        As `lavender report` takes them; `mujoco:SCENE:CONE` and `scene:SCENE` with a scene of
         `engines.SCENES`.
     say : callable
         Told what is left out.

@@ -29,7 +29,6 @@ from lavender._arrays import FloatArray
 from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import InputError
-from lavender.external import clarabel_cone
 from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
@@ -117,7 +116,7 @@ def _backend(backend: Backend, form: str, own: str = "") -> Contestant:
         if form == "velocity" and problem.rows is None:
             return "no rows"
         spec = registry.get(backend.name)
-        if problem.law not in spec.laws or (backend is clarabel_cone.BACKEND and problem.law != "cone"):
+        if problem.law not in spec.laws or (backend.cones and problem.law != "cone"):
             return "friction"
         if own and backend.dense and problem.m > DENSE_ROWS:
             return "a dense matrix"
@@ -380,12 +379,10 @@ def contestants(siconos: str = "") -> list[Contestant]:
         for form in FORMS[:2]:
             # Those whose call is quick enough for an adapter to weigh, with dense matrices and with sparse ones.
             ways = QUICK.get(backend.name)
-            made += [_backend(backend, form)] if ways is None else [
+            made += [_backend(backend, form, "clarabel cones" if backend.cones else "")] if ways is None else [
                 _backend(replace(backend, dense=dense, warm=False), form, f"{backend.name}{word}, own interface")
                 for word, dense in ways
             ]  # fmt: skip
-    if _installed("clarabel"):
-        made += [_backend(clarabel_cone.BACKEND, form, "clarabel cones") for form in FORMS[:2]]
     made += [_cone(name, form) for name in ("scs", "qoco") if _installed(name) for form in FORMS[:2]]
     if _installed("pinocchio"):
         made += [_pinocchio(None), _pinocchio(20)]

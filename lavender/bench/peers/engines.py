@@ -31,7 +31,9 @@ SETTLE_LIMIT = 20.0  # s of CPU; an engine that needs more is left out, and said
 BATCH = 5e-3  # s of CPU of one batch: well above the clock's steps
 #: Name -> scene of the gallery, its parameters.
 SCENES: dict[str, tuple[str, dict[str, Any]]] = {
+    "box": ("stack", {"n": 1}),
     "stack6": ("stack", {}),
+    "stack20": ("stack", {"n": 20}),
     "pyramid55": ("pyramid", {"base": 10}),
     "pyramid210": ("pyramid", {"base": 20}),
     "pile1000": ("pile", {"n": 1000}),
