@@ -1,4 +1,4 @@
-"""The kernels in WebAssembly give the bits of the native ones: under Node, and under wasmtime from Python."""
+"""The kernels in WebAssembly give the bits of the native ones, under Node."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.scene import SCENES
 from lavender.web import compile as wasm
 from lavender.web import cut, pages
-from lavender.web.scenes import describe, layout, page_scenes
+from lavender.web.scenes import describe, page_scenes
 from lavender_ext.host import memory
 
 HERE = Path(__file__).resolve().parent.parent
@@ -51,13 +51,6 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     subprocess.run([sys.executable, str(HERE / "wasm" / "record.py"), str(folder)], check=True, cwd=ROOT)
     return folder
-
-
-@pytest.fixture(scope="session")
-def host():
-    return pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)") and __import__(
-        "wasm_host"
-    )
 
 
 # -- the module ------------------------------------------------------------------------------------------------
@@ -248,57 +241,17 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     assert sign in done.stderr
 
 
-# -- wasmtime --------------------------------------------------------------------------------------------------
-
-
-def same_bits(found, expected):
-    return np.asarray(found, expected.dtype).tobytes() == expected.tobytes()
-
-
-def test_wasmtime_structs_are_those_of_c_and_of_the_native_build(module, host):
-    # C's rules: every field at a multiple of its width, the whole at a multiple of the widest.
-    kernels, native = host.Kernels(module, layout()), memory.layout()
-    for pointer, (sizes, offsets) in {
-        4: (kernels.sizes, kernels.offsets),
-        np.dtype(np.intp).itemsize: (
-            {name: size for name, (size, _) in native.items()},
-            {(name, f): at for name, (_, places) in native.items() for f, at in places.items()},
-        ),
-    }.items():
-        for name, fields in memory.STRUCTS.items():
-            at, widest = 0, 1
-            for field, kind in fields.items():
-                width = pointer if kind == "p" else int(kind[-1])
-                at = -(-at // width) * width
-                assert offsets[name, field] == at, (name, field)
-                at += width * int(kind[:-2] or 1)
-                widest = max(widest, width)
-            assert sizes[name] == -(-at // widest) * widest, name
-
-
-def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
-    for name in ("stack", "chain"):
-        simulation = lv.Simulation(lv.Scene(name, substeps=1))
-        twin = host.Simulation(
-            host.Kernels(module, layout()), {"substeps": 1, **describe(simulation.snapshot())}
-        )
-        for _ in range(20):
-            state = simulation.state.copy()
-            assert state.kernel.prepare() == 0
-            curve = np.zeros((simulation.solver_iterations + 1, 2))
-            state.kernel.solve_watched(curve)
-            observation = simulation.step()[0]
-            assert same_bits(twin.step_watched(simulation.solver_iterations), curve)
-            assert same_bits(twin.values(), observation["solver"])
-            assert curve[0, 0] == observation["solver"][4] and curve[-1, 0] == observation["solver"][5]
-
-
-def test_wasmtime_packed_sweeps_are_the_plain_ones(module, host):
-    for scene in page_scenes()["scenes"]:
-        plain, packed = (host.Simulation(host.Kernels(module, layout()), scene) for _ in range(2))
-        for _ in range(60):
-            assert plain.step() == packed.step(packed=True) == 0
-        assert plain.everything() == packed.everything(), scene["name"]
+def test_structs_lie_by_the_rules_of_c():
+    """Every field at a multiple of its width, the whole at a multiple of the widest."""
+    for name, (size, offsets) in memory.layout().items():
+        at, widest = 0, 1
+        for field, kind in memory.STRUCTS[name].items():
+            width = np.dtype(np.intp).itemsize if kind == "p" else int(kind[-1])
+            at = -(-at // width) * width
+            assert offsets[field] == at, (name, field)
+            at += width * int(kind[:-2] or 1)
+            widest = max(widest, width)
+        assert size == -(-at // widest) * widest, name
 
 
 # -- scenes and command ----------------------------------------------------------------------------------------
