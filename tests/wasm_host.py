@@ -202,9 +202,9 @@ class Newton:
                 s.grow()
             k.call("lav_engine_solve", *s.buffers, 0)
             top = k.top  # scratch is given back after each solve
-            whole = k.alloc(4 * self.call("lav_newton_index_room", *s.buffers))
-            room = k.alloc(8 * self.call("lav_newton_plan", *s.buffers, whole))
-            self.call("lav_newton_substep", *s.buffers, tol, whole, room, self.trace, self.said)
+            whole = k.alloc(4 * self.call("lav_newton_index_room", *s.buffers, 1))
+            room = k.alloc(8 * self.call("lav_newton_plan", *s.buffers, 1, whole))
+            self.call("lav_newton_substep", *s.buffers, tol, 1, whole, room, self.trace, self.said)
             k.top = top
             assert k.call("lav_engine_finish", *s.buffers) == 0
         return k.view(self.said, 4, np.float64).copy()
