@@ -445,7 +445,7 @@ class Cones:
     def parts(self) -> Iterator[tuple[int, IntArray]]:
         """(block, rows of it that one bound holds together): tangents, then spin or second side, then what rolls."""
         tangents, apart, rolling = self.n_together, self.apart_rows, self.rolling_rows
-        for i in np.flatnonzero(self.kind != ROW):
+        for i in np.flatnonzero(self.kind != ROW).tolist():
             first = self.ptr[i] + 1
             if tangents[i]:
                 yield i, np.arange(first, first + tangents[i])

@@ -198,7 +198,7 @@ def _rubbing(c: Cones) -> dict[int, list[IntArray]]:
     reach = c.reach
     for i, part in c.parts():
         if reach[part[0]] > 0.0:
-            found.setdefault(int(i), []).append(part)
+            found.setdefault(i, []).append(part)
     return found
 
 
