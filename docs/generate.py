@@ -564,75 +564,31 @@ def stability_part(site):
 
 
 def api_page(site):
-    """Public names by room."""
-    rooms = {
-        "Problems": ("Problem", "Rows", "Cones"),
-        "Solving": ("solve", "prepare", "Solution", "Status", "Claim"),
-        "Judging": ("residual", "Residual", "cross_check", "CrossCheck"),
-        "Moving": ("motion_error", "MotionError", "motions", "Motions"),
-        "Registry": ("available", "known", "get", "register", "SolverSpec"),
-        "Simulating": ("Scene", "Simulation", "Snapshot"),
-        "Errors": (
-            "LavenderError",
-            "InputError",
-            "UnknownName",
-            "SolverUnavailable",
-            "CapabilityError",
-            "InUse",
-            "SolveFailed",
-        ),
-    }
-    listed = {name for names in rooms.values() for name in names}
-    rest = sorted(
-        name for name in set(lv.__all__) - listed if callable(getattr(lv, name))
-    )  # no constants, no rooms
-    if rest:
-        rooms["More"] = tuple(rest)
+    """Public names by room: those of lavender itself, then those of its rooms."""
+    rooms = {}
+    for name in sorted(lv.__all__):
+        thing = getattr(lv, name)
+        if callable(thing):  # no constants, no rooms
+            rooms.setdefault(thing.__module__.split(".")[1], []).append((lv, name))
+    for room in ("io", "suite", "bench", "report", "motion", "measures", "certificates"):
+        held = importlib.import_module(f"lavender.{room}")
+        own = {n: getattr(held, n) for n in sorted(held.__all__) if n not in suite.FAMILIES}
+        rooms[f"lavender.{room}"] = [
+            (held, n) for n, thing in own.items() if callable(thing) and getattr(lv, n, None) is not thing
+        ]
     parts = [
         "# Python interface",
-        "Everything below is in `lavender`; arrays are float64 and C-contiguous, shapes and units as said.",
+        "Arrays are float64 and C-contiguous, shapes and units as said. First what is in `lavender`, by room.",
     ]
     for room, names in rooms.items():
         parts.append(f"## {room}")
-        for name in names:
-            thing = getattr(lv, name, None)
-            if thing is None:
-                continue
-            if inspect.ismodule(thing):
-                parts.append(f"```{{eval-rst}}\n.. automodule:: {thing.__name__}\n```")
-            elif not inspect.isclass(thing):
-                parts.append(f"```{{eval-rst}}\n.. autofunction:: lavender.{name}\n```")
-            else:
-                members = "\n   :members:" if not issubclass(thing, (Exception, lv.Status)) else ""
-                parts.append(f"```{{eval-rst}}\n.. autoclass:: lavender.{name}{members}\n```")
-    parts.append("## Files, cases, measurements, reports")
-    public = {
-        "lavender.io": ("load", "save", "read"),
-        "lavender.suite": ("case", "cases", "families", "Case", "Reference"),
-        "lavender.bench": tuple(sorted(lv.bench.__all__, key=str.lower)),
-        "lavender.report": tuple(lv.report.__all__),
-        "lavender.motion": (
-            "reference",
-            "adopt",
-            "branch",
-            "distance",
-            "uniqueness",
-            "Motion",
-            "Reference",
-            "Witness",
-        ),
-        "lavender.measures": ("natural_map", "qp_residual", "siconos_error"),
-        "lavender.certificates": ("check_certificate",),
-    }
-    for module, names in public.items():
-        parts.append(f"### {module}")
-        held = importlib.import_module(module)
-        for name in names:
-            if not hasattr(held, name):
-                continue
-            kind = "autoclass" if inspect.isclass(getattr(held, name)) else "autofunction"
-            members = "\n   :members:" if kind == "autoclass" else ""
-            parts.append(f"```{{eval-rst}}\n.. {kind}:: {module}.{name}{members}\n```")
+        for held, name in names:
+            thing = getattr(held, name)
+            kind, members = "autofunction", ""
+            if inspect.isclass(thing):
+                plain = issubclass(thing, (Exception, lv.Status))
+                kind, members = "autoclass", "" if plain else "\n   :members:"
+            parts.append(f"```{{eval-rst}}\n.. {kind}:: {held.__name__}.{name}{members}\n```")
     site.write("api.md", "\n\n".join(parts))
 
 
