@@ -24,7 +24,7 @@ from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, is_path, resolve
 from lavender.bench.record import CaseInfo, Done, Record, Run, Skip
 from lavender.bench.running.plan import Plan
-from lavender.bench.running.runner import Event, Watch, Runner, is_foreign, not_loaded, solver_names
+from lavender.bench.running.runner import Event, Runner, Watch, is_foreign, not_loaded, solver_names
 from lavender.bench.running.timing import Task, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened

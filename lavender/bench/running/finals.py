@@ -16,7 +16,7 @@ from typing import Any
 from lavender.bench.cases import Item, Source, resolve
 from lavender.bench.record import CaseInfo, Record
 from lavender.bench.running.plan import Plan
-from lavender.bench.running.runner import Watch, Runner, is_foreign
+from lavender.bench.running.runner import Runner, Watch, is_foreign
 from lavender.bench.running.timing import Task, just_written, one_thread, outcome_of, pace, record_of
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
