@@ -22,12 +22,12 @@ class Derived:
     """
 
     __slots__ = (
-        "chain",
         "factor",
         "judged",
         "lock",
         "motion",
         "nothing",
+        "small",
         "spread",
         "vain",
         "view",
@@ -39,7 +39,7 @@ class Derived:
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
         self.spread: int | None = None  # how far apart blocks that share a body stand
-        self.chain: Any = None  # of a problem of few rows, False where it has none
+        self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
         self.vain: tuple[str, float, bytes] | None = None  # whose one compiled call did not end, from where
         self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator

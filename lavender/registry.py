@@ -26,7 +26,7 @@ from typing import Any, Protocol
 from lavender._arrays import FloatArray
 from lavender.errors import InputError, SolverUnavailable, UnknownName
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
-from lavender.solution import Claim, Turn
+from lavender.solution import Claim
 
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
 
@@ -46,13 +46,8 @@ class Few(Protocol):
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
 
-    def claim(self, problem: Problem, counts: Any) -> Claim:
-        """What counts come to."""
-
-    def turns(
-        self, problem: Problem, claim: Claim, start: FloatArray | None, after: float
-    ) -> tuple[Turn, ...]:
-        """Who ran, from a start (m,) or from none, to the residual `after`; () where one solver did."""
+    def claim(self, problem: Problem, counts: Any, start: FloatArray | None, after: float) -> Claim:
+        """What counts come to, from a start (m,) or from none to the residual `after`, with its turns."""
 
 
 class State(Protocol):

@@ -525,7 +525,7 @@ def _rest(
     problem: Problem, spec: SolverSpec, judged: Any, counts: Any, given: FloatArray | None
 ) -> dict[str, Any]:
     assert spec.few is not None
-    claim = spec.few.claim(problem, counts)
+    claim = spec.few.claim(problem, counts, given, judged.relative)
     return {
         "residual": told(problem, judged),
         "iterations": claim.iterations,
@@ -537,7 +537,7 @@ def _rest(
         "certificate": None,
         "contradicted": "",
         "sweeps_per_decade": math.nan,
-        "turns": spec.few.turns(problem, claim, given, judged.relative),
+        "turns": claim.turns,
     }
 
 

@@ -163,7 +163,7 @@ def sweep(problem, a, lam, blocks):
 
 def block_diagonal(system, values):
     """The small matrices of the elements of Newton's method as one block diagonal matrix."""
-    sc = system.sc
+    sc = system.solve
     out = np.zeros((sc.m, sc.m))
     for i, q in enumerate(sc.wptr[:-1]):
         j, end = sc.ptr[i], sc.ptr[i + 1]

@@ -13,8 +13,6 @@ from lavender.solution import Claim
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
-from lavender_ext.core.order import GIVEN
-from lavender_ext.few.looks import Looks
 from lavender_ext.judge import measure
 from lavender_ext.local import gauss_seidel
 
@@ -42,16 +40,6 @@ class AcceleratedState(SweepState):
         self.memory = memory
         self.space = accelerated.allocate(data, memory)
         self.restarts = 0
-
-    @classmethod
-    def after(cls, problem: Problem, looks: Looks) -> AcceleratedState:
-        """Where a first look at sweeps of a problem left them, to go on from."""
-        state = cls.__new__(cls)
-        state.problem, state.data, state.watch = problem, looks.data, looks.watch
-        state.order = state.plan = Order(looks.order, looks.split, GIVEN, looks.rng, is_given=True)
-        state.exact, state.convex, state.prepared = looks.exact, 0, looks.prepared
-        state.memory, state.space, state.restarts = looks.memory, looks.space, looks.restarts
-        return state
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def newton_factor(system: System) -> float:
     if not isinstance(system, MatrixSystem):
         return (weights.BLOCK if system.cost < PANELS else weights.PANEL) * system.cost
     if system.dense:
-        return dense_factor(system.sc.m)
+        return dense_factor(system.solve.m)
     return float(
         weights.FILLED
         + weights.FILLED_ENTRY * len(system.sparse.indices)

@@ -80,11 +80,10 @@ class Auto:
         deadline = Deadline(time_limit)
         if n >= ONE_CALL and call_ends_within(problem, time_limit):
             made = AUTO.solve(problem, impulse, tol)
-            claim = None if made is None else AUTO.claim(problem, made[1])
+            claim = None if made is None else AUTO.claim(problem, made[1], impulse, made[0].relative)
             if made is not None and claim is not None and claim.iterations <= n:
-                turns = AUTO.turns(problem, claim, impulse, made[0].relative)
                 impulse[:] = made[0].impulse
-                return Claim(claim.status, claim.iterations, claim.work, claim.message, turns=turns)
+                return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         log = SolveLog(problem, tol, n, deadline)

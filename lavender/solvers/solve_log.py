@@ -13,7 +13,7 @@ from lavender.problem import Problem
 from lavender.residuals import at_floor, judged, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
-from lavender.solvers.small import said
+from lavender.solvers.small import told
 from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]
@@ -65,14 +65,8 @@ class SolveLog:
 
     @property
     def message(self) -> str:
-        """What ran, in words: turns of one solver in a row are one."""
-        words: list[tuple[str, dict[str, int]]] = []
-        for turn in self.turns:
-            if not words or words[-1][0] != turn.solver:
-                words.append((turn.solver, {}))
-            for kind, count in turn.work.items():
-                words[-1][1][kind] = words[-1][1].get(kind, 0) + count
-        return " -> ".join(said(name, work) for name, work in words)
+        """What ran, in words."""
+        return told(self.turns)
 
     # -- the end ---------------------------------------------------------------------------------
 

@@ -193,9 +193,9 @@ def test_steps_over_few_velocities_end_too_late_for_the_least_limits():
 def test_the_compiled_call_is_set_up_before_the_clock():
     problem = suite.case("pyramid(k=3)").problem
     reference(problem)
-    assert problem.derived.chain is None
+    assert problem.derived.small is None
     Auto().ready(Auto().prepare(problem), 1.0)
-    assert problem.derived.chain
+    assert problem.derived.small
 
 
 def test_with_time_enough_nothing_is_set_up_before_the_clock():

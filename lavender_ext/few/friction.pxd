@@ -1,0 +1,207 @@
+"""A few contacts, or an island of them: accelerated sweeps, and where these are slow Newton's method, in turns.
+
+One call solves a part over A or over bodies, in room that the caller has. Factors go on where they stood; so do sweeps.
+"""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdlib cimport free, malloc
+from libc.string cimport memcmp, memcpy, memset
+
+from lavender_ext.accelerate.accelerated cimport anderson_step, sweep_data_t
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
+from lavender_ext.core.block cimport CONE, blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
+from lavender_ext.judge.measure cimport do_nothing, judge_into, relative_of
+from lavender_ext.judge.score cimport score_t
+from lavender_ext.newton.plan cimport CERTIFICATE, MORE
+
+
+cdef enum:
+    MEMORY = 5                  # sweeps that are combined
+    FIRST = 4                   # before the first look
+    SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them; of each in the mean,
+    AGAIN = 8
+    STEPS = 120                 # and in all
+    HOPED = 4                   # times the rounds left, that what the last one gained may promise an end in
+
+
+cdef struct part_t:
+    view_t v                    # over A or bodies
+    double* lam                 # (m) N s, where it starts
+    double* answer              # (m)
+    int32_t split               # blocks before it are swept before the others: joints, contacts
+    const int32_t* at           # of blocks that are solved exactly, as gauss_seidel.prepare has them; else NULL
+    const double* prepared
+
+
+cdef struct ask_t:
+    double tol
+    double e0                   # of the whole: E0 / sqrt(n),
+    double v0
+    int32_t most                # sweeps
+    int32_t wide
+    int64_t swept               # what was done in all
+    int64_t undone
+    int64_t factorisations
+    double factored             # multiply-adds of them,
+    double most_factored        # and at most
+    int32_t driven              # parts that asked for factors
+    int32_t longest             # sweeps and factorisations of one part
+
+
+cdef struct turns_t:            # of one part
+    part_t* s
+    ask_t* o
+    room_t* r                   # of Newton's method
+    double e0                   # the part's share
+    double v0
+    double* swept               # (m) N s
+    double* w                   # (m)
+    double* error               # (m)
+    double* scratch             # (12 n_bodies)
+    sweep_data_t c
+    asked_t asked
+    room_t room
+    said_t said
+    int32_t how
+
+
+cdef inline int64_t work_of(int64_t m, int64_t n_bodies) noexcept nogil:
+    return (7 + 2 * MEMORY) * m + 18 * n_bodies + CONTROL + MAX_MEMORY * MAX_MEMORY + 1
+
+
+cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* rng) noexcept nogil:
+    """Places in work (`work_of`) and order (k)."""
+    cdef const view_t* v = &t.s.v
+    cdef int64_t m = v.p.n_rows, n = v.r.n_bodies if v.r != NULL else 0
+    cdef int32_t i
+    t.swept, t.w, t.error, t.scratch = work, work + m, work + 2 * m, work + 3 * m
+    work += 3 * m + 12 * n
+    memset(&t.c, 0, sizeof(t.c))
+    t.c.v, t.c.control, t.c.gram = work, work + 6 * n, work + 6 * n + CONTROL
+    t.c.work = t.c.gram + MAX_MEMORY * MAX_MEMORY
+    memset(t.c.control, 0, (CONTROL + MAX_MEMORY * MAX_MEMORY) * sizeof(double))
+    for i in range(v.p.n_blocks):
+        order[i] = i
+    rng[0] = 0
+    t.c.blocks, t.c.csr, t.c.rows, t.c.nv = &v.p, v.a, v.r, <int32_t>(6 * n)
+    t.c.order, t.c.rng, t.c.split, t.c.memory = order, rng, t.s.split, MEMORY
+    t.c.exact, t.c.start, t.c.g = t.s.at != NULL, t.s.at, t.s.prepared
+
+
+cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
+    cdef const view_t* v = &t.s.v
+    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    judge_into(&v.p, v.a, v.r, v.r != NULL, lam, t.w, t.error, t.scratch, False, &found)
+    return relative_of(&found, t.w, v.p.n_rows, t.e0, t.v0)
+
+
+cdef inline bint promises(double before, double now, double tol, int32_t rounds) noexcept nogil:
+    """Does what the last round gained bring the residual to tol in so many more?"""
+    cdef double fall = now / before
+    cdef int32_t _
+    for _ in range(rounds):
+        now *= fall
+        if now <= tol:
+            return True
+    return False
+
+
+cdef inline double sweep_on(turns_t* t, int32_t most, bint hoping) noexcept nogil:
+    """Sweeps of `swept` up to `most` in all, `hoping` as long as they promise an end within that; its relative residual."""
+    cdef double before, tol = t.o.tol, now = found_at(t, t.swept)
+    cdef int32_t step = FIRST
+    while now > tol and t.c.turn < most:
+        before = now
+        anderson_step(&t.c, t.swept, t.c.turn == 0, step)
+        now = found_at(t, t.swept)
+        step = t.c.turn // 2 if t.c.turn // 2 > FIRST else FIRST
+        if hoping and not promises(before, now, tol, HOPED * (most - t.c.turn) // step):
+            break
+    return now
+
+
+cdef inline bint begin_newton(turns_t* t) noexcept nogil:
+    """Newton's method from `answer`; is there room for it?"""
+    cdef room_t* r = t.r
+    t.how = 0
+    if not lav_room(&t.s.v, &t.asked, &t.room):
+        return False
+    t.said.factorisations = 0
+    while True:
+        if t.room.n_index > r.n_index or t.room.n_real > r.n_real:
+            free(r.index)
+            free(r.real)
+            r.n_index, r.n_real = 2 * t.room.n_index, 2 * t.room.n_real
+            r.index = <int32_t*>malloc(r.n_index * sizeof(int32_t))
+            r.real = <double*>malloc(r.n_real * sizeof(double))
+            if r.index == NULL or r.real == NULL:
+                r.n_index = r.n_real = 0
+                return False
+        t.room.index, t.room.real = r.index, r.real
+        t.how = lav_start(&t.s.v, &t.asked, &t.room, t.s.answer)
+        if t.how != ROOM:
+            return t.how == MORE
+
+
+cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
+    """So many factorisations, or its end; the relative residual of `answer`."""
+    cdef int32_t last = t.said.factorisations + steps
+    while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
+        t.how = lav_step(&t.s.v, &t.asked, &t.room, last - t.said.factorisations, t.s.answer, &t.said)
+    return found_at(t, t.s.answer)
+
+
+cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
+    """From where sweeps gave way."""
+    cdef double now
+    if not begin_newton(t):
+        return 1.0 / 0.0
+    now = step_newton(t, SHORT)
+    if now > t.o.tol:
+        now = sweep_on(t, AGAIN * t.o.most, t.s.v.p.law == CONE)
+        if now > t.o.tol:
+            return step_newton(t, STEPS)
+        memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
+    return now
+
+
+cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_t* order) noexcept nogil:
+    """From `lam` into `answer`; has it met its share?"""
+    cdef score_t nothing = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef turns_t t
+    cdef uint64_t rng
+    cdef const blocks_t* p = &s.v.p
+    cdef double own, less, now
+    t.s, t.o, t.r = s, o, r
+    lay_turns(&t, work, order, &rng)
+    do_nothing(p, s.answer, t.w)
+    judge_into(p, s.v.a, s.v.r, s.v.r != NULL, s.answer, t.w, t.error, t.scratch, False, &nothing)
+    own = nothing.energy
+    if own == 0.0 and nothing.velocity == 0.0:
+        return True     # doing nothing is right
+    less = own / o.e0 if own < o.e0 else o.e0 / own     # squares of what is far from 1 vanish
+    t.e0, t.v0 = (own if own > o.e0 else o.e0) * sqrt(0.5 * (1.0 + less * less)), o.v0
+    memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
+    if s.v.r != NULL:
+        rows_velocity(p, s.v.r, t.swept, t.c.v)
+    t.said.factorisations = 0
+    now = sweep_on(&t, o.most, True)
+    if now <= o.tol or now < 1.0:
+        memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
+    if now > o.tol:
+        o.driven += 1
+        # Both measures of the part's own error of doing nothing are then below tol of its share.
+        now = t.e0 / own if t.e0 / own < t.v0 / nothing.velocity else t.v0 / nothing.velocity
+        t.asked = asked_t(NEWTON, STEPS, 0, 0, 0, o.wide, o.tol * now)
+        now = factor_in_turns(&t)
+    o.swept += t.c.turn
+    o.undone += <int64_t>t.c.control[UNDONE]
+    o.factorisations += t.said.factorisations
+    o.factored += t.said.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
+    if t.c.turn + t.said.factorisations > o.longest:
+        o.longest = t.c.turn + t.said.factorisations
+    return now <= o.tol and o.factored <= o.most_factored

@@ -1,0 +1,397 @@
+"""Problems of few rows by bodies or by A, and islands of few rows: look, solve and judge in one call.
+
+    bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
+                   where exchanges are stuck Lemke's path, if asked for                      (pivot/tableau.pyx)
+    friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
+
+Under friction a part is the whole, or each island in its turn, cut out of A. Part i of n, E0_i its error of doing
+nothing, has met its share where
+
+    E_i <= tol sqrt((E0_i^2 + E0^2 / n) / 2),   V_i <= tol V0                                              (1)
+
+which for all of them together is tol by both measures. An island with the bytes of the one before has its answer. What
+does not end below tol on the judge's own measure is nobody's result: the caller starts again the long way.
+"""
+from cpython.exc cimport PyErr_CheckSignals
+from libc.math cimport INFINITY, sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.stdlib cimport free
+from libc.string cimport memcmp, memcpy
+
+import numpy as np
+
+from lavender_ext.core.block cimport CONE, blocks_t
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport room_t
+from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.few.friction cimport SHORT, ask_t, part_t, solve_part, work_of
+from lavender_ext.judge.measure cimport Judged
+from lavender_ext.judge.measure import same_bits
+from lavender_ext.local import gauss_seidel
+from lavender_ext.pivot.direct cimport (HALVED, after_rounds, direct_begin, direct_begin_passes, direct_factor, direct_first,
+                                        direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end,
+                                        judge_now)
+from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED, pivots_rounds, pivots_start
+from lavender_ext.pivot.tableau import DONE as FOLLOWED
+from lavender_ext.pivot.tableau import follow as lemke
+
+TINY = 1e-11                    # of the largest entry of a column, as `lemke` has it
+
+
+cdef enum:
+    SWEEPS = 2                  # that guess the free rows
+    ROUNDS = 32                 # of exchanges
+    PATH = 8                    # pivots of Lemke's for each row
+    LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
+
+
+cdef view_t view_of(Data data):
+    cdef view_t v = view_t(data.blocks, NULL, NULL, NULL)
+    if data.factored:
+        v.r = &data.rows
+    else:
+        v.a = &data.csr
+    return v
+
+
+cdef class Small:
+    """One problem, its error of doing nothing known to `data`; `run` only reads it.
+
+    Parameters
+    ----------
+    data : Data
+        What the judge reads.
+    start : (m,) N s
+        Pi(0), read-only.
+    matrix : Data
+        What is solved: of bounded rows and islands A in compressed rows.
+    """
+
+    cdef readonly Data data
+    cdef readonly object start
+    cdef readonly bint pivots
+    cdef Data matrix
+
+    def __init__(self, Data data, start, Data matrix):
+        self.data, self.start, self.matrix = data, start, matrix
+
+    def run(self, impulse, double tol, bint look, double warm):
+        """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
+
+        look: something else comes next. Is `impulse` a solution? It is no start where its residual is above `warm`.
+        And what pivots find is good where it is below tol, not to rounding alone, with Lemke's path where exchanges are
+        stuck. None where it does not end below tol. What was done is None where `impulse` is the solution.
+        """
+        cdef Judged found
+        cdef double before = self.data.start_relative
+        if look:
+            if impulse is None or same_bits(impulse, self.start):
+                impulse = None
+                if before <= tol:
+                    return Judged(self.data, self.start.copy()), None
+            else:
+                found = Judged(self.data, impulse.copy())
+                before = found.relative
+                if before <= tol:
+                    return found, None
+            if not before <= warm:
+                impulse = None
+        own = (self.start if impulse is None else impulse).copy()
+        counts = self.solve(own, tol, look)
+        if counts is None:
+            return None
+        found = Judged(self.data, own)
+        return (found, counts) if self.pivots or found.relative <= tol else None
+
+    cdef solve(self, own, double tol, bint follow):
+        """`own` (m,) N s in place; counts, or None."""
+
+
+cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
+    # Below tol and to rounding; where bounded rows are exchanged to the end and that is `enough`, below tol alone.
+    return t.relative <= tol and (is_end(t) or (enough and t.solved and not t.linear))
+
+
+cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough) noexcept nogil:
+    """Into `best`; did it end below tol? Passes end where one does not halve the residual, or is stuck."""
+    cdef int32_t code
+    direct_begin(t, start)
+    if t.linear:
+        code = direct_factor(t)
+        if code == INDEFINITE:
+            return False
+        if code == SOLVED:
+            code = direct_linear(t)
+    else:
+        code = direct_first(t, SWEEPS, ROUNDS)
+    if t.symmetric and (code == SMALL or (t.linear and not is_end(t))):
+        direct_begin_passes(t, 0)
+        code = HALVED
+        while code == HALVED:
+            code = direct_pass(t, ROUNDS)
+            if not t.relative < INFINITY:
+                return False
+    return met(t, tol, enough)
+
+
+cdef class Bounded(Small):
+    """Linear or boxed; counts are (rounds, whether swept, refinements, factorisations, pivots, shifts, rank of a singular
+    linear system or 0, pivots of Lemke's path).
+
+    Parameters
+    ----------
+    band, linear, symmetric : int, bool, bool
+        Half bandwidth of A, m - 1 where it is not symmetric; whether every row is free.
+    """
+
+    cdef int band
+    cdef bint linear, symmetric
+
+    def __init__(self, Data data, start, Data matrix, int band, bint linear, bint symmetric):
+        Small.__init__(self, data, start, matrix)
+        self.band, self.linear, self.symmetric, self.pivots = band, linear, symmetric, True
+
+    cdef solve(self, own, double tol, bint follow):
+        cdef double[::1] start = own
+        cdef view_t v = view_of(self.data)
+        cdef Room real = room_for(direct_real(&v, self.band) * sizeof(double))
+        cdef Room index = room_for(direct_index(&v) * sizeof(int32_t))
+        cdef direct_t t
+        cdef int32_t path = 0
+        cdef bint ended
+        t.e0, t.v0, t.least = self.data.start_energy, self.data.start_velocity, 1e-13
+        t.linear, t.symmetric = self.linear, self.symmetric
+        with nogil:
+            direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, <double*>real.at,
+                       <int32_t*>index.at)
+            ended = pivot(&t, &start[0], tol, follow)
+        if not ended:
+            if not follow or t.linear or t.solved:
+                return None
+            path = self.followed(&t, own, tol)
+            if path < 0:
+                return None
+        memcpy(&start[0], t.best, t.s.n * sizeof(double))
+        return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, path
+
+    cdef int followed(self, direct_t* t, own, double tol) except -2:
+        """Where exchanges are stuck: the sides on which Lemke's path leaves the rows, and exchanges from there.
+
+        Pivots of the path, -1 where it does not end below tol.
+        """
+        cdef int32_t m = t.s.n
+        cdef double[::1] start = own
+        at, x = np.asarray(<int32_t[:m]>t.s.at), np.asarray(<double[:m]>t.s.x)
+        x[:] = own
+        end, path = lemke(self.matrix, TINY, PATH * m, at, x)
+        if end != FOLLOWED:
+            return -1
+        t.relative = INFINITY
+        t.refined = t.shifts = 0
+        judge_now(t)
+        memcpy(&start[0], t.best, m * sizeof(double))   # where exchanges from there are no better
+        end_of_path = t.relative
+        pivots_start(&t.s, 0.0)
+        if pivots_rounds(&t.s, ROUNDS) == SOLVED:
+            t.relative = INFINITY
+            after_rounds(t, SOLVED)
+            if met(t, tol, True):
+                return path
+        if not end_of_path <= tol:
+            return -1
+        t.refined = 0
+        memcpy(t.best, &start[0], m * sizeof(double))
+        return path
+
+
+cdef enum:                      # arrays of an island's
+    OF_ROWS = 7                 # rows: lower, upper, b, d, nu, step, where it starts
+    OF_BLOCKS = 3               # blocks: mu, patch_radius, rolling
+
+
+cdef struct island_t:           # cut out of A; its numbers and whole numbers are one run of bytes each
+    part_t s
+    csr_t a
+    double* numbers
+    int32_t* marks
+    int64_t n_numbers
+    int64_t n_marks
+
+
+cdef inline void lay(island_t* x, double* numbers, int32_t* marks, int32_t m, int32_t k, int32_t nnz) noexcept nogil:
+    """Places of m rows in k blocks with nnz entries, and behind these of the answer."""
+    cdef blocks_t* p = &x.s.v.p
+    x.numbers, x.marks = numbers, marks
+    x.n_numbers, x.n_marks = OF_ROWS * <int64_t>m + OF_BLOCKS * k + nnz, 2 * k + m + 2 + nnz
+    p.n_blocks, p.n_rows = k, m
+    p.lower, p.upper, p.b, p.d = numbers, numbers + m, numbers + 2 * m, numbers + 3 * m
+    p.nu, p.step = numbers + 4 * m, numbers + 5 * m
+    x.s.lam = numbers + 6 * m
+    numbers += OF_ROWS * m
+    p.mu, p.patch_radius, p.rolling = numbers, numbers + k, numbers + 2 * k
+    x.a.data = numbers + OF_BLOCKS * k
+    x.s.answer = x.numbers + x.n_numbers
+    p.ptr, p.kind = marks, marks + k + 1
+    x.a.indptr, x.a.indices = marks + 2 * k + 1, marks + 2 * k + m + 2
+    x.s.v.a, x.s.v.r, x.s.v.g = &x.a, NULL, NULL
+
+
+cdef inline void cut(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block, const double* lam,
+                     int32_t* place) noexcept nogil:
+    """The blocks `block` of the whole; place (rows of the whole) gets the numbers that its rows have here."""
+    cdef const double* of_row[OF_ROWS]
+    cdef const double* of_block[OF_BLOCKS]
+    cdef blocks_t* own = &x.s.v.p
+    cdef int32_t i, j, k, q, row, at = 0, n = 0
+    cdef int32_t* ptr = <int32_t*>own.ptr
+    cdef int32_t* indptr = <int32_t*>x.a.indptr
+    of_row[0], of_row[1], of_row[2], of_row[3], of_row[4], of_row[5] = p.lower, p.upper, p.b, p.d, p.nu, p.step
+    of_row[6] = lam
+    of_block[0], of_block[1], of_block[2] = p.mu, p.patch_radius, p.rolling
+    own.law = p.law
+    ptr[0] = indptr[0] = 0
+    for k in range(own.n_blocks):
+        i = block[k]
+        (<int32_t*>own.kind)[k] = p.kind[i]
+        for q in range(OF_BLOCKS):
+            x.numbers[OF_ROWS * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
+        j = p.ptr[i]
+        for q in range(OF_ROWS):
+            memcpy(x.numbers + q * own.n_rows + n, of_row[q] + j, (p.ptr[i + 1] - j) * sizeof(double))
+        for row in range(j, p.ptr[i + 1]):
+            place[row] = n
+            n += 1
+        ptr[k + 1] = n
+    n = 0
+    for k in range(own.n_blocks):
+        i = block[k]
+        for row in range(p.ptr[i], p.ptr[i + 1]):
+            for q in range(a.indptr[row], a.indptr[row + 1]):
+                (<int32_t*>x.a.indices)[at] = place[a.indices[q]]
+                (<double*>x.a.data)[at] = a.data[q]
+                at += 1
+            n += 1
+            indptr[n] = at
+
+
+cdef inline bint same(const island_t* x, const island_t* y) noexcept nogil:
+    return (x.n_numbers == y.n_numbers and x.n_marks == y.n_marks
+            and memcmp(x.numbers, y.numbers, x.n_numbers * sizeof(double)) == 0
+            and memcmp(x.marks, y.marks, x.n_marks * sizeof(int32_t)) == 0)
+
+
+cdef class Friction(Small):
+    """Contacts; counts are (longest of a part, sweeps, undone, factorisations, parts that asked for these, parts).
+
+    Parameters
+    ----------
+    split, most : int
+        Blocks before it are swept before the others: joints, contacts; sweeps of one part at most, before its factors.
+    label : (k,) int32, or None
+        The island of each block, from 0 to count - 1.
+    count : int
+        Islands; 1 is the whole.
+    """
+
+    cdef readonly int count
+    cdef readonly double most_factored
+    cdef object block, size, at, prepared
+    cdef int split, most
+
+    def __init__(self, Data data, start, Data matrix, int split, int most, label=None, int count=1):
+        Small.__init__(self, data, start, matrix)
+        self.split, self.most, self.count = split, most, count
+        if matrix.blocks.law == CONE:
+            self.at, self.prepared = gauss_seidel.prepare(matrix)
+        self.most_factored = SHORT * <double>data.blocks.n_rows ** 3
+        if count > 1:
+            ptr = np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)
+            entries = np.asarray(<int32_t[:data.blocks.n_rows + 1]>matrix.csr.indptr)[ptr]
+            self.block = np.argsort(label, kind="stable").astype(np.int32)
+            size = [np.bincount(label, of, count) for of in (np.diff(ptr), np.ones(len(label)), np.diff(entries))]
+            self.size = np.array(size, np.int32)
+            self.most_factored = SHORT * float(size[0] @ size[0]**2)
+
+    cdef solve(self, own, double tol, bint follow):
+        cdef double most = self.most_factored if self.count > 1 else 1.0 / 0.0
+        cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
+                             has_wide(), 0, 0, 0, 0.0, most, 0, 0)
+        cdef room_t r = room_t(0, 0, NULL, NULL)
+        try:
+            good = self.whole(own, &o, &r) if self.count == 1 else self.islands(own, &o, &r)
+        finally:
+            free(r.index)
+            free(r.real)
+        return (o.longest, o.swept, o.undone, o.factorisations, o.driven, self.count) if good else None
+
+    cdef bint whole(self, double[::1] own, ask_t* o, room_t* r) except -1:
+        cdef part_t s
+        cdef const blocks_t* p = &self.matrix.blocks
+        cdef int32_t m = p.n_rows, n = 0 if self.matrix.csr.indptr != NULL else self.matrix.rows.n_bodies
+        cdef Room room = room_for((work_of(m, n) + m) * sizeof(double) + p.n_blocks * sizeof(int32_t))
+        cdef double* x = <double*>room.at
+        cdef const int32_t[::1] at
+        cdef const double[::1] prepared
+        cdef bint good
+        s.v = view_of(self.matrix)
+        s.lam, s.answer, s.split = &own[0], x, self.split
+        s.at, s.prepared = NULL, NULL
+        if self.prepared is not None:
+            at, prepared = self.at, self.prepared
+            s.at, s.prepared = &at[0], &prepared[0]
+        with nogil:
+            good = solve_part(&s, o, r, x + m, <int32_t*>(x + m + work_of(m, n)))
+        memcpy(&own[0], s.answer, m * sizeof(double))
+        return good
+
+    cdef bint islands(self, double[::1] own, ask_t* o, room_t* r) except -1:
+        cdef const blocks_t* p = &self.matrix.blocks
+        cdef const int32_t[::1] block = self.block, prepared_at
+        cdef const int32_t[:, ::1] size = self.size     # of each: rows, blocks, entries
+        cdef const double[::1] prepared
+        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks
+        cdef double[::1] numbers, work
+        cdef int32_t i, j, q, m, k, first = 0
+        cdef int64_t swept, unheard = 0
+        cdef double factored
+        cdef island_t two[2]
+        cdef island_t* x
+        cdef island_t* last
+        cdef bint good = True
+        m, k, q = self.size.max(axis=1)
+        cdef int64_t each = (OF_ROWS + 1) * <int64_t>m + OF_BLOCKS * k + q, whole = 2 * k + m + 2 + q
+        numbers, marks, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(work_of(m, 0))
+        at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
+        if self.prepared is not None:
+            prepared_at, prepared = self.at, self.prepared
+        two[1].n_numbers = -1
+        with nogil:
+            for i in range(self.count):
+                x, last = &two[i % 2], &two[1 - i % 2]
+                m, k = size[0, i], size[1, i]
+                lay(x, &numbers[(i % 2) * each], &marks[(i % 2) * whole], m, k, size[2, i])
+                cut(x, p, &self.matrix.csr, &block[first], &own[0], &place[0])
+                if same(x, last):
+                    memcpy(x.s.answer, last.s.answer, m * sizeof(double))
+                else:
+                    x.s.split, x.s.at, x.s.prepared = 0, NULL, NULL
+                    if p.law == CONE:
+                        for j in range(k):
+                            at[j] = prepared_at[block[first + j]]
+                        x.s.at, x.s.prepared = &at[0], &prepared[0]
+                    swept, factored = o.swept, o.factored
+                    good = solve_part(&x.s, o, r, &work[0], &order[0])
+                    if not good:
+                        break
+                    unheard += <int64_t>(o.factored - factored) + size[2, i] * (o.swept - swept)
+                    if unheard > LISTEN:
+                        unheard = 0
+                        with gil:
+                            PyErr_CheckSignals()
+                for j in range(k):
+                    q = block[first + j]
+                    memcpy(&own[p.ptr[q]], x.s.answer + x.s.v.p.ptr[j], (p.ptr[q + 1] - p.ptr[q]) * sizeof(double))
+                first += k
+        return good
