@@ -335,12 +335,6 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
     "--rows", type=click.IntRange(1), default=3000, show_default=True, help="Leave larger problems out."
 )
 @click.option(
-    "--calibrate/--no-calibrate", default=True, show_default=True, help="Residual against motion error."
-)
-@click.option(
-    "--search/--no-search", default=True, show_default=True, help="Several motions of each problem."
-)
-@click.option(
     "--figure", "picture", type=click.Path(path_type=Path), help="Residual against motion error, drawn."
 )
 @click.option(
@@ -350,8 +344,6 @@ def command(
     files: tuple[str, ...],
     runs: int,
     rows: int,
-    calibrate: bool,
-    search: bool,
     picture: Path | None,
     out: Path | None,
 ) -> None:
@@ -360,8 +352,6 @@ def command(
     On FILES, or on the default set of the suite.
     """
     folder_of(out)
-    if picture is not None and not calibrate:
-        raise InputError("--figure draws the calibration; leave out --no-calibrate")
     seen: list[Sample] = []
     found: list[Branches] = []
     left = 0
@@ -371,13 +361,9 @@ def command(
             left += 1
             continue
         structure = " + ".join(structure_of(problem))
-        if search:
-            found.append(branches(item.name, problem, structure, runs))
-            click.echo(
-                f"{item.name}: {found[-1].motions} motions, {found[-1].spread:.2g} m/s apart", err=True
-            )
-        if calibrate:
-            seen += samples(item.name, problem, structure)
+        found.append(branches(item.name, problem, structure, runs))
+        click.echo(f"{item.name}: {found[-1].motions} motions, {found[-1].spread:.2g} m/s apart", err=True)
+        seen += samples(item.name, problem, structure)
         item.forget()
     if seen:
         click.echo(table(seen))

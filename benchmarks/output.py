@@ -18,7 +18,9 @@ __all__ = ["folder_of", "markdown", "write_json"]
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""
     lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
 
 
 def folder_of(out: Path | None) -> Path | None:

@@ -25,11 +25,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import docstrings
 import matplotlib
 import tried
-from docstrings import table
 
 import lavender as lv
 import lavender_ext
 from benchmarks import motions, stability
+from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.bench import level_name, structure_of
 from lavender.ordering import ORDERS
