@@ -17,10 +17,10 @@ __all__ = ["folder_of", "markdown", "write_json"]
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(
-        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in lines
-    )
+    lines = [
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in (head, *rows)
+    ]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def folder_of(out: Path | None) -> Path | None:
