@@ -20,6 +20,7 @@ from lavender.bench.running.timing import Task, measure_impulse, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
 from lavender.errors import LavenderError
+from lavender.motion import load_reference
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
@@ -192,7 +193,7 @@ class Runner:
         try:
             info = describe(item, self.this.run)
             if self.plan.motion:
-                motion.load_reference(item.problem, item.source)
+                load_reference(item.problem, item.source)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
             self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error)))
             self.done += len(self.names)
