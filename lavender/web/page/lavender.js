@@ -93,9 +93,9 @@ export class Newton {
   // { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, the relative
   // residual; and of each score on the way the work so far, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
-    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers));
-    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, whole));
-    const how = this.f.lav_newton_substep(...buffers, tol, whole, real, this.trace, this.said);
+    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers, 1));
+    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, 1, whole));
+    const how = this.f.lav_newton_substep(...buffers, tol, 1, whole, real, this.trace, this.said);
     const [sweeps, steps, relative, n] = this.k.f64(this.said, 4);
     const scores = this.k.f64(this.trace, 3 * n);
     const column = (c) => Array.from({ length: n }, (_, i) => scores[3 * i + c]);
