@@ -12,7 +12,6 @@ from scipy.linalg import lapack
 from lavender._arrays import FloatArray, IntArray
 from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
-from lavender.solvers._counts import dense_factor, sparse_factor
 from lavender.solvers._factor import (
     SMALL_SIZE,
     TINY,
@@ -23,6 +22,7 @@ from lavender.solvers._factor import (
     choose,
     permuted_band,
 )
+from lavender.solvers.weights import dense_factor, sparse_factor
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, Pivoting
 
 HALVINGS = 41  # step lengths tried in a line search: 1, 1/2, ... 2^-40
