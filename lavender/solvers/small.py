@@ -24,7 +24,7 @@ from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.weights import READ, of_law, rates, sweep_cost
-from lavender_ext.few.many import solve_first
+from lavender_ext.few.many import Gate, solve_first
 from lavender_ext.few.small import Bounded, Friction, Small
 
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
@@ -41,19 +41,19 @@ FIRST = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
 MOST = 1e7
 
 
-def velocities_cost(problem: Problem, largest: int, islands: int = 1) -> float:
+def velocities_cost(problem: Problem, largest: int) -> float:
     """Newton over generalised velocities, `largest` of them in one island [ns]; `is_cheap` of the compiled call."""
     v = rates()["velocities"]
     factor = v["work"] * general.factor_flops(problem, largest)
     read = v["entry"] * float(problem.derived.view.work)
-    return float(READ * read + of_law(v["count"], problem.law) * (islands * v["step"] + read + factor))
+    return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
 
 
-def gate(most: float, most_coulomb: float) -> FloatArray:
-    """`gate_t` of `lavender_ext/few/many.pyx`: what may be counted to cost so much at most [ns]."""
+def gate(most: float, most_coulomb: float) -> Gate:
+    """What may be counted to cost so much at most [ns] is let in."""
     v = rates()["velocities"]
     count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
-    return np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM])
+    return Gate(np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM]))
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
@@ -106,7 +106,7 @@ class Few:
     """What `SolverSpec.few` holds: small problems as that solver solves them."""
 
     name: str
-    gate: FloatArray | None  # what it may cost over generalised velocities; None: not at all
+    gate: Gate | None  # what it may cost over generalised velocities; None: not at all
     pivots: bool  # bounded rows
     sweeps: bool  # and cones
     looks: bool = False  # a start that is a solution is the result, one that is none is not started from

@@ -172,10 +172,7 @@ class Structure:
     def goes_first(self) -> bool:
         """It is what the compiled call for few rows does."""
         kernel = self.kernel
-        return (
-            kernel is not None
-            and velocities_cost(self.problem, kernel.largest, kernel.islands) <= FIRST[self.problem.law]
-        )
+        return kernel is not None and velocities_cost(self.problem, kernel.largest) <= FIRST[self.problem.law]
 
     @property
     def is_small(self) -> bool:

@@ -30,8 +30,8 @@ cdef enum:
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
-cdef struct gate_t:             # as `velocities_cost` of lavender/solvers/_counts.py, ns
-    double step                 # each iteration of each island,
+cdef struct gate_t:             # as `velocities_cost` of lavender/solvers/small.py, ns
+    double step                 # each iteration, as if all islands had theirs at once,
     double entry                # each multiply-add of a sweep, and
     double work                 # of a factor
     double read                 # sweeps before the first iteration
@@ -71,15 +71,14 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     reference_of(&j.p, &s, moves, False, j.begin)
 
 
-cdef inline bint is_cheap(const job_t* j, const gate_t* gate, const flow_t* f, double largest) noexcept nogil:
+cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) noexcept nogil:
     cdef double flops = j.g.n * (largest * largest) / 6.0, count = gate.bounded, most = gate.most
     cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
     if has_friction(&j.p):
         count = gate.cone
         if j.p.law == COULOMB:
             count, most, flops = gate.coulomb, gate.most_coulomb, 2.0 * flops
-    return gate.entry * gate.read * sweep + count * (f.n_islands * gate.step + gate.entry * sweep
-                                                     + gate.work * flops) <= most
+    return gate.entry * gate.read * sweep + count * (gate.step + gate.entry * sweep + gate.work * flops) <= most
 
 
 cdef inline bint is_nothing(const job_t* j, double* scratch) noexcept nogil:
@@ -104,7 +103,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double to
     if j.begin[0] < 0.0:
         begin(j, room.real)
     settle(&f, &j.p, &j.g, PER_COLUMN, room.index, &need)
-    if need.crowded or need.values > gate.values or not is_cheap(j, gate, &f, need.wide):
+    if need.crowded or need.values > gate.values or not is_cheap(j, gate, need.wide):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -169,7 +168,15 @@ cdef void remember(job_t* j, Data p):
         p.start_relative = j.begin[2]
 
 
-def solve_first(Data p, start, double tol, const double[::1] gate):
+cdef class Gate:
+    """Of the numbers of a `gate_t` (10,)."""
+    cdef gate_t at
+
+    def __init__(self, const double[::1] numbers):
+        self.at = (<const gate_t*>&numbers[0])[0]
+
+
+def solve_first(Data p, start, double tol, Gate gate):
     """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
 
     What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, has empty rows or costs
@@ -184,7 +191,7 @@ def solve_first(Data p, start, double tol, const double[::1] gate):
     lam, both = impulse, results
     take(&j, p, start, &lam[0], &both[0])
     with nogil:
-        solve_job(&j, &room, <const gate_t*>&gate[0], tol)
+        solve_job(&j, &room, &gate.at, tol)
         free(room.index)
         free(room.real)
     if not known and j.made.numbers != NULL:
@@ -202,15 +209,14 @@ cdef class Batch:
         In generalised coordinates, each of a problem of at least one row.
     starts : list of (m,) N s or None
         None: from doing nothing.
-    gate : (10,)
-        `gate_t`.
+    gate : Gate
     """
 
     cdef job_t* jobs
     cdef list data
     cdef object impulses, both
 
-    def __init__(self, list data, list starts, double tol, const double[::1] gate):
+    def __init__(self, list data, list starts, double tol, Gate gate):
         cdef Py_ssize_t i, end, done = 0, at = 0, n = len(data)
         cdef room_t room = room_t(0, 0, NULL, NULL)
         cdef Data p
@@ -233,7 +239,7 @@ cdef class Batch:
                 end = done + AT_A_TIME if done + AT_A_TIME < n else n
                 with nogil:
                     while done < end:
-                        solve_alone(&self.jobs[done], &room, <const gate_t*>&gate[0], tol)
+                        solve_alone(&self.jobs[done], &room, &gate.at, tol)
                         done += 1
                 PyErr_CheckSignals()
         finally:
