@@ -49,7 +49,7 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
 #: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` and
 #: `islands` the kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python,
-#: `elements`, `newton`, `scaling` and `solve` are the driver's newton for Python. The arithmetic of all is that of
+#: `newton` and `solve` are the driver's newton for Python. The arithmetic of all is that of
 #: other modules, which this check sees, but for the logarithms by which `looks` guesses about sweeps.
 EXEMPT = {
     "threaded": "threads",
@@ -59,9 +59,7 @@ EXEMPT = {
     "blocks": "reads and fills arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
     "islands": "allocates, copies islands out and calls kernels, computes nothing",
-    "elements": "reads arrays of Python; its arithmetic is in the driver's core",
     "newton": "makes room for Python; its arithmetic is in the driver's core",
-    "scaling": "hands arrays to Python; its arithmetic is in the driver's core",
     "solve": "calls the turns that the driver calls, in arrays of Python",
 }
 

@@ -22,7 +22,7 @@ import scipy.sparse as sp
 from lavender._arrays import FloatArray
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem, check_problem
-from lavender_ext.pivot.principal import Pivoting
+from lavender_ext.pivot.direct import Pivoting
 
 __all__ = ["Redundancy", "redundancy"]
 
@@ -263,7 +263,7 @@ def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
     m = len(a)
     problem = Problem.linear(a, np.zeros(m))
     pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol, m * 2.0**-52))
-    pivoting.factor()
+    pivoting.factor_all()
     found = np.array(pivoting.skipped(), np.intp)
     return found if len(found) == len(tail) else tail
 

@@ -29,6 +29,7 @@ MODULES = (
     "accelerate.accelerated",
     "accelerate.admm",
     "driver.driver",
+    "pivot.direct",
     "pivot.principal",
     "pivot.tableau",
     "factor.graph",

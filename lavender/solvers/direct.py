@@ -9,6 +9,8 @@
              refinement that shrinks what A sees by s / (s + sigma). On a problem without a solution the
              passes keep walking along some y >= 0 with A y = 0, b.y > 0: the certificate.
 
+Exchanges, passes and what is tried where they are stuck run in `lavender_ext/pivot/direct.pyx`.
+
 Positive definite A: finite and exact to rounding, whatever `tol`. Singular positive semidefinite A: the
 message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
 that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
@@ -35,16 +37,12 @@ from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
+from lavender_ext.pivot.direct import PASSED, SPENT
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
 
-# -, s: the last is far above the rounding of a factorisation and below what a mass ratio of 1e8 leaves.
-PATH = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
-SHIFT_STEP = 100.0
 GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
 RUNAWAY = 1e-6
-PASSES = 100  # proximal passes at most
 PATIENCE = 6  # passes without halving the best residual
-CORRECTIONS = 100  # refinements at a time at most; each halves the residual
 BATCH = 32  # rounds between two looks at the clock and the judge
 
 
@@ -79,7 +77,7 @@ class Direct:
             return _unsymmetric(problem)
         state = DirectState(problem, PivotState(problem, like))
         if linear and state.pivot is not None:
-            state.outcome = state.pivot.factorise(whole=True)
+            state.outcome = state.pivot.rows.factor_all()
             if state.outcome == INDEFINITE:
                 return _general(problem, "A is indefinite")
             if not problem.is_symmetric:
@@ -94,13 +92,16 @@ class Direct:
     def run(
         self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        run = _Run(state, impulse, n, tol, time_limit, self.patience, self.exact)
+        run = _Run(state, impulse, n, tol, Deadline(time_limit), self)
         if state.problem.m == 0:
             return run.claim(Status.CONVERGED)
         if n == 0:
             return run.claim(Status.MAX_ITERATIONS)
         try:
-            return run.pivoting() if state.general is None else run.linear_general(state.general)
+            if state.general is not None:
+                return run.linear_general(state.general)
+            assert state.pivot is not None
+            return run.pivoting(state.pivot)
         finally:
             run.put_best()
 
@@ -149,17 +150,17 @@ class _Run:
         impulse: FloatArray,
         n: int,
         tol: float,
-        time_limit: float | None,
-        patient: bool,
-        exact: bool,
+        deadline: Deadline,
+        solver: Direct,
     ) -> None:
-        self.patient = patient
-        self.least = GOOD if exact else max(GOOD, tol)  # relative residual that is good whatever the floor
+        self.patient = solver.patience
+        # Relative residual that is good whatever the floor.
+        self.least = GOOD if solver.exact else max(GOOD, tol)
         self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
-        self.deadline = Deadline(time_limit)
+        self.deadline = deadline
         self.kept: measure.Judged | None = None
-        self.best, self.floor, self.last = np.inf, 0.0, np.inf
         self.iterations = 0
+        self.late = False  # nothing was begun that would have ended after the deadline
         self.work: dict[str, int] = {}
         self.notes = [state.note] if state.note else []
 
@@ -168,47 +169,55 @@ class _Run:
     def judge(self, x: FloatArray) -> float:
         """Relative residual of x, which must not change any more; the best becomes the result."""
         found = judged(self.problem, x)
+        self.keep(found)
         relative: float = found.relative
-        if relative < self.best:
-            self.kept, self.best, self.floor = found, relative, found.floor
-        self.last = relative
         return relative
+
+    def keep(self, found: measure.Judged | None) -> None:
+        if found is not None and found.relative < self.best:
+            self.kept = found
+
+    @property
+    def best(self) -> float:
+        """Relative residual of the best iterate."""
+        return np.inf if self.kept is None else self.kept.relative
+
+    @property
+    def floor(self) -> float:
+        return 0.0 if self.kept is None else self.kept.floor
 
     def put_best(self) -> None:
         if self.kept is not None:
             self.impulse[:] = self.kept.impulse
             remember(self.problem, self.kept)
 
-    @property
-    def impulse_now(self) -> FloatArray:
-        """The best so far, (m,) N s; not to be changed."""
-        return self.impulse if self.kept is None else self.kept.impulse
-
     def good(self) -> bool:
         # A floor above 1e-6 belongs to an impulse that ran away, not to the problem.
         return self.best <= max(self.least, min(self.floor, RUNAWAY))
 
-    def rounded(self) -> bool:
-        """Good, or where refinement ends: at what counts as the floor."""
-        return self.good() or at_floor(self.best, min(self.floor, RUNAWAY))
+    @property
+    def left(self) -> int:
+        """Rounds left in this call of the kernel."""
+        assert self.state.pivot is not None
+        return min(BATCH, self.budget - int(self.state.pivot.rows.n_rounds))
 
     @property
     def spent(self) -> bool:
         """No rounds or no time left."""
-        return self.iterations >= self.budget or self.out_of_time
+        return self.left <= 0 or self.out_of_time
 
     @property
     def out_of_time(self) -> bool:
         pivot = self.state.pivot
-        late = pivot is not None and pivot.late and self.deadline.is_set
-        return late or self.deadline.passed()
+        late = self.late or (pivot is not None and pivot.rows.late)
+        return (late and self.deadline.is_set) or self.deadline.passed()
 
     def claim(self, status: Status, **more: Any) -> Claim:
         state = self.state
-        form = "LU" if state.general is not None else state.pivot.form if state.pivot is not None else ""
-        work = dict(self.work)
+        work, form = dict(self.work), "LU"
         if state.pivot is not None:
-            work.update(state.pivot.work)
+            work.update(state.pivot.rows.work)
+            form = state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
     def verdict(self) -> Claim:
@@ -229,7 +238,9 @@ class _Run:
         if not factor.usable:
             return self.claim(Status.NUMERICAL_ERROR)
         singular = factor.rank < problem.m
-        x = self.impulse_now if singular else np.zeros(problem.m)
+        x = np.zeros(problem.m)
+        if singular:
+            x = self.impulse if self.kept is None else self.kept.impulse
         w = np.empty(problem.m)
         previous = np.inf
         for k in range(8):
@@ -241,7 +252,8 @@ class _Run:
                 break
             previous = relative
         if isinstance(factor, PanelsLU):
-            if not self.rounded() and not self.out_of_time:
+            rounded = self.good() or at_floor(self.best, min(self.floor, RUNAWAY))
+            if not rounded and not self.out_of_time:
                 return self.general(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.good() and singular:
             # What least squares in the metric of D leaves of b is orthogonal to the range of A.
@@ -251,37 +263,30 @@ class _Run:
                 return proof
         return self.verdict()
 
-    # -- symmetric A -------------------------------------------------------------------------------
+    def general(self, why: str) -> Claim:
+        """A linear system by LU that tells the rank."""
+        before = dict(self.work)
+        before.pop("rank", None)  # not a count: the claim's is of a decomposition
+        if self.state.pivot is not None:
+            before.update(self.state.pivot.rows.work)
+        self.state = _general(self.problem, why)
+        self.notes = [self.state.note]
+        assert isinstance(self.state.general, GeneralFactor)
+        claim = self.linear_general(self.state.general)
+        work = {kind: before.get(kind, 0) + claim.work.get(kind, 0) for kind in {**claim.work, **before}}
+        return replace(claim, work=work)
 
-    def pivoting(self) -> Claim:
-        pivot = self.state.pivot
-        assert pivot is not None
+    # -- symmetric A, and bounded rows -------------------------------------------------------------
+
+    def pivoting(self, pivot: PivotState) -> Claim:
+        """Rounds, then passes, of the kernel."""
         rows = pivot.rows
-        code = self.state.outcome
-        if self.problem.law == "linear":
-            if code == SOLVED:
-                pivot.solve_free()
-                self.iterations = 1
-                relative = self.judge(pivot.impulse())
-                if not self.good():
-                    rows.slack()
-                    self.refine(pivot, relative)
-                    if self.rounded():
-                        return self.verdict()
-                    if not pivot.symmetric:
-                        return self.general("A is not symmetric")
-        else:
-            # Which rows will be free? All, or where a few sweeps put them.
-            sweeps = pivot.sweeps
-            code, self.iterations, swept = pivot.solve(
-                self.impulse, sweeps, min(BATCH, self.budget), self.deadline
-            )
-            if swept:
-                self.work["sweeps"] = 2 * sweeps
-            code = self.after_rounds(pivot, code)
-            if code == ROUNDS and not self.spent:
-                code = self.rounds(pivot)
-        if self.good():
+        rows.begin(self.impulse, self.least)
+        pivot.until(self.deadline)
+        code = self.rounds(pivot)
+        self.iterations = rows.n_rounds
+        self.keep(rows.best)
+        if rows.is_good or (code == SOLVED and rows.is_end):
             return self.verdict()
         if code == ROUNDS and self.spent:
             return self.out_of_budget()
@@ -289,11 +294,65 @@ class _Run:
             return self.indefinite()
         if code == SMALL:
             self.note_singular(pivot, self.patient or pivot.symmetric)
+        if not pivot.symmetric and self.problem.law == "linear":
+            return self.general("A is not symmetric")
         if code == STUCK and not pivot.symmetric:
             return self.circling()
         if not self.patient and not (code == SMALL and pivot.symmetric):
             return self.verdict()
-        return self.proximal(pivot, code == STUCK)
+        rows.begin_passes(code == STUCK)
+        ended = self.passes(pivot)
+        self.iterations = rows.n_rounds
+        self.keep(rows.best)
+        return self.after_passes(pivot, ended)
+
+    def rounds(self, pivot: PivotState) -> int:
+        """All rows free, or those that sweeps leave free, then exchanges; within the budget and the time."""
+        rows = pivot.rows
+        code: int = self.state.outcome
+        if self.problem.law == "linear":
+            return code if code != SOLVED else rows.linear()
+        self.late = pivot.too_late_to_sweep(self.deadline)
+        code = rows.first(0, 0) if self.late else rows.first(pivot.sweeps, self.left)
+        if rows.swept and not self.late:
+            self.work["sweeps"] = 2 * pivot.sweeps
+        while code == ROUNDS and not rows.is_good and not self.spent:
+            code = rows.rounds(self.left)
+        return code
+
+    @np.errstate(all="ignore")  # what overflows is judged
+    def passes(self, pivot: PivotState) -> int | Claim:
+        """Passes around the last answer, and how the last of them ended; a proof that there is no solution."""
+        rows = pivot.rows
+        while not self.spent:
+            code: int = rows.one_pass(self.left)
+            if code in (SOLVED, SPENT, INDEFINITE):
+                return code
+            if code in (STUCK, SMALL) and not (self.patient and (pivot.symmetric or code == SMALL)):
+                return code
+            if code == PASSED:
+                self.iterations = rows.n_rounds
+                self.keep(rows.best)
+                proof = self.certificate(rows.turn)
+                if proof is not None:
+                    return proof
+                if rows.waited >= PATIENCE or self.out_of_time:
+                    return SPENT
+        return ROUNDS
+
+    def after_passes(self, pivot: PivotState, code: int | Claim) -> Claim:
+        linear = self.problem.law == "linear"
+        if isinstance(code, Claim):
+            return code
+        if code == ROUNDS:
+            return self.out_of_budget()
+        if code == STUCK and not pivot.symmetric:
+            return self.circling()
+        if code == INDEFINITE and self.patient:
+            return self.general("A is indefinite") if linear else self.indefinite(pivot.symmetric)
+        if linear and self.best > max(self.tol, 2.0 * self.floor) and not self.out_of_time:
+            return self.general("A is indefinite")
+        return self.verdict()
 
     def circling(self) -> Claim:
         self.notes.append(
@@ -302,40 +361,6 @@ class _Run:
         if not self.best <= 1.0:
             self.judge(self.problem.start())
         return self.verdict()
-
-    def rounds(self, pivot: PivotState) -> int:
-        """Rounds to the end of this pass, refined and judged, within the budget and the time."""
-        while True:
-            code, done = pivot.rounds(min(BATCH, self.budget - self.iterations), self.deadline)
-            self.iterations += done
-            code = self.after_rounds(pivot, code)
-            # Signs that differ by rounding alone exchange for ever; the judge sees that nothing is wrong.
-            if code != ROUNDS or self.good() or self.spent:
-                return code
-
-    def after_rounds(self, pivot: PivotState, code: int) -> int:
-        """Judge what rounds left, and refine it."""
-        if code in (SMALL, INDEFINITE):
-            return code
-        relative = self.judge(pivot.impulse())
-        if code == SOLVED and pivot.rows.shift == 0.0 and not self.good():
-            pivot.rows.slack()
-            code = self.refine(pivot, relative)
-        return code
-
-    def refine(self, pivot: PivotState, relative: float) -> int:
-        """x <- x - A_FF^-1 w while that halves the residual; ROUNDS where it changes a sign."""
-        previous = np.inf
-        for _ in range(CORRECTIONS):
-            if self.good() or not relative < 0.5 * previous:
-                break
-            previous = relative
-            pivot.correct()
-            self.work["refinements"] = self.work.get("refinements", 0) + 1
-            if pivot.exchange():
-                return ROUNDS
-            relative = self.judge(pivot.impulse())
-        return SOLVED
 
     def out_of_budget(self) -> Claim:
         if not self.best <= 1.0:
@@ -354,98 +379,6 @@ class _Run:
             self.work["rank"] = rank
         else:
             self.notes.append("A is singular on the free rows" + ": shifted and refined" * shifted)
-
-    @np.errstate(all="ignore")  # what overflows is judged
-    def proximal(self, pivot: PivotState, stuck: bool) -> Claim:
-        """Passes on A + s D around the last answer; where pivoting is stuck, descent along falling s."""
-        problem, rows = self.problem, pivot.rows
-        ended = self.rounded if problem.law == "linear" else self.good
-        path = list(PATH if stuck else PATH[-1:])
-        reference, waited = np.inf, 0
-        rows.x[:] = self.impulse_now if self.floor <= RUNAWAY else self.impulse
-        self.work["shifts"] = 0
-        shift = 0.0
-        for _ in range(PASSES):
-            rows.recenter()
-            if path:
-                shift = path.pop(0)
-                pivot.start(shift)
-                self.work["shifts"] += 1
-            rows.restart()
-            code = self.descend(pivot) if stuck else self.rounds(pivot)
-            if ended():
-                break
-            if code == ROUNDS:
-                return self.out_of_budget()
-            if code == STUCK and not pivot.symmetric:
-                return self.circling()
-            if code != SOLVED and not self.patient:
-                break
-            if code == STUCK:
-                stuck, path = True, list(PATH)
-                np.clip(rows.center, problem.cones.lower, problem.cones.upper, out=rows.x)
-                continue
-            if code in (SMALL, INDEFINITE):
-                if shift >= PATH[0]:
-                    linear = problem.law == "linear"
-                    return self.general("A is indefinite") if linear else self.indefinite(pivot.symmetric)
-                path = [shift * SHIFT_STEP]
-                rows.x[:] = rows.center
-                continue
-            step = rows.x - rows.center
-            self.settle(pivot)
-            if ended():
-                break
-            if path or self.best <= 0.5 * reference:
-                reference, waited = self.best, 0
-                continue
-            waited += 1
-            proof = self.certificate(step)
-            if proof is not None:
-                return proof
-            if waited >= PATIENCE or self.out_of_time:
-                break
-        if problem.law == "linear" and self.best > max(self.tol, 2.0 * self.floor) and not self.out_of_time:
-            return self.general("A is indefinite")
-        return self.verdict()
-
-    def descend(self, pivot: PivotState) -> int:
-        rows, c = pivot.rows, self.problem.cones
-        np.clip(rows.x, c.lower, c.upper, out=rows.x)
-        code, done = pivot.descend(self.budget - self.iterations, self.deadline)
-        self.iterations += done
-        if code in (SOLVED, ROUNDS):
-            self.judge(pivot.impulse())
-        return code
-
-    def settle(self, pivot: PivotState) -> None:
-        """Refine on the rows found, whatever signs rounding gives: more passes with the same factor."""
-        rows, previous = pivot.rows, np.inf
-        relative = self.last  # of this x
-        for _ in range(CORRECTIONS):
-            if self.good() or not relative < 0.5 * previous:
-                break
-            kept, previous = rows.x.copy(), relative
-            rows.recenter()
-            rows.slack()
-            pivot.correct()
-            self.work["refinements"] = self.work.get("refinements", 0) + 1
-            relative = self.judge(pivot.impulse())
-            if not relative < previous:
-                rows.x[:] = kept
-
-    def general(self, why: str) -> Claim:
-        """A linear system by LU that tells the rank."""
-        before = dict(self.work)
-        before.pop("rank", None)  # not a count: the claim's is of a decomposition
-        if self.state.pivot is not None:
-            before.update(self.state.pivot.work)
-        self.state = _general(self.problem, why)
-        self.notes = [self.state.note]
-        assert isinstance(self.state.general, GeneralFactor)
-        claim = self.linear_general(self.state.general)
-        work = {kind: before.get(kind, 0) + claim.work.get(kind, 0) for kind in {**claim.work, **before}}
-        return replace(claim, work=work)
 
     def certificate(self, step: FloatArray) -> Claim | None:
         """INFEASIBLE where `step`, cut to the directions the bounds allow, proves it."""

@@ -308,7 +308,7 @@ class Newton(Finite):
         rows = self.name == "newton over rows" or self.log.problem.rows is None
         if rows != (system.form == "impulse"):
             return super().prepare(solver)
-        return NewtonState(self.log.problem, system if system.sc.m else None)
+        return NewtonState(self.log.problem, system if system.solve.m else None)
 
 
 class Direct(Finite):

@@ -64,5 +64,5 @@ def newton_factor(system: System) -> float:
     if not isinstance(system, MatrixSystem):
         return (BLOCK if system.cost < PANELS else PANEL) * system.cost
     if system.dense:
-        return dense_factor(system.sc.m)
+        return dense_factor(system.solve.m)
     return float(FILLED + FILLED_ENTRY * len(system.sparse.indices) + FILLED_WORK * system.sparse.work)

@@ -19,10 +19,7 @@ After CERTIFICATE `asked_t.proven` = 1 ends it; without, the next step goes on.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport blocks_t
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 
 
 cdef enum:                      # methods
@@ -31,13 +28,6 @@ cdef enum:                      # methods
 cdef enum:                      # outcomes; the first six are those of newton/plan.pxd
     ROOM = 6
     UNFIT = 7
-
-
-cdef struct view_t:
-    blocks_t p
-    const csr_t* a              # one of these three, the others NULL
-    const rows_t* r
-    const generalized_t* g      # with its panels
 
 
 cdef struct asked_t:

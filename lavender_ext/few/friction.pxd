@@ -11,7 +11,8 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t, view_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.few.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_into, relative_of
 from lavender_ext.judge.score cimport score_t

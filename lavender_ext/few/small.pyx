@@ -1,6 +1,6 @@
 """Problems of few rows by bodies or by A, and islands of few rows: look, solve and judge in one call.
 
-    bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement      (pivots.pxd);
+    bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
                    where exchanges are stuck Lemke's path, if asked for                      (pivot/tableau.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
@@ -13,7 +13,7 @@ which for all of them together is tol by both measures. An island with the bytes
 does not end below tol on the judge's own measure is nobody's result: the caller starts again the long way.
 """
 from cpython.exc cimport PyErr_CheckSignals
-from libc.math cimport sqrt
+from libc.math cimport INFINITY, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free
 from libc.string cimport memcmp, memcpy
@@ -23,15 +23,17 @@ import numpy as np
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data, Room, room_for
-from lavender_ext.driver.driver cimport room_t, view_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.driver.driver cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.few.friction cimport SHORT, ask_t, part_t, solve_part, work_of
-from lavender_ext.few.pivots cimport (ROUNDS, begin_pivots, judge_now, lay_pivots, pivot, pivots_index, pivots_real,
-                                      refined, trial_t)
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.local import gauss_seidel
-from lavender_ext.pivot.principal cimport SOLVED, pivots_rounds, pivots_start
+from lavender_ext.pivot.direct cimport (HALVED, after_rounds, direct_begin, direct_begin_passes, direct_factor, direct_first,
+                                        direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end,
+                                        judge_now)
+from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED, pivots_rounds, pivots_start
 from lavender_ext.pivot.tableau import DONE as FOLLOWED
 from lavender_ext.pivot.tableau import follow as lemke
 
@@ -39,6 +41,8 @@ TINY = 1e-11                    # of the largest entry of a column, as `lemke` h
 
 
 cdef enum:
+    SWEEPS = 2                  # that guess the free rows
+    ROUNDS = 32                 # of exchanges
     PATH = 8                    # pivots of Lemke's for each row
     LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
 
@@ -105,6 +109,33 @@ cdef class Small:
         """`own` (m,) N s in place; counts, or None."""
 
 
+cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
+    # Below tol and to rounding; where bounded rows are exchanged to the end and that is `enough`, below tol alone.
+    return t.relative <= tol and (is_end(t) or (enough and t.solved and not t.linear))
+
+
+cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough) noexcept nogil:
+    """Into `best`; did it end below tol? Passes end where one does not halve the residual, or is stuck."""
+    cdef int32_t code
+    direct_begin(t, start)
+    if t.linear:
+        code = direct_factor(t)
+        if code == INDEFINITE:
+            return False
+        if code == SOLVED:
+            code = direct_linear(t)
+    else:
+        code = direct_first(t, SWEEPS, ROUNDS)
+    if t.symmetric and (code == SMALL or (t.linear and not is_end(t))):
+        direct_begin_passes(t, 0)
+        code = HALVED
+        while code == HALVED:
+            code = direct_pass(t, ROUNDS)
+            if not t.relative < INFINITY:
+                return False
+    return met(t, tol, enough)
+
+
 cdef class Bounded(Small):
     """Linear or boxed; counts are (rounds, whether swept, refinements, factorisations, pivots, shifts, rank of a singular
     linear system or 0, pivots of Lemke's path).
@@ -125,28 +156,27 @@ cdef class Bounded(Small):
     cdef solve(self, own, double tol, bint follow):
         cdef double[::1] start = own
         cdef view_t v = view_of(self.data)
-        cdef Room real = room_for(pivots_real(&v, self.band) * sizeof(double))
-        cdef Room index = room_for(pivots_index(&v) * sizeof(int32_t))
-        cdef trial_t t
+        cdef Room real = room_for(direct_real(&v, self.band) * sizeof(double))
+        cdef Room index = room_for(direct_index(&v) * sizeof(int32_t))
+        cdef direct_t t
         cdef int32_t path = 0
         cdef bint ended
-        lay_pivots(&t, &v, <double*>real.at)
-        t.e0, t.v0 = self.data.start_energy, self.data.start_velocity
+        t.e0, t.v0, t.least = self.data.start_energy, self.data.start_velocity, 1e-13
         t.linear, t.symmetric = self.linear, self.symmetric
-        t.tol, t.enough = tol, follow
         with nogil:
-            begin_pivots(&t, &self.matrix.csr, &self.matrix.blocks, self.band, <int32_t*>index.at)
-            ended = pivot(&t, &start[0])
+            direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, <double*>real.at,
+                       <int32_t*>index.at)
+            ended = pivot(&t, &start[0], tol, follow)
         if not ended:
             if not follow or t.linear or t.solved:
                 return None
-            path = self.followed(&t, own)
+            path = self.followed(&t, own, tol)
             if path < 0:
                 return None
         memcpy(&start[0], t.best, t.s.n * sizeof(double))
-        return t.done, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, path
+        return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, path
 
-    cdef int followed(self, trial_t* t, own) except -2:
+    cdef int followed(self, direct_t* t, own, double tol) except -2:
         """Where exchanges are stuck: the sides on which Lemke's path leaves the rows, and exchanges from there.
 
         Pivots of the path, -1 where it does not end below tol.
@@ -158,20 +188,20 @@ cdef class Bounded(Small):
         end, path = lemke(self.matrix, TINY, PATH * m, at, x)
         if end != FOLLOWED:
             return -1
-        t.relative = 1.0 / 0.0
+        t.relative = INFINITY
         t.refined = t.shifts = 0
         judge_now(t)
         memcpy(&start[0], t.best, m * sizeof(double))   # where exchanges from there are no better
         end_of_path = t.relative
         pivots_start(&t.s, 0.0)
         if pivots_rounds(&t.s, ROUNDS) == SOLVED:
-            t.done = t.s.n_rounds
-            t.relative = 1.0 / 0.0
-            if refined(t, &start[0]):
+            t.relative = INFINITY
+            after_rounds(t, SOLVED)
+            if met(t, tol, True):
                 return path
-        if not end_of_path <= t.tol:
+        if not end_of_path <= tol:
             return -1
-        t.done, t.refined = t.s.n_rounds, 0
+        t.refined = 0
         memcpy(t.best, &start[0], m * sizeof(double))
         return path
 

@@ -7,7 +7,7 @@ A row's products serve w and F, and its error and sums follow while they are at 
 core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport (CONTACT_BOX, ROW, block_error, blocks_t, contact_error, mu_r, n_directions, n_turns,
                                       row_error)
@@ -17,6 +17,7 @@ from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, pa
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
+from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport (add_floor, are_numbers, is_plain, norms_of_rhs, nothing, relative, root,
                                        score_from, score_rows, score_t, sum_t, tally_block, tally_contact,
                                        tally_floor, tally_row, tally_t)
@@ -397,6 +398,22 @@ cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, 
         rows_judge(p, r, lam, w, e, v, floor, out)
     else:
         csr_judge(p, a, lam, w, e, floor, out)
+
+
+cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
+    """Numbers that `judge_view` needs besides w and e."""
+    return v.g.n + v.p.n_rows if v.g != NULL else 12 * <int64_t>v.r.n_bodies if v.r != NULL else 0
+
+
+cdef inline void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
+                            score_t* out) noexcept nogil:
+    """Slack into w (m), error into e (m), the sums into out, whatever the form; scratch: `scratch_of`."""
+    if v.g != NULL:
+        general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
+    elif v.r != NULL:
+        rows_judge(&v.p, v.r, lam, w, e, scratch, floor, out)
+    else:
+        csr_judge(&v.p, v.a, lam, w, e, floor, out)
 
 
 # -- doing nothing, and what a pass over an impulse comes to beside it -----------------------------------

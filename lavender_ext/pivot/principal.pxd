@@ -20,6 +20,10 @@ cdef enum:                      # sides of a row
     AT_UPPER = 1
 
 
+ctypedef int32_t (*refactor_t)(void* outside, const int32_t* place, int32_t n_free, double shift) noexcept nogil
+ctypedef void (*resolve_t)(void* outside, int32_t n_free, double* y) noexcept nogil
+
+
 cdef struct pivoting_t:
     const csr_t* a
     const blocks_t* p           # b, d, lower, upper
@@ -49,10 +53,16 @@ cdef struct pivoting_t:
     int32_t exchanged           # rows that changed sides so far
     int32_t factorisations
     int32_t n_rounds
+    int32_t late                # a factor was not begun
+    void* outside               # whose factor it is, of the rows with a place, numbered as they stand, or NULL:
+    refactor_t refactor         # how many of its pivots are small, -1: not begun
+    resolve_t resolve           # y (n_free) <- the solve
 
 
-cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, double tiny, double* real,
-                    int32_t* whole) noexcept nogil
+cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
+                    double* real, int32_t* whole) noexcept nogil
+cdef void pivots_renew(pivoting_t* s) noexcept nogil
+cdef void factor_free(pivoting_t* s, double* x) noexcept nogil
 cdef void pivots_factor_all(pivoting_t* s) noexcept nogil
 cdef void pivots_solve_free(pivoting_t* s) noexcept nogil
 cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil

@@ -13,11 +13,8 @@ the case of all rows free. LU is of D^-1/2 (A_FF + s D_FF) D^-1/2, dense, with r
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-import numpy as np
-
-from lavender_ext.core.block cimport blocks_t, clip, relax_row
+from lavender_ext.core.block cimport blocks_t, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
-from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.band cimport ldl_back_all, ldl_factor, ldl_factor_2, ldl_solve, no_pivots
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.judge.score cimport unit_roundoff
@@ -56,8 +53,19 @@ cdef inline void factor_lu(pivoting_t* s) noexcept nogil:
     s.is_factored = 1
 
 
-cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
-    # of A_FF + s D_FF, (1); x: what ldl_factor takes along, or NULL
+cdef inline void factor_elsewhere(pivoting_t* s) noexcept nogil:
+    cdef int32_t small = s.refactor(s.outside, s.place, s.n_free, s.shift)
+    s.late = small < 0
+    if s.late:
+        return
+    no_pivots(&s.found)
+    s.found.small = small
+    s.factorisations += 1
+    s.is_factored = 1
+
+
+cdef void factor_free(pivoting_t* s, double* x) noexcept nogil:
+    """A_FF + s D_FF of (1); x: what ldl_factor takes along, or NULL."""
     cdef int32_t i, j, k = 0, q, r, at, to, in_place
     cdef const csr_t* a = s.a
     cdef double* col
@@ -70,6 +78,9 @@ cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
             s.size[k] = s.p.d[i]
             k += 1
     s.n_free = k
+    if s.refactor != NULL:
+        factor_elsewhere(s)
+        return
     if s.swap != NULL:
         factor_lu(s)
         return
@@ -103,6 +114,9 @@ cdef inline void factor_free(pivoting_t* s, double* x) noexcept nogil:
 cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
     # y (n_free) <- (A_FF + s D_FF)^-1 y
     cdef int32_t j
+    if s.resolve != NULL:
+        s.resolve(s.outside, s.n_free, y)
+        return
     if s.swap == NULL:
         ldl_solve(s.n_free, s.width, s.c, y)
         return
@@ -115,14 +129,15 @@ cdef inline void solve_factored(const pivoting_t* s, double* y) noexcept nogil:
 
 cdef void pivots_factor_all(pivoting_t* s) noexcept nogil:
     """A factor of A, all rows free and no shift; of LDL^T with the first half of x = A^-1 b on the way."""
-    cdef int32_t i, q, end
+    cdef int32_t i, q, end, half
     cdef const csr_t* a = s.a
     if s.swap != NULL or not (s.natural and s.band == 1 and s.n > 1):
         for i in range(s.n):
             s.at[i] = FREE
             s.x[i] = s.p.b[i]
-        factor_free(s, s.x if s.natural and s.swap == NULL else NULL)
-        s.is_half_solved = s.natural and s.swap == NULL
+        half = s.natural and s.swap == NULL and s.refactor == NULL
+        factor_free(s, s.x if half else NULL)
+        s.is_half_solved = half
         return
     s.is_half_solved = 1
     s.n_free = s.n
@@ -306,7 +321,7 @@ cdef inline int32_t pivots_all_free(pivoting_t* s) noexcept nogil:
 
 
 cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
-    """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible."""
+    """At most `rounds` rounds of: factor, solve, exchange; until no row is infeasible, or a factor is not begun."""
     cdef int32_t _r, bad
     for _r in range(rounds):
         s.n_rounds += 1
@@ -314,9 +329,12 @@ cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
         pivots_slack(s)
         if not s.is_factored:
             factor_free(s, NULL)
+        if s.late:
+            s.n_rounds -= 1
+            return ROUNDS
         if s.found.negative > 0:
             return INDEFINITE
-        if s.found.small > 0 and (s.shift == 0.0 or s.swap != NULL):
+        if s.found.small > 0 and (s.shift == 0.0 or s.swap != NULL or s.refactor != NULL):
             return SMALL
         pivots_correct(s)
         pivots_slack(s)
@@ -330,7 +348,10 @@ cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
 
 cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n,
                                     int32_t* swept) noexcept nogil:
-    """A boxed problem, as `Pivoting.solve` says; the outcome."""
+    """A boxed problem: where that costs less than the sweeps all rows free first, which may be the end of it.
+
+    Else `sweeps` symmetric sweeps from `start` (m), the rows free that they leave free, and at most n rounds.
+    """
     cdef int32_t i
     # Multiply-adds: (band + 1)^2 / 2 a row against two for each nonzero and sweep.
     cdef bint cheap = s.band >= 0 and n > 0 and s.n > 0 and (
@@ -358,19 +379,19 @@ cdef void pivots_start(pivoting_t* s, double shift) noexcept nogil:
     pivots_restart(s)
 
 
-cdef inline void renew(pivoting_t* s) noexcept nogil:
-    # as if made anew: no row at a bound, nothing factored, nothing counted
+cdef void pivots_renew(pivoting_t* s) noexcept nogil:
+    """As if made anew: no row at a bound, nothing factored, nothing counted."""
     cdef int32_t i
     for i in range(s.n):
         s.at[i] = FREE
-    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = 0
+    s.is_half_solved = s.exchanged = s.factorisations = s.n_rounds = s.late = 0
     no_pivots(&s.found)
     pivots_start(s, 0.0)
 
 
-cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
-                         double* real, int32_t* whole) noexcept nogil:
-    # real: 6 m numbers and the factor's; whole: 2 m; order: NULL as they stand
+cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order, double tiny,
+                    double* real, int32_t* whole) noexcept nogil:
+    """Arrays in real, 6 m numbers and the factor's, and whole, 2 m; order: NULL as rows stand."""
     cdef int32_t i, m = p.n_rows
     s.a = a
     s.p = p
@@ -392,209 +413,7 @@ cdef inline void lay_out(pivoting_t* s, const csr_t* a, const blocks_t* p, int32
     s.at = whole
     s.place = whole + m
     s.swap = NULL
-    renew(s)
-
-
-cdef public int32_t lav_pivot_boxed(const blocks_t* p, const csr_t* a, int32_t band, const int32_t* order, double tiny,
-                                    const double* start, int32_t sweeps, int32_t n, double* real,
-                                    int32_t* whole) noexcept nogil:
-    """A whole solve for a host without Python, in room of 6 m + m (band + 1) + 1 and 2 m numbers; x, w come first."""
-    cdef pivoting_t s
-    cdef int32_t swept, code
-    lay_out(&s, a, p, band, order, tiny, real, whole)
-    code = pivots_solve(&s, start, sweeps, n, &swept)
-    pivots_slack(&s)
-    return code
-
-
-cdef void pivots_on(pivoting_t* s, const csr_t* a, const blocks_t* p, int32_t band, double tiny, double* real,
-                    int32_t* whole) noexcept nogil:
-    lay_out(s, a, p, band, NULL, tiny, real, whole)
-
-
-cdef class Pivoting:
-    """Work arrays of one problem; all methods but `rounds` and `solve` serve drivers with another factorisation.
-
-    Parameters
-    ----------
-    p : Data
-        Of A in compressed rows.
-    band : int
-        Half bandwidth of A in order of elimination, at most m - 1; -1: no room for a factor.
-    order : (m,) int32 or None
-        Row eliminated first, second, ...; None: as they stand.
-    symmetric : bool
-        False: LU, in room for a band of m - 1, as they stand.
-    """
-
-    cdef pivoting_t s
-    cdef Data p
-    cdef object reals, ints, order
-
-    def __init__(self, Data p, int band, order, double tiny, bint symmetric=True):
-        cdef int32_t m = p.blocks.n_rows
-        cdef int64_t room = 1 if band < 0 else <int64_t>m * (band + 1) + 1
-        cdef const int32_t[::1] given
-        cdef double[::1] reals
-        cdef int32_t[::1] ints
-        # One block for the vectors and the factor: two allocations in all.
-        self.reals = np.zeros(6 * m + room)
-        self.ints = np.zeros(3 * m + 1, np.int32)
-        reals, ints = self.reals, self.ints
-        cdef const int32_t* first = NULL
-        if p.factored:
-            raise ValueError("Pivoting reads A in compressed rows")
-        if not symmetric and (band != m - 1 or order is not None):
-            raise ValueError("LU has room where the band is whole, and takes rows as they stand")
-        self.p = p
-        self.order = order
-        if order is not None:
-            given = order
-            if given.shape[0] != m:
-                raise ValueError("order must name every row once")
-            if m:
-                first = &given[0]
-        lay_out(&self.s, &p.csr, &p.blocks, band, first, tiny, &reals[0], &ints[0])
-        if not symmetric:
-            self.s.swap = &ints[2 * m]
-
-    @property
-    def x(self):
-        """(m,) N s"""
-        return self.reals[:self.s.n]
-
-    @property
-    def w(self):
-        """(m,) m/s, (2)"""
-        return self.reals[self.s.n:2 * self.s.n]
-
-    @property
-    def f(self):
-        """(m,) m/s, rounding of w"""
-        return self.reals[2 * self.s.n:3 * self.s.n]
-
-    @property
-    def center(self):
-        """(m,) N s"""
-        return self.reals[3 * self.s.n:4 * self.s.n]
-
-    @property
-    def at(self):
-        """(m,) 0 free, -1 at the lower bound, 1 at the upper"""
-        return self.ints[:self.s.n]
-
-    @property
-    def place(self):
-        """(m,) place among the free rows, -1"""
-        return self.ints[self.s.n:2 * self.s.n]
-
-    def start(self, double shift):
-        """A fresh count of infeasible rows, with this shift; nothing factored."""
-        pivots_start(&self.s, shift)
-
-    def restart(self):
-        """A fresh count of infeasible rows; the factor stays."""
-        pivots_restart(&self.s)
-
-    def recenter(self):
-        """center <- x."""
-        cdef int32_t i
-        for i in range(self.s.n):
-            self.s.center[i] = self.s.x[i]
-
-    def factor(self):
-        """Factor the free rows; (small, negative) pivots."""
-        with nogil:
-            factor_free(&self.s, NULL)
-        return self.s.found.small, self.s.found.negative
-
-    def factor_all(self):
-        """Factor A, all rows free; (small, negative) pivots."""
-        with nogil:
-            pivots_factor_all(&self.s)
-        return self.s.found.small, self.s.found.negative
-
-    def correct(self):
-        """x_F less the solve of w_F."""
-        with nogil:
-            pivots_correct(&self.s)
-
-    def solve_free(self):
-        """x = A^-1 b with all rows free and factored; w is left alone."""
-        with nogil:
-            pivots_solve_free(&self.s)
-
-    def solve(self, const double[::1] start, int sweeps, int n):
-        """A boxed problem: (code as of `rounds`, whether it was swept).
-
-        Where that costs less than the sweeps all rows free first, which may be the end of it. Else `sweeps` symmetric
-        sweeps from `start` (m,), the rows free that they leave free, and at most n rounds.
-        """
-        cdef int32_t code, swept
-        cdef const double* first = &start[0] if self.s.n else NULL
-        with nogil:
-            code = pivots_solve(&self.s, first, sweeps, n, &swept)
-        return code, bool(swept)
-
-    def slack(self):
-        with nogil:
-            pivots_slack(&self.s)
-
-    def exchange(self):
-        """Number of infeasible rows, which have changed sides; negative: out of patience, none has."""
-        return pivots_exchange(&self.s)
-
-    def put_bounds(self):
-        """x of bound rows."""
-        pivots_place(&self.s)
-
-    def number(self):
-        """Places of the free rows in order of rows; their number."""
-        cdef int32_t i, k = 0
-        for i in range(self.s.n):
-            self.s.place[i] = -1
-            if self.s.at[i] == FREE:
-                self.s.place[i] = k
-                k += 1
-        self.s.n_free = k
-        return k
-
-    def clipped(self, double[::1] out):
-        """x within its bounds, into out (m,)."""
-        cdef int32_t i
-        for i in range(self.s.n):
-            out[i] = clip(self.s.x[i], self.s.p.lower[i], self.s.p.upper[i])
-
-    def rounds(self, int n):
-        """At most n rounds; 0 solved, 1 rounds used, 2 small pivot, 3 negative pivot, 4 stuck."""
-        cdef int32_t code
-        with nogil:
-            code = pivots_rounds(&self.s, n)
-        return code
-
-    @property
-    def shift(self):
-        return self.s.shift
-
-    @property
-    def exchanged(self):
-        return self.s.exchanged
-
-    @property
-    def factorisations(self):
-        return self.s.factorisations
-
-    @property
-    def n_rounds(self):
-        return self.s.n_rounds
-
-    def skipped(self):
-        """Rows whose pivots were small in the last factorisation, in order of elimination."""
-        rows = self.order if self.order is not None else range(self.s.n)
-        return [i for i in rows if self.s.place[i] >= 0 and self.s.c[<int64_t>self.s.place[i] * self.s.width] == 0.0]
-
-    @property
-    def pivots(self):
-        """(small, negative, least, first small place) of the last factorisation."""
-        f = self.s.found
-        return f.small, f.negative, f.least, f.first_small
+    s.outside = NULL
+    s.refactor = NULL
+    s.resolve = NULL
+    pivots_renew(s)

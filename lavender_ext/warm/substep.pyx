@@ -20,11 +20,10 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
-                                         real_room)
+from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
 from lavender_ext.newton.phases cimport LIMITLESS, begin_rounds, enter_rounds, go_rounds
 from lavender_ext.newton.scaling cimport find_elements
-from lavender_ext.newton.run cimport INNER, N_ROUNDS, impulse_of, newton_t
+from lavender_ext.newton.run cimport INNER, N_ROUNDS, aim, impulse_of, judge_room, lay_judge, newton_t, unknown_of
 from lavender_ext.warm.start cimport (JUDGED, MOST_SWEEPS, MOST_TRACED, UNDECIDED, WALKED, band_width, judged, lay_out,
                                       observe, room_of, scored, start_errors, warm_solve, warm_t)
 
@@ -65,6 +64,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     cdef int64_t room, walks
     cdef blocks_t p
     cdef rows_t r
+    cdef newton_t n
     cdef pattern_t a
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
@@ -73,9 +73,10 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     scratch[1] = walks > 0
     room = room_of(&p, &r, scratch[0]) + p.n_rows
     if walks > 0:
-        lay_pattern(&a, scratch + HEAD, &p, &r)
-        make_pattern(&a, &p, &r)
-        room += real_room(&a, &p, &r)
+        lay_pattern(&n, &a, scratch + HEAD, &p, &r)
+        find_elements(&n.sc, &p, NULL, &r)
+        make_pattern(&n.sc, &a, &r)
+        room += judge_room(&p, &r, NULL) + body_room(&n, &a, &p, &r)
     return <int32_t>room if room < MOST else -1
 
 
@@ -87,9 +88,7 @@ cdef inline void take_best(const rows_t* r, const blocks_t* p, const newton_t* n
 cdef inline void walk(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double alpha, int32_t limit,
                       double* lam, double* v) noexcept nogil:
     """Proximal rounds from lam until the judge is content, `limit` factorisations are spent, or nothing moves."""
-    cdef int32_t j
-    for j in range(p.n_rows):
-        n.trial[j] = lam[j] / n.scale[j]
+    unknown_of(n, lam, n.trial)
     begin_rounds(n, 0, n.trial, COULOMB, alpha, INNER)
     enter_rounds(n, 0, limit)
     while n.depth > 0:
@@ -131,7 +130,6 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef newton_t n
-    cdef bodies_t w
     cdef pattern_t a
     if how != UNDECIDED or p.n_rows == 0:
         return how
@@ -146,9 +144,10 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     if not scratch[1]:
         return UNDECIDED
-    lay_pattern(&a, scratch + HEAD, p, r)
-    find_elements(&a.s, p, NULL, r)                     # the pattern stands from `lav_newton_plan`
-    lay_bodies(&n, &w, &a, room, p, r)
+    lay_pattern(&n, &a, scratch + HEAD, p, r)
+    find_elements(&n.sc, p, NULL, r)                    # the pattern stands from `lav_newton_plan`
+    aim(&n, p, NULL, r, NULL)
+    furnish_bodies(&n, &a, lay_judge(&n, room), p, r)
     n.problem.e0, n.problem.v0 = e0, v0
     return solve_with_walks(p, r, s, &n, tol, lam, v)
 

@@ -4,7 +4,6 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from enumeration import enumerate_lcp
 from hypothesis import assume, given
 from random_problems import good, random_lcp, seeds, without_solution
 
@@ -14,7 +13,7 @@ from lavender.certificates import check_certificate
 from lavender.lu import sparse_lu
 from lavender.solvers.pivoting import PivotState
 from lavender_ext.factor.sparse import SparsePanels
-from lavender_ext.pivot import principal
+from lavender_ext.pivot import direct, principal
 from lavender_ext.pivot.principal import SMALL
 
 
@@ -79,54 +78,19 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
     rng = np.random.default_rng(seed)
     lower = sum((np.diag(rng.normal(size=m - k), -k) for k in range(min(band, m - 1) + 1)), np.zeros((m, m)))
     a = lower @ lower.T + np.eye(m)
-    problem = lv.Problem.lcp(a, rng.normal(size=m))
+    free = np.array([not bound >> i & 1 for i in range(m)])
+    wide = np.where(free, np.inf, 0.0)
+    problem = lv.Problem.lcp(a, rng.normal(size=m), -wide, wide)
+    lv.residual(problem, np.zeros(m))  # the error of doing nothing, which what is found is measured against
     order = rng.permutation(m).astype(np.int32)
-    for p, wide in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
-        rows = principal.Pivoting(problem.csr_data, wide, p, 1e-13)
-        rows.at[:] = [-((bound >> i) & 1) for i in range(m)]
-        free = rows.at == 0
-        rows.x[:] = 0.0
-        rows.slack()
-        assert rows.factor() == (0, 0)
-        rows.correct()
+    for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
+        rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
+        rows.begin(np.zeros(m), np.inf)  # whatever is found is good: nothing is refined
+        assert rows.first(0, 1) == principal.SOLVED
         expected = np.zeros(m)
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
-        np.testing.assert_allclose(rows.x, expected, rtol=1e-11, atol=1e-11)
-
-
-@given(seed=seeds, m=st.integers(1, 7), boxed=st.booleans(), whole=st.booleans())
-def test_positive_definite_pivoting_equals_enumeration(seed, m, boxed, whole):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, m + 2))
-    if whole:  # small whole numbers: degenerate, w = 0 and lambda = 0 at once
-        g = np.rint(g)
-    a = g @ g.T + 0.25 * np.eye(m)
-    b = np.rint(2.0 * rng.normal(size=m)) if whole else rng.normal(size=m)
-    low = np.where(rng.random(m) < 0.2, -np.inf, -np.rint(2.0 * rng.random(m)) if boxed else 0.0)
-    high = np.where(rng.random(m) < 0.5, np.inf, np.maximum(low, 0.0) + 1.0) if boxed else np.full(m, np.inf)
-    solution = lv.solve(lv.Problem.lcp(a, b, low, high), "direct", tol=1e-9)
-    assert good(solution), solution
-    truth = enumerate_lcp(a, b, low, high)
-    assert truth
-    for x, _ in truth:  # all spellings of the one solution
-        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
-
-
-@given(seed=seeds, m=st.integers(2, 8), whole=st.booleans())
-def test_semidefinite_pivoting_finds_the_slack_of_enumeration(seed, m, whole):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, max(1, m // 2)))
-    if whole:
-        g = np.rint(g)
-    a = g @ g.T
-    b = a @ np.maximum(rng.normal(size=m), 0.0) - np.maximum(rng.normal(size=m), 0.0)
-    solution = lv.solve(lv.Problem.lcp(a, b), "direct", tol=1e-9)
-    assert solution.success, solution
-    assert not solution.contradicted
-    truth = enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf))
-    for _, w in truth:  # the slack of a symmetric semidefinite LCP is unique
-        np.testing.assert_allclose(solution.slack, w, atol=1e-6)
+        np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
 
 
 @given(seed=seeds, rank=st.integers(2, 12))
@@ -306,9 +270,10 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a = np.eye(m)
     a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10
     state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
-    state.rows.start(1e-10)
-    assert state.rounds(4) == (SMALL, 1)
-    assert np.isfinite(state.rows.x).all()
+    state.rows.begin(np.zeros(m), 1e-13)
+    state.rows.begin_passes(False)
+    assert state.rows.one_pass(4) == SMALL
+    assert state.rows.n_rounds == 1
 
 
 def test_the_first_lu_of_what_fills_is_expected_to_take_long():
@@ -316,7 +281,7 @@ def test_the_first_lu_of_what_fills_is_expected_to_take_long():
     scattered = PivotState(lv.Problem.lcp(sp.csr_array(a + sp.eye_array(3000)), b))
     band = sp.diags_array([np.ones(2999), np.full(3000, 3.0), np.full(2999, 0.5)], offsets=[-1, 0, 1])
     narrow = PivotState(lv.Problem.lcp(sp.csr_array(band), b))
-    assert scattered.seconds > 20.0 * narrow.seconds
+    assert scattered.outside.seconds > 20.0 * narrow.outside.seconds
 
 
 def test_refusals_and_indefinite_matrices():
@@ -383,7 +348,7 @@ def test_short_tridiagonal_systems(m):
 
 @pytest.mark.parametrize("band", [0, 1, 5])
 def test_a_band_without_free_rows_has_no_pivots(band):
-    """Whatever the work arrays held: with every row at a bound there is nothing to read of them."""
+    """With every row at a bound there is nothing to read of the factor: its zeros would be pivots at rounding."""
     m = 6
     a = (
         sp.csr_array(np.eye(m))
@@ -392,12 +357,13 @@ def test_a_band_without_free_rows_has_no_pivots(band):
         if band == 1
         else sp.csr_array(np.ones((m, m)))
     )
-    pivoting = principal.Pivoting(lv.Problem.lcp(a, np.ones(m), 0.1, 0.1).csr_data, band, None, 1e-13)
-    pivoting.x.base[:] = -1.0  # a pivot of -1 would be a negative one
-    pivoting.at[:] = -1
-    assert pivoting.factor() == (0, 0)
-    pivoting.correct()
-    assert np.all(pivoting.x.base[: 6 * m] == -1.0)
+    problem = lv.Problem.lcp(a, np.ones(m), 0.1, 0.1)
+    lv.residual(problem, np.zeros(m))
+    rows = direct.Pivoting(problem.csr_data, band, None, 1e-13)
+    rows.begin(np.zeros(m), 1e-13)
+    assert rows.first(0, 1) == principal.SOLVED
+    assert rows.work == {"factorisations": 1}
+    assert np.array_equal(rows.best.impulse, np.full(m, 0.1))
 
 
 def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
@@ -406,7 +372,7 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     problem = lv.Problem.lcp(y @ y.T, rng.normal(size=90))  # more than the compiled factor takes
     prepared = lv.prepare(problem, "direct")
     pivot = prepared.state.pivot
-    pivot.seconds = 1e9  # by which its first factor would be refused
+    pivot.outside.seconds = 1e9  # by which its first factor would be refused
     refused = prepared.solve(time_limit=10.0)
     assert refused.status is lv.Status.TIME_LIMIT
     assert "factorisations" not in refused.work

@@ -20,8 +20,10 @@ from benchmarks.drawn import wild
 from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
+from lavender.solvers.costs import candidates
 from lavender.solvers.newton_systems import general
 from lavender.solvers.small import AUTO, FIRST, ISLAND, Few, call_ends_within, velocities_cost
+from lavender.solvers.structure import Structure
 from lavender_ext.few.many import solve_first
 
 SHORT = ("auto", "direct", "newton")
@@ -196,6 +198,7 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
         lv.solve(problem, "newton", form="impulse")
+    assert "newton over rows" not in candidates(Structure(problem))
     # What it cannot take further ends as a result, not in a solver that reads past such a block.
     hard = lv.prepare(problem, "auto").solve(tol=1e-15)
     assert np.isfinite(hard.residual.relative) and not hard.contradicted

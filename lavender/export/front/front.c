@@ -52,15 +52,13 @@ struct lav_solver {
   struct sweep_packed_packed_t pairs;
   double *pair_room;
   int32_t pairs_asked;
-  struct driver_driver_view_t view;
+  struct core_view_view_t view;
   struct driver_driver_asked_t asked;
   struct driver_driver_room_t drive;
   int32_t driven;              /* Newton's method has begun, as `asked` says */
   blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
-  struct pivot_principal_pivoting_t pivots;
-  int32_t band, is_linear, is_symmetric, left; /* left: of the budget */
-  double *pivot_room, *from, *tried, *search, best, best_floor;
-  int32_t *pivot_marks, *whole;
+  struct pivot_direct_direct_t direct;
+  int32_t pivots, *whole;      /* of Lemke's path */
   double *table;               /* Lemke's dictionary, or the factor of admm */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;

@@ -281,7 +281,7 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
   const int64_t memory = method == LAV_NNCG ? 0 : o->memory, prepared = 9 * m + 26 * k; /* of exact blocks */
   const int64_t pairs = bodies && k >= PACK_FROM ? sweep_packed_room_for(q->n_joints, mj, k - q->n_joints, mc, q->n_bodies) : 0;
-  struct driver_driver_view_t view;
+  struct core_view_view_t view;
   struct driver_driver_asked_t asked;
   struct driver_driver_room_t room;
   int64_t numbers = 0, band = q->form == LAV_MATRIX && m > 0 && q->n_entries / m > 64 ? q->n_entries / m : 64;
