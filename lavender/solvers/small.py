@@ -45,7 +45,7 @@ def velocities_cost(problem: Problem, largest: int) -> float:
     """Newton over generalised velocities, `largest` of them in one island [ns]; `is_cheap` of the compiled call."""
     v = rates()["velocities"]
     factor = v["work"] * general.factor_flops(problem, largest)
-    read = v["entry"] * float(problem.derived.view.work)
+    read = v["entry"] * float(problem.metric.work)
     return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
 
 
