@@ -81,8 +81,8 @@ cdef class Small:
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
         look: something else comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
-        nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone, with Lemke's path where exchanges are
-        stuck. None where it does not end below tol. What was done is None where `impulse` is the solution.
+        nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
+        with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is None where `impulse` is the solution.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
