@@ -82,7 +82,8 @@ cdef class Small:
 
         look: something else comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
         nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
-        with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is None where `impulse` is the solution.
+        with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
+        None where `impulse` is the solution.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
