@@ -1,5 +1,7 @@
-"""Figures hold the runs that they show, on one pair of axes for the page and for files."""
+"""The page stands alone; figures hold the runs that they show, on one pair of axes for the page and for files."""
 
+import html
+import html.parser
 import math
 import re
 from xml.etree import ElementTree
@@ -7,10 +9,70 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
+from lavender import bench, report
+from lavender.bench.record import file_name
 from lavender.report import curves
 from lavender.report.draw import matplotlib_figure
 from lavender.report.style import looks
 from lavender.report.svg import svg
+
+
+class Page(html.parser.HTMLParser):
+    """What a page loads, and whether its elements close."""
+
+    VOID = frozenset({"meta", "br", "hr", "img", "input", "link"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.loads, self.ids, self.links, self.wrong = [], [], set(), set(), []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.ids.add(values.get("id"))
+        if values.get("href", "").startswith("#"):
+            self.links.add(values["href"][1:])
+        self.loads += [v for k, v in attrs if k in ("src", "srcset", "data")]
+        self.loads += [values["href"]] if tag == "link" else []
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if self.open.pop() != tag:
+            self.wrong.append(tag)
+
+
+def test_the_page_stands_alone_and_is_well_formed(real, tmp_path):
+    records, evil = real
+    index = report.write(records, tmp_path)
+    text = index.read_text()
+    page = Page(text)
+    assert page.open == []
+    assert page.wrong == []
+    assert page.loads == []  # nothing from anywhere
+    assert "<script>alert" not in text
+    assert "<b>row" not in text
+    assert evil not in text
+    assert page.links <= page.ids
+    assert text.count("<svg") == len(list(curves.figures(records)))
+    for name in ("pgs", "jacobi", "Limitations", bench.cpu_name(), "numpy " + np.__version__):
+        assert name in text
+
+
+def test_everything_asked_for_is_in_the_folder(real, tmp_path):
+    records, _ = real
+    report.write(records, tmp_path)
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"records.csv", "records.json", "index.html", "summary.md", "figures"}
+    shown = [file_name(figure.name) for figure in curves.figures(records)]
+    saved = sorted(p.name for p in (tmp_path / "figures").iterdir())
+    assert saved == sorted(f"{name}.{suffix}" for name in shown for suffix in ("svg", "png"))
+    kinds = [name.split("_")[0] for name in shown]
+    assert [kinds.count(kind) for kind in ("work-precision", "budget", "family", "profile")] == [3, 3, 1, 2]
+    assert all(p.stat().st_size > 1000 for p in (tmp_path / "figures").iterdir())
+    text = (tmp_path / "summary.md").read_text()
+    for solver in ("pgs", "direct", "jacobi", "gauss_seidel"):
+        assert text.count(f"\n| chain | {solver} |") == 1
 
 
 def test_looks_tell_solvers_apart():
