@@ -60,6 +60,7 @@ EXEMPT = {
     "many": "allocates and calls kernels, computes nothing",
     "islands": "allocates, copies islands out and calls kernels, computes nothing",
     "newton": "makes room for Python; its arithmetic is in the driver's core",
+    "start": "makes room for Python; its arithmetic is in the substep's core",
     "solve": "calls the turns that the driver calls, in arrays of Python",
 }
 

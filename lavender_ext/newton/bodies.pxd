@@ -177,4 +177,4 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const b
     s.blocks.pivot = a.pivot
     s.blocks.next = a.next
     s.blocks.super = NULL
-    memset(s.blocks.work, 0, 72 * <int64_t>n * sizeof(double))
+    memset(x, 0, (2 * b + 72 * <int64_t>a.lptr[n] + 108 * <int64_t>n) * sizeof(double))
