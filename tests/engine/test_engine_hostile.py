@@ -305,7 +305,7 @@ def test_ctrl_c_inside_a_solver_that_returns_its_best_all_the_same(solver, monke
     # `newton` and `auto` answer Ctrl-C with the best impulses that they have: no step is made of them
     from lavender.solvers.newton import Newton
 
-    scene = lv.Scene("bridge", n=6, solver=solver, substeps=2)
+    scene = lv.Scene("bridge", n=30, solver=solver, substeps=2)  # too many rows for the one compiled call
     sim, twin = lv.Simulation(scene), lv.Simulation(scene)
     trajectory(sim, 3), trajectory(twin, 3)
     original = Newton.run
