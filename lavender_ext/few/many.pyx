@@ -112,7 +112,6 @@ cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, end, i, steps
-    cdef bint cold = j.cold
     if j.made.n_empty:
         return
     if j.begin[0] < 0.0:
@@ -127,26 +126,13 @@ cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double
     if not with_numbers(space, numbers_of(&f, &need)):
         return
     furnish(&f, &need, space.numbers)
-    if cold:
+    if j.cold:
         do_nothing(&j.p, j.lam, j.both)
-    else:                                               # doing nothing, given as a start, is cold as well
-        cold = True
-        for i in range(m):
-            if j.lam[i] != 0.0:
-                cold = False
-                break
-        if not cold:
-            do_nothing(&j.p, j.both, j.both + m)
-            cold = True
-            for i in range(m):
-                if j.lam[i] != j.both[i]:
-                    cold = False
-                    break
     steps = MOST
     if f.n_islands < (MOST - STEPS) / OF_EACH:
         steps = STEPS + OF_EACH * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    end = descend_all(&f, j.lam, cold)
+    end = descend_all(&f, j.lam)
     j.counts[0] = steps - f.steps
     if end != DONE:
         return

@@ -35,7 +35,7 @@ cdef struct descent_t:          # Newton steps under one law
 cdef struct wait_t:             # an island whose steps may be used up, to go on with
     int32_t island              # -1: none waits
     int32_t worst               # end of the islands before it
-    int32_t cold                # those after it begin from nothing
+    int32_t cold                # the run began from nothing
     int32_t at                  # of a round of Coulomb friction
     int32_t rounds              # of Coulomb friction before this one
     double kept                 # error of the island's best, which a cut may have found,
@@ -97,6 +97,16 @@ cdef struct flow_t:
     int32_t evaluations         # of lambda(s) along a line
     wait_t wait
     descent_t descent
+
+
+cdef inline bint is_nothing(const blocks_t* p, const double* lam) noexcept nogil:
+    """Is lam (m) 0, or what doing nothing is: Pi(0)?"""
+    cdef int32_t j
+    cdef bint zero = True, same = True
+    for j in range(p.n_rows):
+        zero = zero and lam[j] == 0.0
+        same = same and lam[j] == (p.lower[j] if p.lower[j] > 0.0 else p.upper[j] if p.upper[j] < 0.0 else 0.0)
+    return zero or same
 
 
 # -- rows and blocks of a run of panels ------------------------------------------------------------------

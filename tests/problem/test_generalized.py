@@ -348,10 +348,10 @@ def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(frictio
     """Cut anywhere, in one of several islands: the same impulse and counts."""
     problem = random_general(seed, friction, n=24, compliance=False)
     whole, cut = problem.start(), problem.start()
-    end, counts = general.prepare(problem).run(whole, 1e-9, 90, True)
+    end, counts = general.prepare(problem).run(whole, 1e-9, 90)
     kernel, done, now, again = general.prepare(problem), np.zeros(5, int), ENDS["spent"], False
     while now == ENDS["spent"] and done[0] < 90:
-        now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), True, again)
+        now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), again)
         done, again = done + more, kernel.waits
     assert (now, tuple(done)) == (end, counts)
     assert kernel.waits == (end == ENDS["spent"])
@@ -361,10 +361,10 @@ def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(frictio
 def test_newton_that_waits_begins_anew_unless_it_is_told_to_go_on():
     problem = random_general(3, "coulomb", n=24, compliance=False)
     kernel, fresh = general.prepare(problem), problem.start()
-    end, counts = kernel.run(fresh, 1e-9, 5, True)
+    end, counts = kernel.run(fresh, 1e-9, 5)
     assert end == ENDS["spent"] and kernel.waits
     other = problem.start()
-    assert kernel.run(other, 1e-9, 5, True) == (end, counts)
+    assert kernel.run(other, 1e-9, 5) == (end, counts)
     np.testing.assert_array_equal(other, fresh)
 
 
