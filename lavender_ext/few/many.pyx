@@ -111,7 +111,7 @@ cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) n
 cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, end, i, steps
+    cdef int32_t m = j.p.n_rows, end, steps
     if j.made.n_empty:
         return
     if j.begin[0] < 0.0:
