@@ -26,7 +26,8 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
 from lavender_ext.core.contact_map cimport length
 from lavender_ext.core.generalized cimport dot
-from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, is_nothing, measure, renew,
+from lavender_ext.core.start cimport is_nothing
+from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, newton_step
 from lavender_ext.generalized.sparse cimport is_worth

@@ -12,7 +12,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.block cimport CONE, COULOMB, ROW
-from lavender_ext.generalized.flow cimport is_nothing
+from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchanges, begin_rounds, begin_steps,

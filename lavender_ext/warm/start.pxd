@@ -14,9 +14,9 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, row_error
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
-from lavender_ext.generalized.flow cimport is_nothing
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport is_plain, nothing, relative, score_rows, score_t, tally_row, tally_t
 
