@@ -186,7 +186,7 @@ def abilities(spec):
     }
     yes = {
         "impulse": "starts from `impulse=`",
-        "order": "`order=`, `ground=`",
+        "order": "`order=`",
         "seed": "`seed=`",
         "threads": '`threads=` (with `order="colored"`)',
         "callback": "`callback=`",

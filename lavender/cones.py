@@ -18,6 +18,7 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -440,6 +441,18 @@ class Cones:
     def rolling_rows(self) -> IntArray:
         """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
         return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
+
+    def parts(self) -> Iterator[tuple[int, IntArray]]:
+        """(block, rows of it that one bound holds together): tangents, then spin or second side, then what rolls."""
+        tangents, apart, rolling = self.n_together, self.apart_rows, self.rolling_rows
+        for i in np.flatnonzero(self.kind != ROW).tolist():
+            first = self.ptr[i] + 1
+            if tangents[i]:
+                yield i, np.arange(first, first + tangents[i])
+            if apart[i] >= 0:
+                yield i, apart[i : i + 1]
+            if rolling[i] >= 0:
+                yield i, np.arange(rolling[i], rolling[i] + 2)
 
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""

@@ -54,7 +54,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     with room for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
     largest panel, and its rows. A panel without columns is an island of its own.
     """
-    cdef int32_t b, q, r, i, k, n = 0, size, nc, rows, end, panels = g.n_panels, at
+    cdef int32_t b, q, r, i, n = 0, size, nc, rows, end, panels = g.n_panels, at
     cdef const int32_t* cols = g.cols
     cdef const int32_t* ptr = p.ptr
     join_trees(g, up)

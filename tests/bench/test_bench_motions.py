@@ -42,25 +42,6 @@ def test_samples_are_iterates_with_both_errors():
         assert s.found <= s.bound
 
 
-def test_shares_count_what_they_say():
-    def branch(found, unique="", mu=0.5, sliding=0.2, warm=""):
-        return motions.Branches(
-            "c", "coulomb", "pile", 9, mu, sliding, found, 7, 0.1 * (found > 1), 0.1, unique, warm
-        )
-
-    text = motions.several_table(
-        [
-            branch(3, warm="nearest"),
-            branch(2, mu=0.7, warm="another"),
-            branch(1),
-            branch(1, "friction is small", mu=0.1),
-        ]
-    )
-    assert "| all | 4 | 1 | 1 | 2 (50%) | 0.1 m/s | c |" in text
-    assert "| friction from 0 to 0.3 | 1 | 1 | 0 | 0 (0%) |  |  |" in text
-    assert "sweeps from 1 of 2" in text
-
-
 def test_a_problem_with_several_motions_is_counted_as_one():
     p = suite.case("granularF(n=3, sliding=0.5)").problem
     found = motions.branches("granular", p, "pile", 6)

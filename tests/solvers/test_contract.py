@@ -317,15 +317,6 @@ def test_seeds_change_random_sweeps(name):
     assert x.tobytes() == y.tobytes() != z.tobytes()
 
 
-@pytest.mark.parametrize("name", lv.available(threads=True))
-def test_thread_count_changes_no_bit(name):
-    problem = next(examples(registry.get(name)))
-    one, two = (
-        lv.solve(problem, name, order="colored", threads=t, tol=0.0, max_iter=10).impulse for t in (1, 2)
-    )
-    assert one.tobytes() == two.tobytes()
-
-
 @pytest.mark.parametrize("name", lv.available(history=True))
 def test_history_is_recorded_at_fixed_counts(name):
     problem = next(examples(registry.get(name)))
