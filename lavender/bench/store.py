@@ -19,7 +19,7 @@ from typing import Any
 from lavender._arrays import table_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
-from lavender.errors import InputError, UnknownName
+from lavender.errors import InputError
 from lavender.io.stored import MAX_BYTES, destination, write_atomically, write_text
 
 __all__ = ["Records", "Store", "opened", "read", "write_csv", "write_json"]
@@ -136,24 +136,6 @@ class Records:
         solvers = sorted({r.solver for r in self.records})
         facts = {"runs": len(self.records), "cases": len(self.cases), "solvers": ", ".join(solvers)}
         return table_of(facts, self.source or "Records")
-
-    def plot(self, case: str | None = None) -> Any:
-        """Error against time, every solver on one case (the first if None), as a figure of matplotlib.
-
-        Raises
-        ------
-        UnknownName
-            No such case.
-        """
-        cases = list(dict.fromkeys(r.case for r in self.records))
-        case = cases[0] if case is None and cases else case
-        if case not in cases:
-            raise UnknownName("case", case, cases)
-        from lavender.report import curves, draw, style
-
-        return draw.matplotlib_figure(
-            curves.work_precision(self, case), style.looks({r.solver for r in self.records})
-        )
 
     def frame(self) -> Any:
         """`rows()` as a pandas frame.

@@ -1,6 +1,6 @@
 """`python -m benchmarks motions`: what its tables count."""
 
-import csv
+import json
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ def sample(relative, motion, law="lcp", structure="stack + redundant"):
 
 def test_factors_are_those_of_the_samples():
     found = [sample(1e-3, 2e-3), sample(1e-3, 4e-3), sample(1e-2, 9e-2, structure="stack")]
-    rows = {row[0]: row for row in motions.calibration(found)}
+    rows = {row.structure: row for row in motions.calibration(found)}
     assert set(rows) == {"stack", "redundant", "law lcp", "all"}
-    assert rows["all"][1] == 3
-    assert rows["all"][2] == pytest.approx(4.0)
-    assert rows["all"][4] == pytest.approx(9.0)
-    assert rows["redundant"][1] == 2
+    assert rows["all"].iterates == 3
+    assert rows["all"].median == pytest.approx(4.0)
+    assert rows["all"].largest == pytest.approx(9.0)
+    assert rows["redundant"].iterates == 2
     names = {name: (median, spread) for name, _, median, spread in motions.predictors(found)}
     assert names["V / V0 alone"][0] == pytest.approx(2 * names["E / E0 alone"][0])
     assert "median 1" in motions.table(found)
@@ -52,13 +52,14 @@ def test_a_problem_with_several_motions_is_counted_as_one():
 
 def test_the_command_writes_both_tables(tmp_path):
     path = tmp_path / "figure.png"
-    args = ["stack(n=8)", "box_stackF(n=2)", "--runs", "3", "--out", str(tmp_path)]
+    args = ["stack(n=8)", "box_stackF(n=2)", "--runs", "3", "--out", str(tmp_path / "m.json")]
     result = CliRunner().invoke(motions.command, [*args, "--figure", str(path)])
     assert result.exit_code == 0, result.output
     assert path.read_bytes().startswith(b"\x89PNG")
     assert "| all |" in result.output
     assert "| Coulomb problems |" in result.output
-    with open(tmp_path / "motions.csv", newline="") as stream:
-        assert [row["case"] for row in csv.DictReader(stream)] == ["stack(n=8)", "box_stackF(n=2)"]
-    bad = CliRunner().invoke(motions.command, ["stack(n=8)", "--out", str(tmp_path / "no")])
+    kept = json.loads((tmp_path / "m.json").read_text())
+    assert [line["case"] for line in kept["lines"]] == ["stack(n=8)", "box_stackF(n=2)"]
+    assert {sample["case"] for sample in kept["samples"]} <= {"stack(n=8)", "box_stackF(n=2)"}
+    bad = CliRunner().invoke(motions.command, ["stack(n=8)", "--out", str(tmp_path / "no" / "m.json")])
     assert isinstance(bad.exception, lv.InputError)
