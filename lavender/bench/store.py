@@ -11,7 +11,7 @@ import csv
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -83,8 +83,6 @@ class Records:
         if not self.runs:
             return self
         run = list(self.runs)[-1]
-        found = Records(source=self.source)
-        found.add(self.runs[run])
         now = {name: info.sha for name, info in self.cases.items()}
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
@@ -94,9 +92,15 @@ class Records:
         )  # lines that took turns with each other
         mine = [r for r in mine if r.turns in ("", newest)]
         cases = {r.case for r in mine}
-        described = [info for info in self.cases.values() if info.run == run or info.case in cases]
-        entries: list[Entry] = [*self.skips, *self.done.values()]
-        for entry in (*described, *(e for e in entries if e.run == run), *mine):
+        return self.having(mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases))
+
+    def having(
+        self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
+    ) -> Records:
+        """Other records of the same runs, with the descriptions and notes that `keep` leaves."""
+        found = Records(source=self.source)
+        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips, *self.done.values()]
+        for entry in (*filter(keep, entries), *records):
             found.add(entry)
         return found
 
