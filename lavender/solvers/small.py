@@ -1,9 +1,8 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A, islands of few rows under friction, as many as are swept in `LONGEST`
-(`lavender_ext/few/small.pyx`), generalised coordinates where Newton's method is counted to cost little
-(`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or not at all:
-then the solver runs as on any problem, from the beginning.
+Few rows of bodies or of A, islands of few rows under friction (`lavender_ext/few/small.pyx`), generalised coordinates
+where Newton's method is counted to cost little (`lavender_ext/few/many.pyx`): what Python costs outweighs such a
+problem. The call ends with a solution or not at all: then the solver runs as on any problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -34,7 +33,6 @@ ISLAND = {"coulomb": 150, "cone": 12}
 SWEPT = 32  # sweeps of a part at most, before its factors
 IN_ALL = 5  # times as long, as sweeps and factors of all parts mostly take
 FACTORED = 0.05  # ns of a multiply-add of factors of parts
-LONGEST = 5e8  # ns of SWEPT sweeps of all islands at most
 # ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
 # Coulomb's law sooner; and up to which nobody looks at the clock in between.
 FIRST = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
@@ -84,7 +82,7 @@ def _make(problem: Problem) -> Small | None:
     if cones.has_round or cones.has_rolling:
         return None
     if problem.m > SMALL_ROWS:
-        if bounded or SWEPT * sweep_cost(problem) > LONGEST:
+        if bounded:
             return None
         count, label = islands(problem)
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND[law]:
@@ -108,8 +106,9 @@ class Few:
     name: str
     gate: Gate | None  # what it may cost over generalised velocities; None: not at all
     pivots: bool  # bounded rows
-    sweeps: bool  # and cones
-    looks: bool = False  # a start that is a solution is the result, one that is none is not started from
+    hands_over: bool = (
+        False  # and friction; a start that is a solution is the result, a bad one is not started from
+    )
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
@@ -125,10 +124,10 @@ class Few:
                 return None
             found = solve_first(kept.view, impulse, tol, self.gate)
         else:
-            small = prepared(problem) if problem.m <= SMALL_ROWS or self.sweeps else None
-            if small is None or not (self.pivots if small.pivots else self.sweeps):
+            small = prepared(problem) if problem.m <= SMALL_ROWS or self.hands_over else None
+            if small is None or not (self.pivots if small.pivots else self.hands_over):
                 return None
-            found = small.run(impulse, tol, self.looks, WARM)
+            found = small.run(impulse, tol, self.hands_over, WARM)
         if found is None:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found
@@ -222,6 +221,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", gate(FIRST["cone"], FIRST["coulomb"]), True, True, looks=True)
-DIRECT = Few("direct", None, True, False)
-NEWTON = Few("newton", gate(MOST, MOST), False, False)
+AUTO = Few("auto", gate(FIRST["cone"], FIRST["coulomb"]), True, True)
+DIRECT = Few("direct", None, True)
+NEWTON = Few("newton", gate(MOST, MOST), False)
