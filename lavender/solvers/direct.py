@@ -187,6 +187,9 @@ class _Run:
         return 0.0 if self.kept is None else self.kept.floor
 
     def put_best(self) -> None:
+        pivot = self.state.pivot
+        if pivot is not None and pivot.rows.relative < self.best:
+            self.keep(pivot.rows.best)  # an error, or Ctrl-C, ended it between two rounds
         if self.kept is not None:
             self.impulse[:] = self.kept.impulse
             remember(self.problem, self.kept)

@@ -42,13 +42,14 @@ cdef inline void along_rim(const double* y, double t, double kappa, int32_t j, i
                            double* p) noexcept nogil:
     # kappa (I - y y^T / t^2) of rows [j, j + m)
     cdef int32_t k, l
-    cdef double x, square = 0.0
-    for k in range(j, j + m):
-        square += y[k] * y[k]
-    for k in range(j, j + m):
-        for l in range(j, j + m):
-            x = square - y[k] * y[k] if k == l else -y[k] * y[l]
-            p[k * n + l] += kappa * (x / (t * t))
+    cdef double u[5]
+    cdef double square = 0.0
+    for k in range(m):
+        u[k] = y[j + k] / t                             # t^2 may have left the range
+        square += u[k] * u[k]
+    for k in range(m):
+        for l in range(m):
+            p[(j + k) * n + j + l] += kappa * (square - u[k] * u[k] if k == l else -u[k] * u[l])
 
 
 cdef inline void map_parts(int32_t law, const int32_t nt, const int32_t spin, const int32_t rolls, const double* a,
