@@ -16,8 +16,7 @@ from lavender_ext.generalized.newton cimport DONE as G_DONE
 from lavender_ext.generalized.newton cimport SPENT as G_SPENT
 from lavender_ext.generalized.newton cimport descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of
-from lavender_ext.judge.score cimport are_numbers, score_rows, score_t
+from lavender_ext.judge.measure cimport judge_nothing, scratch_of
 from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
                                          real_room)
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
@@ -42,10 +41,7 @@ cdef inline int64_t state_room() noexcept nogil:
 
 
 cdef inline int64_t judge_room(const view_t* v) noexcept nogil:
-    cdef int64_t m = v.p.n_rows
-    if v.r != NULL:
-        return 6 * m + 12 * <int64_t>v.r.n_bodies
-    return 6 * m + (v.g.n + m if v.g != NULL else 0)
+    return 6 * <int64_t>v.p.n_rows + scratch_of(v)
 
 
 cdef inline void vanish(double* x, int64_t n) noexcept nogil:
@@ -54,23 +50,13 @@ cdef inline void vanish(double* x, int64_t n) noexcept nogil:
 
 cdef inline void reference(const view_t* v, state_t* s) noexcept nogil:
     """Errors of doing nothing, as the judge has them."""
-    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef double begun[3]
     cdef newton_t* n = &s.n
     cdef int64_t m = v.p.n_rows
-    cdef bint moves
     n.problem.p, n.problem.a, n.problem.r, n.problem.g = v.p, v.a, v.r, v.g
     n.lam, n.problem.w, n.problem.error = s.rows, s.rows + m, s.rows + 2 * m
     s.z, s.proof, n.problem.x = s.rows + 3 * m, s.rows + 4 * m, s.rows + 6 * m
-    moves = do_nothing(&v.p, n.lam, n.problem.w)
-    if not moves:
-        score_rows(&v.p, n.lam, n.problem.w, n.problem.error, &found)
-    elif v.g != NULL:
-        general_judge(&v.p, v.g, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
-    else:
-        judge_into(&v.p, v.a, v.r, v.r != NULL, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
-    found.finite = found.finite and are_numbers(n.problem.w, v.p.n_rows)
-    reference_of(&v.p, &found, moves, False, begun)
+    judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, False, begun)
     n.problem.e0, n.problem.v0 = begun[0], begun[1]
 
 

@@ -418,13 +418,7 @@ cdef class Pivoting:
                 raise ValueError("order must name every row once")
             if m:
                 first = &given[0]
-        v = view_t(self.judged.blocks, NULL, NULL, NULL)
-        if self.judged.is_general:
-            v.g = &self.judged.general
-        elif self.judged.factored:
-            v.r = &self.judged.rows
-        else:
-            v.a = &self.judged.csr
+        v = self.judged.view()
         # One block for the vectors and the factor: two allocations in all.
         self.reals = np.zeros(direct_real(&v, band))
         self.ints = np.zeros(direct_index(&v), np.int32)
