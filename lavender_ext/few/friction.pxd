@@ -7,7 +7,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.stdlib cimport free, malloc
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.accelerate.accelerated cimport anderson_step, sweep_data_t
+from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
@@ -116,7 +116,7 @@ cdef inline double sweep_on(turns_t* t, int32_t most, bint hoping) noexcept nogi
     cdef int32_t step = FIRST
     while now > tol and t.c.turn < most:
         before = now
-        anderson_step(&t.c, t.swept, t.c.turn == 0, step)
+        lav_anderson(&t.c, t.swept, t.c.turn == 0, step)
         now = found_at(t, t.swept)
         step = t.c.turn // 2 if t.c.turn // 2 > FIRST else FIRST
         if hoping and not promises(before, now, tol, HOPED * (most - t.c.turn) // step):

@@ -40,11 +40,11 @@ cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam,
     else:
         for k in range(p.n_rows):
             w[k] = csr_dot_size(a, k, lam, &size) - p.b[k]
-            add_floor(p, k, size, &f)
-        if not floor_ends(&f, out):
+            add_floor(p, k, size, 0, &f)
+        if not floor_ends(&f, 0, out):
             for k in range(p.n_rows):
-                add_floor(p, k, csr_abs_dot(a, k, lam), &f)
-            floor_ends(&f, out)
+                add_floor(p, k, csr_abs_dot(a, k, lam), 1, &f)
+            floor_ends(&f, 1, out)
     score_rows(p, lam, w, e, out)
 
 
@@ -221,7 +221,7 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 
 cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* sizes,
-                            floor_t* f) noexcept nogil:
+                            const bint scaled, floor_t* f) noexcept nogil:
     # (|J| |M^-1| |J|^T |lam| + c |lam|) of every row; sizes of `velocity_size`
     cdef int32_t i, j, c, n, nt, turns, a, b
     cdef double size[6]
@@ -229,7 +229,7 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
+            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), scaled, f)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
@@ -243,7 +243,7 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
         else:
             contact_sizes(r, c, 0, 0, sizes, size)
         for i in range(n):
-            add_floor(p, j + i, r.compliance[j + i] * fabs(lam[j + i]) + size[i], f)
+            add_floor(p, j + i, r.compliance[j + i] * fabs(lam[j + i]) + size[i], scaled, f)
 
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
@@ -256,10 +256,10 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
     if not floor:
         return
     velocity_size(p, r, lam, sizes)
-    rows_floor(p, r, lam, sizes, &f)
-    if not floor_ends(&f, out):
-        rows_floor(p, r, lam, sizes, &f)
-        floor_ends(&f, out)
+    rows_floor(p, r, lam, sizes, 0, &f)
+    if not floor_ends(&f, 0, out):
+        rows_floor(p, r, lam, sizes, 1, &f)
+        floor_ends(&f, 1, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
@@ -293,11 +293,11 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
         panel_size(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
-        add_floor(p, i, size[i], &f)
-    if not floor_ends(&f, out):
+        add_floor(p, i, size[i], 0, &f)
+    if not floor_ends(&f, 0, out):
         for i in range(p.n_rows):
-            add_floor(p, i, size[i], &f)
-        floor_ends(&f, out)
+            add_floor(p, i, size[i], 1, &f)
+        floor_ends(&f, 1, out)
 
 
 # -- any form ------------------------------------------------------------------------------------------

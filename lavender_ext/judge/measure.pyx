@@ -53,17 +53,19 @@ def slack(Data p, const double[::1] lam, double[::1] w):
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, w, e finite)."""
+    """Slack into w, error into e, and (energy, velocity, relative residual, its floor); inf, inf, inf, 0 where not finite."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef view_t v = p.view()
     cdef double[::1] scratch
     if p.blocks.n_rows == 0:
-        return 0.0, 0.0, -1, 0.0, 0.0, True
+        return 0.0, 0.0, 0.0, 0.0
     scratch = np.empty(scratch_of(&v) + 1)
     with nogil:
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
-    return (s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity,
-            s.finite and are_numbers(&w[0], p.blocks.n_rows))
+    if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
+        return np.inf, np.inf, np.inf, 0.0
+    return (s.energy, s.velocity, relative(s.energy, s.velocity, p.start_energy, p.start_velocity),
+            relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity))
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):

@@ -35,10 +35,9 @@ cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over-
 
 
 cdef struct floor_t:            # of F, what rounding leaves of a slack
-    int32_t scaled              # by the last two, the first two having left the range of squares
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
-    sum_t total                 # sum F^2 / d
+    sum_t total                 # sum F^2 / d, scaled: neither over- nor underflows
     double big                  # max F sqrt(nu / d)
 
 
@@ -240,13 +239,13 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
 
 
 cdef inline floor_t no_floor() noexcept nogil:
-    return floor_t(0, 0.0, 0.0, sum_t(0.0, 0.0), 0.0)
+    return floor_t(0.0, 0.0, sum_t(0.0, 0.0), 0.0)
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t k, double size, floor_t* s) noexcept nogil:
-    """What rounding leaves of row k, size = (|A| |lam|)_k; all rows, and once more where `floor_ends` says no."""
+cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint scaled, floor_t* s) noexcept nogil:
+    """What rounding leaves of row k, size = (|A| |lam|)_k; all rows, and once more, scaled, where `floor_ends` says no."""
     cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t
-    if s.scaled:
+    if scaled:
         add_square(&s.total, f / sqrt(p.d[k]))
         t = f * (sqrt(p.nu[k]) / sqrt(p.d[k]))
         if t > s.big:
@@ -259,11 +258,10 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, double size, floor_t* s
         s.fast = t
 
 
-cdef inline bint floor_ends(floor_t* s, score_t* out) noexcept nogil:
-    """The floor entries of out; False where the rows are wanted once more, for sums that neither over- nor underflow."""
-    if not s.scaled and not is_plain(s.energy, s.fast):
-        s.scaled = 1
+cdef inline bint floor_ends(const floor_t* s, const bint scaled, score_t* out) noexcept nogil:
+    """The floor entries of out; False where plain sums have left the range of squares."""
+    if not scaled and not is_plain(s.energy, s.fast):
         return False
-    out.floor_energy = root(&s.total) if s.scaled else sqrt(s.energy)
-    out.floor_velocity = s.big if s.scaled else sqrt(s.fast)
+    out.floor_energy = root(&s.total) if scaled else sqrt(s.energy)
+    out.floor_velocity = s.big if scaled else sqrt(s.fast)
     return True

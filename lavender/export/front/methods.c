@@ -42,7 +42,7 @@ static int32_t prepare_accelerated(lav_solver *s) {
   s->fast.v = s->v;
   s->fast.nv = s->n_v;
   s->context = &s->fast;
-  s->step = memory == 0 ? accelerate_accelerated_nncg_step : accelerate_accelerated_anderson_step;
+  s->step = memory == 0 ? k_nncg : k_anderson;
   return LAV_OK;
 }
 
