@@ -28,7 +28,6 @@ NAMES = (
     "stability",
     "stand",
     "steppers",
-    "wasm",
 )
 
 

@@ -16,11 +16,10 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.output import markdown, write_csv
+from benchmarks.output import folder_of, markdown, write_json
 from lavender import motion
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
-from lavender.errors import InputError
 from lavender.motion.error import SAME
 from lavender.problem import Problem
 from lavender.registry import available
@@ -195,14 +194,13 @@ def table(found: Sequence[Crossing]) -> str:
     "--every", type=click.IntRange(1), default=3, show_default=True, help="Search one step of these."
 )
 @click.option("--sweeps", type=click.IntRange(4, 64), default=16, show_default=True, help="Of the engine.")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for branches.csv.")
+@click.option("--out", type=click.Path(path_type=Path), help="JSON of the steps.")
 def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
     """Whether a warm-started engine stays on one branch where a step has several motions.
 
     Six scenes whose bodies are pushed in directions of their own.
     """
-    if out is not None and not out.is_dir():
-        raise InputError(f"--out {out}: there is no such folder")
+    folder_of(out)
     found: list[Crossing] = []
     for name, parameters, speed in RUNS:
         own = follow(name, speed, steps=steps, every=every, sweeps=sweeps, **parameters)
@@ -210,4 +208,4 @@ def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
         click.echo(f"{own[0].run if own else name}: {len(own)} steps", err=True)
     click.echo(table(found))
     if out is not None:
-        write_csv(out / "branches.csv", found)
+        write_json(out, found)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import click
 import numpy as np
 
-from benchmarks.output import markdown, write_csv
+from benchmarks.output import folder_of, markdown, write_json
 from lavender import motion
 from lavender.bench import resolve, structure_of
 from lavender.cones import ROW
@@ -181,8 +181,20 @@ def is_searched(problem: Problem, rows: int) -> bool:
     return 0 < problem.m <= rows and bool(available(problem))
 
 
-def calibration(found: Sequence[Sample]) -> list[tuple[str, int, float, float, float, str]]:
-    """Motion error over residual by structure and of all: (structure, iterates, median, 95 %, largest, where)."""
+@dataclass(frozen=True)
+class Calibration:
+    """Motion error over residual of some iterates."""
+
+    structure: str
+    iterates: int
+    median: float
+    high: float  # 95 % are below
+    largest: float
+    where: str  # the largest
+
+
+def calibration(found: Sequence[Sample]) -> list[Calibration]:
+    """Motion error over residual by structure, by law and of all."""
     groups: dict[str, list[Sample]] = {}
     for sample in found:
         for word in dict.fromkeys((*sample.structure.split(" + "), f"law {sample.law}", "all")):
@@ -192,17 +204,11 @@ def calibration(found: Sequence[Sample]) -> list[tuple[str, int, float, float, f
         ratio = np.array([s.motion / s.relative for s in group])
         worst = group[int(np.argmax(ratio))]
         where = f"{worst.case}, {worst.solver} {worst.iterations}"
-        rows.append(
-            (
-                word,
-                len(group),
-                float(np.median(ratio)),
-                float(np.quantile(ratio, 0.95)),
-                float(ratio.max()),
-                where,
-            )
-        )
-    return sorted(rows, key=lambda row: (row[0] == "all", row[0].startswith("law "), -row[1]))
+        median, high = float(np.median(ratio)), float(np.quantile(ratio, 0.95))
+        rows.append(Calibration(word, len(group), median, high, float(ratio.max()), where))
+    return sorted(
+        rows, key=lambda row: (row.structure == "all", row.structure.startswith("law "), -row.iterates)
+    )
 
 
 def predictors(found: Sequence[Sample]) -> list[tuple[str, int, float, float]]:
@@ -225,32 +231,25 @@ def predictors(found: Sequence[Sample]) -> list[tuple[str, int, float, float]]:
 
 def table(found: Sequence[Sample]) -> str:
     """The calibration as markdown."""
+    heads = ("structure", "iterates", "median", "95 % below", "largest", "where")
+    rows = [
+        (c.structure, c.iterates, f"{c.median:.2g}", f"{c.high:.2g}", f"{c.largest:.2g}", c.where)
+        for c in calibration(found)
+    ]
+    how = "spread (decades, one standard deviation)"
     lines = [
-        markdown(
-            ("structure", "iterates", "median", "95 % below", "largest", "where"),
-            [
-                (word, n, f"{median:.2g}", f"{high:.2g}", f"{most:.2g}", where)
-                for word, n, median, high, most, where in calibration(found)
-            ],
-        ),
+        markdown(heads, rows),
         "",
         markdown(
-            (
-                "residual",
-                "iterates",
-                "median factor to the motion error",
-                "spread (decades, one standard deviation)",
-            ),
+            ("residual", "iterates", "median factor to the motion error", how),
             [(name, n, f"{median:.2g}", f"{spread:.2f}") for name, n, median, spread in predictors(found)],
         ),
     ]
     bounded = [s for s in found if math.isfinite(s.bound) and s.found > 0.0]
     if bounded:
         ratio = np.array([s.bound / s.found for s in bounded])
-        lines += [
-            "",
-            f"Bound / motion error: {len(ratio)} iterates, median {np.median(ratio):.3g}, largest {ratio.max():.3g}.",
-        ]
+        said = f"{len(ratio)} iterates, median {np.median(ratio):.3g}, largest {ratio.max():.3g}"
+        lines += ["", f"Bound / motion error: {said}."]
     return "\n".join(lines)
 
 
@@ -336,21 +335,15 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
     "--rows", type=click.IntRange(1), default=3000, show_default=True, help="Leave larger problems out."
 )
 @click.option(
-    "--calibrate/--no-calibrate", default=True, show_default=True, help="Residual against motion error."
-)
-@click.option(
-    "--search/--no-search", default=True, show_default=True, help="Several motions of each problem."
-)
-@click.option(
     "--figure", "picture", type=click.Path(path_type=Path), help="Residual against motion error, drawn."
 )
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for samples.csv and motions.csv.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="JSON of the searches, and of the iterates as `samples`."
+)
 def command(
     files: tuple[str, ...],
     runs: int,
     rows: int,
-    calibrate: bool,
-    search: bool,
     picture: Path | None,
     out: Path | None,
 ) -> None:
@@ -358,10 +351,7 @@ def command(
 
     On FILES, or on the default set of the suite.
     """
-    if out is not None and not out.is_dir():
-        raise InputError(f"--out {out}: there is no such folder")
-    if picture is not None and not calibrate:
-        raise InputError("--figure draws the calibration; leave out --no-calibrate")
+    folder_of(out)
     seen: list[Sample] = []
     found: list[Branches] = []
     left = 0
@@ -371,13 +361,9 @@ def command(
             left += 1
             continue
         structure = " + ".join(structure_of(problem))
-        if search:
-            found.append(branches(item.name, problem, structure, runs))
-            click.echo(
-                f"{item.name}: {found[-1].motions} motions, {found[-1].spread:.2g} m/s apart", err=True
-            )
-        if calibrate:
-            seen += samples(item.name, problem, structure)
+        found.append(branches(item.name, problem, structure, runs))
+        click.echo(f"{item.name}: {found[-1].motions} motions, {found[-1].spread:.2g} m/s apart", err=True)
+        seen += samples(item.name, problem, structure)
         item.forget()
     if seen:
         click.echo(table(seen))
@@ -388,5 +374,4 @@ def command(
     if picture is not None:
         figure(seen, picture)
     if out is not None:
-        write_csv(out / "samples.csv", seen)
-        write_csv(out / "motions.csv", found)
+        write_json(out, found, samples=[asdict(sample) for sample in seen])

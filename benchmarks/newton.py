@@ -88,18 +88,17 @@ def anything(_p: Problem) -> bool:
     return True
 
 
-_SOLVE = systems.System._solve
+_BEGUN = systems.System.__init__
 
 
 def _without(*phases: str) -> tuple[Any, str, Any]:
     """Newton's method leaves these out."""
 
-    def solve(self: Any, *args: Any) -> Any:
-        made = _SOLVE(self, *args)
-        made.without = sum(PHASES[name] for name in phases)
-        return made
+    def begin(self: Any, problem: Problem, solve: Any) -> None:
+        _BEGUN(self, problem, solve)
+        solve.without = sum(PHASES[name] for name in phases)
 
-    return systems.System, "_solve", solve
+    return systems.System, "__init__", begin
 
 
 def _singular(*_: Any, **_kwargs: Any) -> Any:

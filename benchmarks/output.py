@@ -1,25 +1,26 @@
-"""Tables as markdown, lines as JSON or CSV: for every benchmark."""
+"""Tables as markdown, lines as JSON: for every benchmark."""
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from lavender.bench import machine
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically, write_text
+from lavender.io.stored import write_text
 
-__all__ = ["folder_of", "markdown", "write_csv", "write_json"]
+__all__ = ["folder_of", "markdown", "write_json"]
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
+    lines = [
+        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in line) + " |" for line in (head, *rows)
+    ]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
 def folder_of(out: Path | None) -> Path | None:
@@ -34,17 +35,3 @@ def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:
     rows = [line if isinstance(line, dict) else asdict(line) for line in lines]
     more = {"cpu": machine.cpu_name(), "versions": machine.versions(), **more, "lines": rows}
     write_text(path, json.dumps(more, indent=1) + "\n")
-
-
-def write_csv(path: Path, lines: Iterable[Any]) -> None:
-    """One line for each dataclass, floats to their last digit."""
-    entries = list(lines)
-
-    def write(part: Path) -> None:
-        with part.open("w", newline="", encoding="utf-8") as stream:
-            to = csv.writer(stream)
-            if entries:
-                to.writerow([f.name for f in fields(entries[0])])
-            to.writerows([*asdict(entry).values()] for entry in entries)
-
-    write_atomically(path, write)

@@ -13,6 +13,7 @@ import os
 import shutil
 import tempfile
 import threading
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -46,6 +47,34 @@ PARTS = {
 }
 
 
+@contextmanager
+def opened(address, **options):
+    """A page of Chromium, without a window, on what this checkout writes; `options` of `new_page`.
+
+    Raises
+    ------
+    SolverUnavailable
+        No Chromium.
+    """
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if browser_path is None:
+        raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
+        pages.write_page(Path(folder), print)
+        server = pages.server(Path(folder))
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        # Containers and root have no user namespaces to build the sandbox from.
+        browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
+        page = browser.new_page(**options)
+        page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
+        page.wait_for_selector("html[data-ready=true]")
+        page.wait_for_function("!lavender.waiting")
+        yield page
+        browser.close()
+        server.shutdown()
+
+
 def spent(session):
     """Processor time of the main thread so far [ms]."""
     found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
@@ -62,54 +91,40 @@ def cpu(page, session, code, times):
     return (spent(session) - before) / times
 
 
+def measured(page, seconds):
+    """Frames and simulated seconds a second, and milliseconds of each part of a frame, as text."""
+    page.wait_for_function("lavender.steps > 10")
+    session = page.context.new_cdp_session(page)
+    session.send("Performance.enable", {"timeDomain": "threadTicks"})
+    before = spent(session)
+    page.evaluate(COUNT)
+    page.wait_for_timeout(1000 * seconds)
+    found = page.evaluate("() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})")
+    thread = spent(session) - before
+    dt = page.evaluate("lavender.scene.dt")
+    page.evaluate("lavender.play(false)")
+    parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
+    parts["watching"] = max(parts["watching"] - parts["steps"], 0.0) / 8
+    parts["the rest"] /= 8
+    parts["script"] = sum(parts.values())
+    parts["main thread"] = thread / found["frames"]
+    passed = found["passed"] / 1000
+    return (
+        f"{found['frames'] / passed:.1f}",
+        f"{(found['to'] - found['from']) * dt / passed:.2f}",
+        *(f"{ms:.2f}" for ms in parts.values()),
+    )
+
+
 @click.command("page")
 @click.argument("addresses", nargs=-1, metavar="[ADDRESS]...")
 @click.option("--seconds", default=8.0, show_default=True)
 def command(addresses, seconds):
     """Frames a second of the page that runs the kernels, and what one frame costs, in Chromium."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-    if browser_path is None:
-        raise SolverUnavailable(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
     rows = []
-    with tempfile.TemporaryDirectory() as folder, sync_playwright() as p:
-        pages.write_page(Path(folder), print)
-        server = pages.server(Path(folder))
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        browser = p.chromium.launch(executable_path=browser_path, args=["--no-sandbox"])
-        for address in addresses or ADDRESSES:
-            page = browser.new_page(viewport={"width": 1280, "height": 1000})
-            page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{address}")
-            page.wait_for_selector("html[data-ready=true]")
-            page.wait_for_function("!lavender.waiting && lavender.steps > 10")
-            session = page.context.new_cdp_session(page)
-            session.send("Performance.enable", {"timeDomain": "threadTicks"})
-            before = spent(session)
-            page.evaluate(COUNT)
-            page.wait_for_timeout(1000 * seconds)
-            found = page.evaluate(
-                "() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})"
-            )
-            thread = spent(session) - before
-            dt = page.evaluate("lavender.scene.dt")
-            page.evaluate("lavender.play(false)")
-            parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
-            parts["watching"] = max(parts["watching"] - parts["steps"], 0.0) / 8
-            parts["the rest"] /= 8
-            parts["script"] = sum(parts.values())
-            parts["main thread"] = thread / found["frames"]
-            passed = found["passed"] / 1000
-            rows.append(
-                [
-                    address.split("&speed")[0],
-                    f"{found['frames'] / passed:.1f}",
-                    f"{(found['to'] - found['from']) * dt / passed:.2f}",
-                    *(f"{ms:.2f}" for ms in parts.values()),
-                ]
-            )
-            page.close()
-        browser.close()
-        server.shutdown()
+    for address in addresses or ADDRESSES:
+        with opened(address, viewport={"width": 1280, "height": 1000}) as page:
+            rows.append([address.split("&speed")[0], *measured(page, seconds)])
     head = (
         "address",
         "frames/s",

@@ -27,6 +27,7 @@ from lavender import solve
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
 from lavender.engine import Simulation
+from lavender.phenomena.engines import engine
 from lavender.problem import Problem
 from lavender.scene import Scene
 
@@ -175,40 +176,25 @@ def drag(turned: float) -> Iterator[tuple[str, float]]:
         yield f"lavender, {shape}", float(np.linalg.norm(observation["velocities"][1, :2]))
     gravity = slab(turned).parameters.gravity
     if find_spec("pybullet") is not None:
-        yield from _bullet(gravity, steps)
+        yield from _bullet(turned, steps)
     if find_spec("dartpy") is not None:
         yield from _dart(gravity, steps)
 
 
-def _bullet(gravity: tuple[float, float, float], steps: int) -> Iterator[tuple[str, float]]:
+def _bullet(turned: float, steps: int) -> Iterator[tuple[str, float]]:
     import pybullet as bullet
 
     kinds = [("sweeps, its cone", 1, "SI"), ("sweeps, its pyramid", 0, "SI")]
     kinds += [(f"{name.lower()}, its pyramid", 0, name) for name in ("PGS", "DANTZIG")]
     for name, cone, kind in kinds:
-        at = bullet.connect(bullet.DIRECT)
-        bullet.setGravity(*gravity, physicsClientId=at)
-        bullet.setTimeStep(1.0 / 120.0, physicsClientId=at)
+        made: Any = engine("bullet", slab(turned), sweeps=100, dt=1.0 / 120.0)
         bullet.setPhysicsEngineParameter(
-            enableConeFriction=cone, numSolverIterations=100, physicsClientId=at,
-            constraintSolverType=getattr(bullet, f"CONSTRAINT_SOLVER_LCP_{kind}"),
+            enableConeFriction=cone, constraintSolverType=getattr(bullet, f"CONSTRAINT_SOLVER_LCP_{kind}"),
+            **made.at,
         )  # fmt: skip
-        ground = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=at)
-        box = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=(0.5, 0.5, 0.1), physicsClientId=at)
-        for body in (
-            bullet.createMultiBody(0, ground, physicsClientId=at),
-            bullet.createMultiBody(200.0, box, basePosition=(0, 0, 0.1), physicsClientId=at),
-        ):
-            bullet.changeDynamics(
-                body, -1, lateralFriction=np.sqrt(MU), linearDamping=0, angularDamping=0, physicsClientId=at
-            )
-        for _ in range(steps):
-            bullet.stepSimulation(physicsClientId=at)
-        yield (
-            f"Bullet, {name}",
-            float(np.linalg.norm(bullet.getBaseVelocity(body, physicsClientId=at)[0][:2])),
-        )
-        bullet.disconnect(physicsClientId=at)
+        made.advance(steps)
+        yield f"Bullet, {name}", float(np.linalg.norm(made.state()[2][1, :2]))
+        made.close()
 
 
 def _dart(gravity: tuple[float, float, float], steps: int) -> Iterator[tuple[str, float]]:

@@ -233,19 +233,36 @@ def figure(path: str | PathLike[str]) -> None:
     write_figure(canvas, path)
 
 
-def numbers(
-    towers: Sequence[tuple[int, int]] = TOWERS,
-) -> list[tuple[int, int, str, float, float, float, float, float]]:
-    """Per tower and order: kappa, frequency [Hz] at 1/60 and 1/240 s, largest |z| of a substep with gains 0 and 1."""
+@dataclass(frozen=True)
+class Tower:
+    """One tower in one order."""
+
+    boxes: int
+    sweeps: int
+    order: str
+    kappa: float
+    hertz: float  # Hz, of the slowest mode in substeps of 1/60 s
+    fine: float  # Hz, of 1/240 s
+    still: float  # largest |z| of a substep of 1/60 s with gain 0
+    whole: float  # with gain 1
+
+
+def numbers(towers: Sequence[tuple[int, int]] = TOWERS) -> list[Tower]:
+    """Every tower (boxes, sweeps) in every order."""
     found = []
     for n, sweeps in towers:
         for order in ORDERS:
             still = modes(n, sweeps, 1 / 60, order=order)
             fine = modes(n, sweeps, 1 / 240, order=order)
             whole = modes(n, sweeps, 1 / 60, order=order, gain=1.0)
-            most = [np.abs(m.z[0]) ** (1 / m.substeps) for m in (still, whole)]
+            most = [float(np.abs(m.z[0]) ** (1 / m.substeps)) for m in (still, whole)]
             kappa, hertz = slowest(still)
-            found.append((n, sweeps, order, kappa, hertz, slowest(fine)[1], *most))
+            found.append(
+                Tower(
+                    boxes=n, sweeps=sweeps, order=order, kappa=kappa, hertz=hertz, fine=slowest(fine)[1],
+                    still=most[0], whole=most[1],
+                )
+            )  # fmt: skip
     return found
 
 
@@ -254,11 +271,13 @@ def numbers(
 def command(picture: str | None) -> None:
     """Why towers fall on few sweeps: eigenvalues of one substep about rest."""
     head = ("boxes", "sweeps", "order", "kappa", "Hz, 1/60 s", "Hz, 1/240 s", "|z|, g = 0", "|z|, g = 1")
-    forms = ("{:.2e}", "{:.2f}", "{:.2f}", "{:.6f}", "{:.4f}")
     cells = [
-        (n, sweeps, order, *(form.format(x) for form, x in zip(forms, values, strict=True)))
-        for n, sweeps, order, *values in numbers()
-    ]
+        (
+            t.boxes, t.sweeps, t.order, f"{t.kappa:.2e}", f"{t.hertz:.2f}", f"{t.fine:.2f}", f"{t.still:.6f}",
+            f"{t.whole:.4f}",
+        )
+        for t in numbers()
+    ]  # fmt: skip
     click.echo(markdown(head, cells))
     for n, sweeps in TOWERS[1:]:
         gain, (kappa, _) = critical_gain(n, sweeps, 1 / 60, digits=1), slowest(modes(n, sweeps, 1 / 60))

@@ -15,14 +15,6 @@ BARS = re.compile(r"\|")
 LINKS = re.compile(r"(?<=\w)_(?![\w`])")
 
 
-def table(head, rows):
-    """A markdown table."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join(
-        lines + ["| " + " | ".join(str(c).replace("|", "\\|") for c in row) + " |" for row in rows]
-    )
-
-
 def blocks(text):
     """(is_formula, lines) in turn, of a docstring without its common indentation."""
     found = []

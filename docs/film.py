@@ -9,17 +9,14 @@ one palette for all frames. A file above `MOST` bytes is not written.
 
 import argparse
 import io
-import os
-import shutil
 import sys
-import tempfile
-import threading
 from pathlib import Path
 
 from PIL import Image
-from playwright.sync_api import sync_playwright
 
-from lavender.web import pages
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # benchmarks
+
+from benchmarks.page import opened
 
 MOST = 1_000_000  # bytes
 FRAMES = 12  # a second
@@ -30,40 +27,24 @@ OUT = Path(__file__).resolve().parent / "static" / "web.gif"
 
 def frames(preset, seconds, pace):
     """PIL images, `FRAMES` a second; `pace` simulated seconds in each."""
-    names = ("chromium", "chromium-browser", "google-chrome")
-    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-    if found is None:
-        sys.exit(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
-    with tempfile.TemporaryDirectory() as folder:
-        pages.write_page(Path(folder), print)
-        server = pages.server(Path(folder))
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with sync_playwright() as p:
-            # Containers and root have no user namespaces to build the sandbox from.
-            browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])
-            options = {"viewport": {"width": WIDTH, "height": 900}, "color_scheme": "light"}
-            page = browser.new_page(**options, reduced_motion="reduce")  # nothing moves but by the frame
-            page.goto(f"http://127.0.0.1:{server.server_address[1]}/#{preset}")
-            page.wait_for_selector("html[data-ready=true]")
-            page.wait_for_function("!lavender.waiting")
-            page.evaluate("lavender.play(false)")
-            first = page.locator("#caption").bounding_box()
-            last = page.locator(".side canvas").last.bounding_box()
-            clip = {
-                "x": 0,
-                "y": first["y"] - 6,
-                "width": WIDTH,
-                "height": last["y"] + last["height"] + 10 - first["y"],
-            }
-            dt = page.evaluate("lavender.scene.dt")
-            steps = 0
-            for k in range(int(seconds * FRAMES)):
-                due = round(k * pace / FRAMES / dt)
-                page.evaluate(f"lavender.advance({due - steps})")
-                steps = due
-                yield Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
-            browser.close()
-        server.shutdown()
+    options = {"viewport": {"width": WIDTH, "height": 900}, "color_scheme": "light"}
+    with opened(preset, **options, reduced_motion="reduce") as page:  # nothing moves but by the frame
+        page.evaluate("lavender.play(false)")
+        first = page.locator("#caption").bounding_box()
+        last = page.locator(".side canvas").last.bounding_box()
+        clip = {
+            "x": 0,
+            "y": first["y"] - 6,
+            "width": WIDTH,
+            "height": last["y"] + last["height"] + 10 - first["y"],
+        }
+        dt = page.evaluate("lavender.scene.dt")
+        steps = 0
+        for k in range(int(seconds * FRAMES)):
+            due = round(k * pace / FRAMES / dt)
+            page.evaluate(f"lavender.advance({due - steps})")
+            steps = due
+            yield Image.open(io.BytesIO(page.screenshot(clip=clip))).convert("RGB")
 
 
 def write(out, images):

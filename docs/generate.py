@@ -25,22 +25,21 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 import docstrings
 import matplotlib
 import tried
-from docstrings import table
 
 import lavender as lv
 import lavender_ext
 from benchmarks import motions, stability
+from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
 from lavender.bench import level_name, structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
-from lavender.report import advice, claims, contents, geometric_means, reaches
+from lavender.report import advice, contents, geometric_means, reaches
 from lavender.report.curves import figures as report_figures
 from lavender.report.curves import work_precision
 from lavender.report.draw import matplotlib_panels
 from lavender.report.page import page as report_page
 from lavender.report.style import looks
-from lavender.report.tables import SHIFT
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.text import residual, seconds
 from lavender.scene.gallery import SCENES
@@ -186,7 +185,7 @@ def abilities(spec):
     }
     yes = {
         "impulse": "starts from `impulse=`",
-        "order": "`order=`, `ground=`",
+        "order": "`order=`",
         "seed": "`seed=`",
         "threads": '`threads=` (with `order="colored"`)',
         "callback": "`callback=`",
@@ -366,7 +365,7 @@ def by_structure(records):
 
 
 def measured_page(site, records, figures):
-    """Advice by structure from the records of this build, and the curves behind it."""
+    """Advice by structure and law from the records of this build, the curves behind it, and their report."""
     run = next(iter(records.runs.values()))
     structures = by_structure(records)
     site.write(
@@ -375,19 +374,7 @@ def measured_page(site, records, figures):
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))
-    parts = [
-        "# Measured in this build",
-        (
-            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
-            f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
-            f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\n"
-            "a solve. It is a glance, not a benchmark: `lavender report` on your own problems says more."
-        ),
-        "## By structure",
-        structures.replace("REPORT", "report.html"),
-        "## By law",
-    ]
-    first = []
+    rows, drawn = [], []
     for law, by_level in geometric_means(records).items():
         cells = []
         for level in LEVELS:
@@ -396,48 +383,26 @@ def measured_page(site, records, figures):
             cells.append(
                 "<br>".join(f"**{name}** {seconds(t)}" for t, name in names[:3]) if most else "nobody"
             )
-        first.append((LAW_NAMES.get(law, law), *cells))
-        rows = [
-            (
-                solver,
-                *(
-                    f"{seconds(by_level[x][solver][0])} ({by_level[x][solver][1]}/{by_level[x][solver][2]})"
-                    for x in LEVELS
-                ),
-            )
-            for solver in by_level[LEVELS[0]]
-        ]
-        parts += [
-            f"### {LAW_NAMES.get(law, law).capitalize()}",
-            (
-                f"Geometric means of time, shifted by {seconds(SHIFT)}, of the solvers that take "
-                "every case "
-                f"of the class; a miss\ncosts {seconds(PLAN.time_limit)}. In brackets, cases that arrived."
-            ),
-            table(("solver", *(f"to {level_name(x)}" for x in LEVELS)), rows),
-        ]
+        rows.append((LAW_NAMES[law], *cells))
         if law in figures:
             site.write(f"figures/all-{law}.svg", figures[law])
-            parts.append(image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}"))
-    rows = [
-        (c.solver, c.claims, c.wrong, f"{c.reached} of {c.asked}")
-        for c in sorted(claims(records), key=lambda c: c.solver)
-    ]
-    parts += [
-        "## Claims",
+            shot = image(f"figures/all-{law}.svg", f"error against time on {LAW_NAMES[law]}")
+            drawn += [f"## {LAW_NAMES[law].capitalize()}", shot]
+    parts = [
+        "# Measured in this build",
         (
-            "How often a solver said that it had solved, how often the judge disagrees, and how many of the levels "
-            "asked for it reached."
+            f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
+            f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
+            f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\n"
+            "a solve. It is a glance, not a benchmark: `lavender report` on your own problems says more. Every run, "
+            "mean and claim, with the cases, is in\n[the report](report.html) of these records."
         ),
-        table(("solver", "claims", "wrong", "levels reached"), rows),
-        "## Cases",
-        table(
-            ("case", "law", "rows", "why it is there"),
-            [(f"`{i.case}`", i.law, i.rows, i.reason) for i in records.cases.values()],
-        ),
+        "## By structure",
+        structures.replace("REPORT", "report.html"),
+        *drawn,
     ]
     site.write("measured.md", "\n\n".join(parts))
-    by_law = table(("", *(f"to {level_name(x)}" for x in LEVELS)), first)
+    by_law = table(("", *(f"to {level_name(x)}" for x in LEVELS)), rows)
     site.write("parts/advice_by_law.md", f":::{{container}} wide\n{by_law}\n:::")
 
 
@@ -564,75 +529,31 @@ def stability_part(site):
 
 
 def api_page(site):
-    """Public names by room."""
-    rooms = {
-        "Problems": ("Problem", "Rows", "Cones"),
-        "Solving": ("solve", "prepare", "Solution", "Status", "Claim"),
-        "Judging": ("residual", "Residual", "cross_check", "CrossCheck"),
-        "Moving": ("motion_error", "MotionError", "motions", "Motions"),
-        "Registry": ("available", "known", "get", "register", "SolverSpec"),
-        "Simulating": ("Scene", "Simulation", "Snapshot"),
-        "Errors": (
-            "LavenderError",
-            "InputError",
-            "UnknownName",
-            "SolverUnavailable",
-            "CapabilityError",
-            "InUse",
-            "SolveFailed",
-        ),
-    }
-    listed = {name for names in rooms.values() for name in names}
-    rest = sorted(
-        name for name in set(lv.__all__) - listed if callable(getattr(lv, name))
-    )  # no constants, no rooms
-    if rest:
-        rooms["More"] = tuple(rest)
+    """Public names by room: those of lavender itself, then those of its rooms."""
+    rooms = {}
+    for name in sorted(lv.__all__):
+        thing = getattr(lv, name)
+        if callable(thing):  # no constants, no rooms
+            rooms.setdefault(thing.__module__.split(".")[1], []).append((lv, name))
+    for room in ("io", "suite", "bench", "report", "motion", "measures", "certificates"):
+        held = importlib.import_module(f"lavender.{room}")
+        own = {n: getattr(held, n) for n in sorted(held.__all__) if n not in suite.FAMILIES}
+        rooms[f"lavender.{room}"] = [
+            (held, n) for n, thing in own.items() if callable(thing) and getattr(lv, n, None) is not thing
+        ]
     parts = [
         "# Python interface",
-        "Everything below is in `lavender`; arrays are float64 and C-contiguous, shapes and units as said.",
+        "Arrays are float64 and C-contiguous, shapes and units as said. First what is in `lavender`, by room.",
     ]
     for room, names in rooms.items():
         parts.append(f"## {room}")
-        for name in names:
-            thing = getattr(lv, name, None)
-            if thing is None:
-                continue
-            if inspect.ismodule(thing):
-                parts.append(f"```{{eval-rst}}\n.. automodule:: {thing.__name__}\n```")
-            elif not inspect.isclass(thing):
-                parts.append(f"```{{eval-rst}}\n.. autofunction:: lavender.{name}\n```")
-            else:
-                members = "\n   :members:" if not issubclass(thing, (Exception, lv.Status)) else ""
-                parts.append(f"```{{eval-rst}}\n.. autoclass:: lavender.{name}{members}\n```")
-    parts.append("## Files, cases, measurements, reports")
-    public = {
-        "lavender.io": ("load", "save", "read"),
-        "lavender.suite": ("case", "cases", "families", "Case", "Reference"),
-        "lavender.bench": tuple(sorted(lv.bench.__all__, key=str.lower)),
-        "lavender.report": tuple(lv.report.__all__),
-        "lavender.motion": (
-            "reference",
-            "adopt",
-            "branch",
-            "distance",
-            "uniqueness",
-            "Motion",
-            "Reference",
-            "Witness",
-        ),
-        "lavender.measures": ("natural_map", "qp_residual", "siconos_error"),
-        "lavender.certificates": ("check_certificate",),
-    }
-    for module, names in public.items():
-        parts.append(f"### {module}")
-        held = importlib.import_module(module)
-        for name in names:
-            if not hasattr(held, name):
-                continue
-            kind = "autoclass" if inspect.isclass(getattr(held, name)) else "autofunction"
-            members = "\n   :members:" if kind == "autoclass" else ""
-            parts.append(f"```{{eval-rst}}\n.. {kind}:: {module}.{name}{members}\n```")
+        for held, name in names:
+            thing = getattr(held, name)
+            kind, members = "autofunction", ""
+            if inspect.isclass(thing):
+                plain = issubclass(thing, (Exception, lv.Status))
+                kind, members = "autoclass", "" if plain else "\n   :members:"
+            parts.append(f"```{{eval-rst}}\n.. {kind}:: {held.__name__}.{name}{members}\n```")
     site.write("api.md", "\n\n".join(parts))
 
 

@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from docstrings import table
 
 import lavender as lv
+from benchmarks.output import markdown as table
 from lavender import registry, suite
 from lavender.bench import level_name
 from lavender.report.text import residual, seconds

@@ -64,25 +64,13 @@ def _exponent(x: FloatArray) -> int:
     return math.frexp(float(np.abs(x).max(initial=0.0)))[1]
 
 
-def _rims(problem: Problem, x: FloatArray) -> tuple[Any, Any, FloatArray, FloatArray, FloatArray]:
-    """Contact blocks and their normal rows; |x_t| over the tangents of each, |x_s| of its spin, |x_r| of what rolls."""
+def _rims(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
+    """Of what one bound holds together: its contact's normal row, the bound over the normal, and |x| of its rows."""
     c = problem.cones
-    contact = np.flatnonzero(c.kind != ROW)
-    first = c.ptr[contact]
-    block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-    place = np.arange(problem.m) - c.ptr[block]
-    rolling = c.rolling_rows
-
-    def size(at: Any) -> FloatArray:
-        big = np.zeros(c.n_blocks)  # over the largest, for squares alone vanish
-        np.maximum.at(big, block[at], np.abs(x[at]))
-        part = x[at] / np.where(big > 0.0, big, 1.0)[block[at]]
-        return np.asarray((big * np.sqrt(np.bincount(block[at], part**2, minlength=c.n_blocks)))[contact])
-
-    rim = size((place > 0) & (place <= c.n_together[block]))
-    roll = size((rolling[block] >= 0) & (place >= rolling[block] - c.ptr[block]))
-    spin = np.where(c.apart_rows[contact] >= 0, np.abs(x[c.apart_rows[contact]]), 0.0)
-    return contact, first, rim, spin, roll
+    parts, reach = list(c.parts()), c.reach
+    normal = c.ptr[np.array([i for i, _ in parts], int)]
+    bound = np.array([reach[part[0]] for _, part in parts])
+    return normal, bound, np.array([np.hypot.reduce(x[part]) for _, part in parts])
 
 
 def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
@@ -91,11 +79,12 @@ def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
     bound = np.where(z > 0.0, c.upper, c.lower)
     pull = np.zeros(problem.m)
     np.multiply(z, bound, out=pull, where=z != 0.0)
-    contact, first, rim, spin, roll = _rims(problem, z)
+    normal, limit, size = _rims(problem, z)
+    most, first = z.copy(), c.ptr[:-1][c.kind != ROW]
+    np.add.at(most, normal, limit * size)
     pull[np.repeat(c.kind != ROW, np.diff(c.ptr))] = 0.0
-    most = z[first] + c.mu[contact] * (rim + c.patch_radius[contact] * spin) + c.rolling[contact] * roll
     # What pulls along tangents alone is beyond its own zero already; against a normal it may be rounding.
-    pull[first] = np.where(most > np.where(z[first] == 0.0, 0.0, zero[first]), np.inf, 0.0)
+    pull[first] = np.where(most[first] > np.where(z[first] == 0.0, 0.0, zero[first]), np.inf, 0.0)
     return pull
 
 
@@ -107,14 +96,15 @@ def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
-    contact, first, rim, spin, roll = _rims(problem, y)
-    limit = c.mu[contact] * y[first] * (1 + 1e-12)
+    normal, limit, size = _rims(problem, y)
     if problem.law == "coulomb":
-        across = np.flatnonzero((rim > 0.0) | (spin > 0.0) | (roll > 0.0))
+        across = normal[size > 0.0]
         if len(across):
-            return f"y is not along the normal of {problem.row_name(int(first[across[0]]))}, as Coulomb friction needs"
-    beyond = (spin > limit * c.patch_radius[contact]) | (roll > c.rolling[contact] * y[first] * (1 + 1e-12))
-    out = np.flatnonzero((y[first] < 0.0) | (rim > limit) | beyond)
+            return (
+                f"y is not along the normal of {problem.row_name(int(across[0]))}, as Coulomb friction needs"
+            )
+    first = c.ptr[:-1][c.kind != ROW]
+    out = np.concatenate([first[y[first] < 0.0], normal[size > limit * y[normal] * (1 + 1e-12)]])
     if len(out):
-        return f"y leaves the cone of {problem.row_name(int(first[out[0]]))}"
+        return f"y leaves the cone of {problem.row_name(int(out.min()))}"
     return None

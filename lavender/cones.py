@@ -18,12 +18,21 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, as_array, check_not_nan, check_not_negative, equal
+from lavender._arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    check_not_nan,
+    check_not_negative,
+    equal,
+    whole_number,
+)
 from lavender.errors import InputError, UnknownName
 from lavender_ext.core import blocks as kernels
 
@@ -183,10 +192,8 @@ class Cones:
             normal = ptr[:-1][kind != ROW]
             lower[normal] = 0.0
             lower.flags.writeable = upper.flags.writeable = False
-        mu = as_array("mu", self.mu, (k,))
-        check_not_negative("mu", mu)
-        radius = as_array("patch_radius", self.patch_radius, (k,), unit="m")
-        check_not_negative("patch_radius", radius)
+        mu = _not_negative("mu", self.mu, k)
+        radius = _not_negative("patch_radius", self.patch_radius, k, "m")
         wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
         bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & wide)
         if len(bad):
@@ -197,8 +204,7 @@ class Cones:
         with np.errstate(over="ignore"):
             second = np.where(np.isin(kind, (CONTACT_BOX, CONTACT_ELLIPSE)), mu * radius, 0.0)
         as_array("mu_2", second, (k,))
-        rolling = as_array("rolling", self.rolling, (k,), unit="m")
-        check_not_negative("rolling", rolling)
+        rolling = _not_negative("rolling", self.rolling, k, "m")
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
@@ -267,56 +273,28 @@ class Cones:
         >>> skates.shaped("box") == lv.Cones.contacts([(0.02, 0.8)] * 4, shape="box")
         True
         """
-        if (
-            isinstance(tangents, bool)
-            or not isinstance(tangents, (int, np.integer))
-            or not 0 <= tangents <= 5
-        ):
-            raise InputError(f"tangents is {tangents!r}; a whole number from 0 to 5 is needed")
+        if type(tangents) is not int or not 0 <= tangents <= 5:
+            tangents = whole_number("tangents", tangents, 0, 5)
+        box, pair = check_shape("shape", shape) == "box", type(mu) is not float and np.ndim(mu) > 1
+        if patch_radius is not None or rolling is not None or tangents != 2:
+            _check_parts(mu, tangents, patch_radius is not None, rolling is not None, box, pair)
         ratio, sides = None, 0
-        if check_shape("shape", shape) == "box":
-            if patch_radius is not None or rolling is not None or tangents > 2:
-                raise InputError(
-                    "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
-                    "out, or give them as a disk's (shape='disk')"
-                )
-            if tangents == 2:
-                sides = CONTACT_BOX
-                mu, ratio = _sides(mu)
-        elif type(mu) is not float and np.ndim(mu) > 1:
-            if patch_radius is not None or rolling is not None or tangents != 2:
-                raise InputError(
-                    f"mu has shape {np.shape(mu)}; one for each of two tangents makes an ellipse, which bounds no spin "
-                    "and no rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
-                )
+        if box and tangents == 2:
+            sides = CONTACT_BOX
+            mu, ratio = _sides(mu)
+        elif pair and not box:
             mu, ratio = _axes(mu)
             sides = 0 if ratio is None else CONTACT_ELLIPSE
-        spin = patch_radius is not None
-        if tangents > 2 and spin:
-            raise InputError(
-                f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius"
-            )
-        if rolling is not None and tangents != 2:
-            raise InputError(
-                f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
-                + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
-            )
-        if count is not None and (
-            isinstance(count, bool) or not isinstance(count, (int, np.integer)) or count < 0
-        ):
-            raise InputError(f"count is {count!r}; a whole number of contacts is needed")
         if type(mu) is not float:
             mu = np.asarray(mu, float)
-        k = count if count is not None else len(mu) if isinstance(mu, np.ndarray) and mu.ndim else 1
+        given = len(mu) if isinstance(mu, np.ndarray) and mu.ndim else 1
+        k = given if count is None else whole_number("count", count)
         if type(mu) is not float or not 0.0 <= mu < np.inf:
-            mu = as_array("mu", mu, (k,))
-            check_not_negative("mu", mu)
+            mu = _not_negative("mu", mu, k)
         if patch_radius is not None:
-            patch_radius = as_array("patch_radius", patch_radius, (k,), unit="m")
-            check_not_negative("patch_radius", patch_radius)
+            patch_radius = _not_negative("patch_radius", patch_radius, k, "m")
         if rolling is not None:
-            rolling = as_array("rolling", rolling, (k,), unit="m")
-            check_not_negative("rolling", rolling)
+            rolling = _not_negative("rolling", rolling, k, "m")
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
         made = kernels.contacts(k, tangents, mu, patch_radius, rolling, sides)
@@ -464,6 +442,18 @@ class Cones:
         """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
         return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
 
+    def parts(self) -> Iterator[tuple[int, IntArray]]:
+        """(block, rows of it that one bound holds together): tangents, then spin or second side, then what rolls."""
+        tangents, apart, rolling = self.n_together, self.apart_rows, self.rolling_rows
+        for i in np.flatnonzero(self.kind != ROW).tolist():
+            first = self.ptr[i] + 1
+            if tangents[i]:
+                yield i, np.arange(first, first + tangents[i])
+            if apart[i] >= 0:
+                yield i, apart[i : i + 1]
+            if rolling[i] >= 0:
+                yield i, np.arange(rolling[i], rolling[i] + 2)
+
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
         if not isinstance(other, Cones):
@@ -483,6 +473,33 @@ class Cones:
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
         return type(self), self._blocks.arrays
+
+
+def _not_negative(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
+    array = as_array(name, value, (k,), unit=unit)
+    check_not_negative(name, array)
+    return array
+
+
+def _check_parts(mu: Any, tangents: int, spin: bool, rolls: bool, box: bool, pair: bool) -> None:
+    """Raise where no kind of contact has these rows together."""
+    if box and (spin or rolls or tangents > 2):
+        raise InputError(
+            "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
+            "out, or give them as a disk's (shape='disk')"
+        )
+    if pair and not box:
+        raise InputError(
+            f"mu has shape {np.shape(mu)}; one for each of two tangents makes an ellipse, which bounds no spin "
+            "and no rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
+        )
+    if tangents > 2 and spin:
+        raise InputError(f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius")
+    if rolls and tangents != 2:
+        raise InputError(
+            f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
+            + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
+        )
 
 
 def _fitting(kind: IntArray, size: IntArray) -> IntArray:

@@ -29,7 +29,7 @@ ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodi
 ASYMMETRY32 = 2.0**-16  # the same of an M in float32, of which the lower triangle is taken
 MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search
 FACTORS = 20  # of a matrix like M that the solves of a problem take: what an order that fills in costs
-LEAF = 8  # trees that are not taken apart any more
+LEAF = 8  # velocities or trees that are not taken apart any more
 MET = 100  # trees that meet a tree, in the mean, beyond which no order keeps J^T J sparse
 Compressed = tuple[IntArray, IntArray, FloatArray]
 
@@ -114,7 +114,7 @@ class Generalized:
                 raise InputError(f"{len(names)} names for {n} velocities; one for each is needed")
         put["v_free"], put["names"], put["order"] = v_free, names, None
         operator = kernels.Operator(*jac, *mass)
-        if operator.fill > 0 and operator.failed < 0 and _worth_ordering(operator.work, n):
+        if operator.fill > 0 and operator.failed < 0 and _worth_ordering(operator.work, len(mass[1])):
             order = _order(mass, n)
             other = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))
             if other.fill < operator.fill:
@@ -351,30 +351,30 @@ def _permuted_columns(jac: Compressed, order: IntArray) -> Compressed:
     return _arrays(rows, np.argsort(order)[indices], data, len(indptr) - 1)
 
 
-def _worth_ordering(work: float, n: int) -> bool:
+def _worth_ordering(work: float, entries: int) -> bool:
     """Whether factors of so many multiply-adds cost more than a better order takes to be found, ns.
 
-    Measured on trees given in the wrong order, 9, 27, 60, 100, 200 and 400 velocities: a search 0.24, 0.4, 0.9, 2.1, 7
-    and 31 ms; a multiply-add 2 ns. A robot of 9 velocities whose root slides in two directions fills in by one
-    entry.
+    Measured on trees given in the wrong order, of 9 to 800 velocities: a search and the factor in its order 0.2 ms and
+    0.13 us for each entry; a multiply-add 2 ns. A robot of 9 velocities whose root slides in two directions fills in
+    by one entry.
     """
-    return 2.0 * FACTORS * work > 2e5 + 7e3 * n + 170.0 * n * n
+    return 2.0 * FACTORS * work > 4e5 + 130.0 * entries
 
 
 def _order(mass: Compressed, n: int) -> IntArray:
-    """Velocity at each place, eliminated from the last: the order of least fill among those tried.
+    """Velocity at each place, eliminated from the last."""
+    indptr, indices, _ = mass
+    lower = sp.csr_array((np.ones(len(indices), np.int32), indices, indptr), shape=(n, n))
+    return _dissected(sp.csr_array(lower + lower.T))
 
-    Maximum cardinality search finds one without fill wherever there is one (Tarjan, Yannakakis 1984); reverse
-    Cuthill-McKee keeps the band of a mesh.
-    """
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-    indptr, indices, data = mass
-    lower = sp.csr_array((np.ones(len(data)), indices, indptr), shape=(n, n))
-    whole = sp.csr_array(lower + lower.T)
-    found = [_cardinality(whole, n), reverse_cuthill_mckee(whole, symmetric_mode=True).astype(np.int32)]
-    fills = [kernels.pattern_fill(*_permuted_lower(mass, order)[:2]) for order in found]
-    return found[int(np.argmin(fills))]
+def _dissected(graph: sp.csr_array) -> IntArray:
+    """Vertex at each place by nested dissection, separators first, since elimination begins at the last."""
+    graph.setdiag(0)
+    graph.eliminate_zeros()
+    graph.sort_indices()
+    order: IntArray = dissection(graph.indptr.astype(np.int32), graph.indices.astype(np.int32), LEAF)[::-1]
+    return order
 
 
 def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
@@ -398,10 +398,7 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     if np.sum(np.diff(on.indptr).astype(float) ** 2) > MET * len(roots):
         return None
     met = sp.csr_array(on.T @ on)
-    met.setdiag(0)
-    met.eliminate_zeros()
-    met.sort_indices()
-    first = dissection(met.indptr.astype(np.int32), met.indices.astype(np.int32), LEAF)[::-1]
+    first = _dissected(met)
     place = np.empty(len(roots), np.int64)
     place[first] = np.arange(len(roots))
     order = np.argsort(place[tree], kind="stable").astype(np.int32)
@@ -417,29 +414,3 @@ def _lower_of(graph: sp.csr_array, order: IntArray) -> tuple[IntArray, IntArray]
     lower = sp.csr_array(sp.tril(graph[order][:, order], -1) + sp.eye_array(n, dtype=graph.dtype))
     lower.sort_indices()
     return lower.indptr.astype(np.int32), lower.indices.astype(np.int32)
-
-
-def _cardinality(whole: sp.csr_array, n: int) -> IntArray:
-    # Next comes the velocity with the most neighbours among those that have come; buckets by their number.
-    weight = np.zeros(n, np.int64)
-    done = np.zeros(n, bool)
-    buckets: list[list[int]] = [list(range(n - 1, -1, -1))]
-    order = np.empty(n, np.int32)
-    top = 0
-    for place in range(n):
-        while True:
-            while not buckets[top]:
-                top -= 1
-            i = buckets[top].pop()
-            if not done[i] and weight[i] == top:
-                break
-        done[i] = True
-        order[place] = i
-        for j in whole.indices[whole.indptr[i] : whole.indptr[i + 1]]:
-            if not done[j]:
-                weight[j] += 1
-                if weight[j] == len(buckets):
-                    buckets.append([])
-                buckets[weight[j]].append(int(j))
-        top = min(top + 1, len(buckets) - 1)
-    return order

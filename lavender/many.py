@@ -19,7 +19,6 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
 from lavender.solve import check_budget, of_batch, solve, solve_small
-from lavender.solvers.newton_systems import general
 from lavender_ext.few.many import Batch
 
 __all__ = ["solve_many"]
@@ -120,7 +119,6 @@ def _batch(
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
     assert spec.few is not None
-    work = Batch(views, given, tol, spec.few.gate, general.ROOM)
-    work.run()
+    work = Batch(views, given, tol, spec.few.gate)
     seconds = (perf_counter() - begin) / max(1, len(at))
     work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)

@@ -19,7 +19,7 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import entry_points
 from typing import Any, Protocol
 
@@ -107,7 +107,7 @@ class SolverSpec:
     exact: bool = False  # finite or to rounding, not to tol
     resumable: bool = True
     impulse: bool = True  # a warm start changes what it does
-    order: bool = False  # takes order= and ground=
+    order: bool = False  # takes order=
     seed: bool = False  # takes seed=
     threads: bool = False  # takes threads=
     callback: bool = True  # takes callback=; needs resumable
@@ -153,10 +153,7 @@ class SolverSpec:
     @property
     def accepts(self) -> frozenset[str]:
         """Options beyond those of the front door."""
-        shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
-        return frozenset(self.options) | {
-            o for flag, names in shared.items() if getattr(self, flag) for o in names
-        }
+        return frozenset(self.options) | {o for o in ("order", "seed", "threads") if getattr(self, o)}
 
     def missing(self) -> str | None:
         """None when the solver can run here, else what to install."""
@@ -167,8 +164,16 @@ class SolverSpec:
             return None
         return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
 
+    @cached_property
+    def takes_all(self) -> bool:
+        """No problem is refused."""
+        kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.rolling
+        return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
+
     def refuses(self, problem: Problem) -> str | None:
         """None when the solver takes this problem, else the reason."""
+        if self.takes_all:
+            return None
         asked, problem = problem, problem.disk
         law = problem.law
         if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:

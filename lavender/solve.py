@@ -101,8 +101,7 @@ def solve(
         Wrong `impulse`, negative or NaN `tol`, `max_iter`, `time_limit`.
     """
     spec = get(solver)
-    plain = max_iter is None and time_limit is None and callback is None
-    if plain and spec.few is not None and spec.own and not (options or history):
+    if max_iter is None and time_limit is None and callback is None and not (history or options):
         made = solve_small(problem, spec, impulse, tol)
         if made is not None:
             return made
@@ -160,7 +159,7 @@ class Prepared:
         self._given, problem = problem, problem.disk
         for name in options:
             if name not in spec.accepts:
-                if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
+                if name in ("order", "seed", "threads") or name in FRONT_DOOR:
                     raise CapabilityError(
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"
@@ -170,10 +169,16 @@ class Prepared:
         self.options = dict(options)
         self.problem = problem
         self._lock = Lock()
-        self.solver = _make(spec, options)
-        self._set_up(problem, anew=True)
-        self.setup_time = perf_counter() - start
         self._fresh = True
+        if (
+            options or not spec.delegates
+        ):  # which prepares nothing: its own call for small problems comes first
+            self._begin()
+        self.setup_time = perf_counter() - start
+
+    def _begin(self) -> None:
+        self.solver = _make(self.spec, self.options)
+        self._set_up(self.problem, anew=True)
 
     def solve(
         self,
@@ -199,16 +204,16 @@ class Prepared:
                 "make another one for every thread (lavender.prepare)"
             )
         try:
-            plain = max_iter is None and time_limit is None and callback is None
+            if self.spec.delegates and not self.options:
+                if max_iter is None and time_limit is None and callback is None and not history:
+                    made = solve_small(self._given if problem is None else problem, self.spec, impulse, tol)
+                    if made is not None:
+                        return made
+                if self.solver is None:
+                    self._begin()
             tol, max_iter, time_limit = check_budget(self.spec, tol, max_iter, time_limit)
             _check_records(self.spec, history, callback)
             self._refresh(problem)
-            if plain and self.spec.delegates and self.spec.few is not None and not (self.options or history):
-                made = solve_small(
-                    self._given, self.spec, impulse, tol
-                )  # nothing was prepared that it would need
-                if made is not None:
-                    return made
             loop = self._loop(impulse, tol, time_limit, history, callback)
             return self._run(loop, max_iter)
         finally:
@@ -263,6 +268,7 @@ class Prepared:
             self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
         self._fresh = False
 
+    solver: Any = None
     _broken = ""  # why there is no state
 
     def _set_up(self, problem: Problem, anew: bool) -> None:
@@ -468,7 +474,10 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
 
     Claim, counts and residual are put in words when somebody asks for them.
     """
-    if type(problem) is not Problem or not isinstance(tol, float) or not 0.0 < tol < math.inf:
+    few = spec.few
+    if few is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
+        return None
+    if not 0.0 < tol < math.inf:
         return None
     if problem.cones.has_ellipse or (problem.m > SMALL_ROWS and problem.generalized is None):
         return None  # of islands, which may take long: who hears Ctrl-C asks for these
@@ -483,31 +492,15 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
         )
     else:
         given = problem.impulse_array(impulse)
-    assert spec.few is not None
-    found = spec.few.solve(problem, given, tol)
+    found = few.solve(problem, given, tol)
     if found is None:
         return None
     judged, counts = found
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
-    return late(problem, spec, judged, counts, tol, perf_counter() - start, kept)
-
-
-def late(
-    problem: Problem,
-    spec: SolverSpec,
-    judged: Any,
-    counts: Any,
-    tol: float,
-    seconds: float,
-    given: FloatArray | None,
-) -> Solution:
-    """A solution that the judge found below tol, in words when somebody asks; `counts` as `spec.few` tells them.
-
-    `given`: where it began (m,) [N s], None where from doing nothing.
-    """
-    impulse = judged.impulse
-    impulse.setflags(write=False)
-    return Solution.late(impulse, CONVERGED, tol, seconds, (_rest, (problem, spec, judged, counts, given)))
+    judged.impulse.setflags(write=False)
+    return Solution.late(
+        judged.impulse, CONVERGED, tol, perf_counter() - start, (_rest, (problem, spec, judged, counts, kept))
+    )
 
 
 def of_batch(

@@ -24,7 +24,7 @@ class NewtonSteps:
 
     def _take(self, state):
         self.state = state
-        self.solver = Substep(state.size, state.real, state.index, state.keys)
+        self.solver = Substep(state.size, state.real, state.index, state.keys, True)
 
     def step(self):
         """One step; the eight values of the solver after it."""

@@ -155,23 +155,6 @@ def random_lcp(seed, m=12, rank=None, boxed=True):
 seeds = st.integers(0, 2**32 - 1)
 
 
-def box_stack(n, mass_ratio=1.0):
-    """n unit cubes on the ground, four contacts each, the top one heavier: singular A, 4 n rows."""
-    inv_mass = np.ones(n)
-    inv_mass[-1] /= mass_ratio
-    corners = np.array([[x, y] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    above = np.repeat(np.arange(n), 4)
-    arm = np.column_stack([np.tile(corners, (n, 1)), np.full(4 * n, 0.5)])
-    v = np.zeros((n, 6))
-    v[:, 2] = -9.81 / 60.0
-    rows = lv.Rows(
-        inv_mass, 6.0 * inv_mass[:, None, None] * np.eye(3), v,
-        normal=np.tile([0.0, 0.0, 1.0], (4 * n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (4 * n, 1)),
-        arm_a=arm, arm_b=arm * [1.0, 1.0, -1.0], contact_body=np.column_stack([above - 1, above]).astype(np.int32),
-    )  # fmt: skip
-    return lv.Problem.from_rows(rows, name=f"box stack {n}, mass ratio {mass_ratio:g}")
-
-
 def dragged(seed, contacts, mu=None, shape="disk", friction="coulomb"):
     """J and M of contacts alone, pressed on and dragged; two coefficients each are drawn where none are given."""
     rng = np.random.default_rng(seed)

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.bench.running.sequences import carry
+from lavender.bench.running.runner import carry
 from lavender.io import mujoco as adapter
 from lavender.io.recording import drive_of
 from lavender.many import solve_many

@@ -11,7 +11,7 @@ import csv
 import json
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from typing import Any
 from lavender._arrays import table_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
-from lavender.errors import InputError, UnknownName
+from lavender.errors import InputError
 from lavender.io.stored import MAX_BYTES, destination, write_atomically, write_text
 
 __all__ = ["Records", "Store", "opened", "read", "write_csv", "write_json"]
@@ -83,8 +83,6 @@ class Records:
         if not self.runs:
             return self
         run = list(self.runs)[-1]
-        found = Records(source=self.source)
-        found.add(self.runs[run])
         now = {name: info.sha for name, info in self.cases.items()}
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
@@ -94,9 +92,15 @@ class Records:
         )  # lines that took turns with each other
         mine = [r for r in mine if r.turns in ("", newest)]
         cases = {r.case for r in mine}
-        described = [info for info in self.cases.values() if info.run == run or info.case in cases]
-        entries: list[Entry] = [*self.skips, *self.done.values()]
-        for entry in (*described, *(e for e in entries if e.run == run), *mine):
+        return self.having(mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases))
+
+    def having(
+        self, records: Iterable[Record], keep: Callable[[Entry], bool] = lambda entry: True
+    ) -> Records:
+        """Other records of the same runs, with the descriptions and notes that `keep` leaves."""
+        found = Records(source=self.source)
+        entries: list[Entry] = [*self.runs.values(), *self.cases.values(), *self.skips, *self.done.values()]
+        for entry in (*filter(keep, entries), *records):
             found.add(entry)
         return found
 
@@ -136,24 +140,6 @@ class Records:
         solvers = sorted({r.solver for r in self.records})
         facts = {"runs": len(self.records), "cases": len(self.cases), "solvers": ", ".join(solvers)}
         return table_of(facts, self.source or "Records")
-
-    def plot(self, case: str | None = None) -> Any:
-        """Error against time, every solver on one case (the first if None), as a figure of matplotlib.
-
-        Raises
-        ------
-        UnknownName
-            No such case.
-        """
-        cases = list(dict.fromkeys(r.case for r in self.records))
-        case = cases[0] if case is None and cases else case
-        if case not in cases:
-            raise UnknownName("case", case, cases)
-        from lavender.report import curves, draw, style
-
-        return draw.matplotlib_figure(
-            curves.work_precision(self, case), style.looks({r.solver for r in self.records})
-        )
 
     def frame(self) -> Any:
         """`rows()` as a pandas frame.

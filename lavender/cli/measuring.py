@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from lavender.cli.options import Asked, console, one_thread
+from lavender.cli.options import Asked, bytes_of, console, one_thread
 from lavender.errors import InputError
 
 if TYPE_CHECKING:
@@ -103,9 +103,9 @@ def measure(
 
             stopped = False
             try:
-                more = asked.process
-                bench.run(items, asked.solvers, plan, store, watch=watch, into=found, fresh=fresh, **more)
-                time_lines(items, found[0], plan, store, watch=watch, fresh=fresh, **more)
+                more: dict[str, Any] = {"watch": watch, "fresh": fresh, "memory": bytes_of(asked.memory)}
+                bench.run(items, asked.solvers, plan, store, into=found, **more)
+                time_lines(items, found[0], plan, store, **more)
             except KeyboardInterrupt:
                 stopped = True
     since = before.get(next(iter(found[0].runs)), "") if reused else ""
@@ -133,7 +133,7 @@ def run_campaign(
         try:
             made = bench.campaign(
                 words, asked.solvers, plan, store, workers=workers, backend=backend, watch=watch,
-                memory=asked.process["memory"],
+                memory=bytes_of(asked.memory),
             )  # fmt: skip
         except KeyboardInterrupt:
             return Measured(bench.read(path).latest(), True)

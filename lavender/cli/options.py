@@ -213,7 +213,7 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
     if not any(s.order and not s.exact for s in specs):
         refuse_unused(context, ["orders"], "on solvers that take no order")
     if not any(map(is_foreign, specs)):
-        refuse_unused(context, ["memory", "in_process"], "where no solver of another package runs")
+        refuse_unused(context, ["memory"], "where no solver of another package runs")
 
 
 @dataclass(frozen=True)
@@ -230,7 +230,6 @@ class Asked:
     time_limit: float | None
     pass_limit: float | None
     memory: float | None
-    in_process: bool
 
     def plan(self, files: Sequence[str], times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Plan:
         """The plan that they mean.
@@ -250,17 +249,6 @@ class Asked:
             if getattr(self, name) is not None:
                 more[name] = getattr(self, name)
         return Plan(times=times, sweeps=sweeps, **more)
-
-    @property
-    def process(self) -> dict[str, Any]:
-        """Where backends of other packages run, as `lavender.bench.run` takes it.
-
-        Raises
-        ------
-        InputError
-            A memory that means nothing.
-        """
-        return {"isolate": not self.in_process, "memory": bytes_of(self.memory)}
 
 
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
@@ -283,7 +271,6 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                       "help": "Of one solver over all steps of a sequence, at one budget or level; 5 s."}),
     ("--memory", {"type": float, "default": None, "metavar": "GB", "help": "Limit of each process of a backend of "
                   "another package; default: half of the machine's memory, shared by the workers of a campaign."}),
-    ("--in-process", {"is_flag": True, "help": "Run backends of other packages here, not in a process of their own."}),
 )  # fmt: skip
 
 

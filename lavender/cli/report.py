@@ -186,7 +186,6 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
             "time_limit",
             "pass_limit",
             "time_budgets",
-            "in_process",
             "sequence",
             "tables",
             "fresh",

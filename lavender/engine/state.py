@@ -27,7 +27,7 @@ from lavender_ext.engine.arrays import (
     TOO_MANY,
     lengths,
 )
-from lavender_ext.warm.start import Warm
+from lavender_ext.warm.substep import Substep
 
 __all__ = ["State"]
 
@@ -86,9 +86,9 @@ class State:
         self._seen: tuple[int, int, Seen] | None = None
 
     @cached_property
-    def warm(self) -> Warm:
+    def warm(self) -> Substep:
         """The first phase of `newton` on these buffers."""
-        return Warm(self.size, self.real, self.index, self.keys)
+        return Substep(self.size, self.real, self.index, self.keys, False)
 
     def seen(self, contacts: int, rows: int) -> Seen:
         """What to copy for an observation; kept while the numbers stay."""

@@ -341,7 +341,7 @@ class Stepping:
     def _solve_in_place(self) -> bool:
         # The bits of lavender.solve(problem, "newton"), whose first phase this is, without making the problem.
         start = perf_counter()
-        how, sweeps, factorisations = self.state.warm.solve(self._warm_tol)
+        how, sweeps, factorisations, _ = self.state.warm.solve(self._warm_tol)
         if how:
             self._last = _Pending(how, sweeps, factorisations, perf_counter() - start)
         return bool(how)

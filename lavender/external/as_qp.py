@@ -237,7 +237,7 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
     matrix, rhs, n_zero = sp.csc_matrix((0, k)), np.zeros(0), 0
     if equality:
         matrix, rhs, n_zero, q = p, -q, k, np.zeros(k)
-    elif len(parts.contacts):
+    elif rows.members:
         # s = a x_n - x_t >= 0, s = a x_n + x_t >= 0;  s = (a x_n, x_t) in the cone of the disk.
         put = _Entries()
         for n, t, ratio in rows.pairs:
@@ -433,7 +433,6 @@ class _Parts:
     fixed: FloatArray
     root: FloatArray
     sigma: float
-    contacts: IntpArray  # blocks with friction rows that stay
 
     @classmethod
     def of(cls, problem: Problem, unit_diagonal: bool) -> _Parts:
@@ -448,18 +447,14 @@ class _Parts:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
-        friction = np.flatnonzero((c.kind != ROW) & (size > 1))
-        reach, stays = c.reach, []
-        for i in friction:
-            start, end = c.ptr[i] + 1, c.ptr[i + 1]
-            known[start:end] = reach[start:end] == 0.0
-            if not known[start:end].all():
-                stays.append(i)
+        friction = np.repeat(c.kind != ROW, size)
+        friction[c.ptr[:-1]] = False
+        known[friction] = c.reach[friction] == 0.0
         kept = np.flatnonzero(~known)
         d = problem.d[kept]
         if not unit_diagonal and len(d):
             d = np.full(len(d), np.exp(np.mean(np.log(d))))
-        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem), np.array(stays, int))
+        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem))
 
     def program(self, **own: Any) -> QP:
         """A program of these rows."""
@@ -474,20 +469,15 @@ class _Parts:
         place[self.kept] = np.arange(len(self.kept))
         pairs: list[tuple[int, int, float]] = []
         disks: list[_Disk] = []
-        for i in self.contacts:
-            n, turning, rolling = int(c.ptr[i]), int(c.apart_rows[i]), int(c.rolling_rows[i])
-            j = int(place[n])
-            parts = [list(range(n + 1, n + 1 + int(c.n_together[i])))]
-            parts += [[turning]] * (turning >= 0) + [[rolling, rolling + 1]] * (rolling >= 0)
-            for part in parts:
-                if not part or place[part[0]] < 0:
-                    continue
-                at = [int(place[t]) for t in part]
-                ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
-                if len(part) == 1:
-                    pairs.append((j, at[0], ratio[0]))
-                else:
-                    disks.append(_Disk(j, tuple(at), tuple(ratio)))
+        for i, part in c.parts():
+            if place[part[0]] < 0:
+                continue
+            j, at = int(place[c.ptr[i]]), [int(place[t]) for t in part]
+            ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
+            if len(part) == 1:
+                pairs.append((j, at[0], ratio[0]))
+            else:
+                disks.append(_Disk(j, tuple(at), tuple(ratio)))
         return _FrictionRows(pairs, disks)
 
 

@@ -23,7 +23,7 @@ import scipy.sparse as sp
 from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
-from lavender.cones import CONTACT, CONTACT_ROLLING, ROW, Cones
+from lavender.cones import CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.io.condensed import ENTRY, condensed
@@ -95,17 +95,8 @@ class Contents:
         else:
             a, b = self._local() if self.form == "local" else self._condensed(Budget(max_bytes))
         c, d = len(self.mu), self.spacedim
-        p = len(b) - c * d
-        ptr = np.concatenate([np.arange(0, c * d + 1, d), c * d + 1 + np.arange(p)])
-        contact = CONTACT if self.mu_r is None else CONTACT_ROLLING
-        kind = np.repeat(np.array([contact, ROW], np.int32), [c, p])
-        mu, mu_r = (
-            np.concatenate([np.zeros(c) if x is None else x, np.zeros(p)]) for x in (self.mu, self.mu_r)
-        )
-        free = np.full(len(b), np.inf)
-        cones = Cones(
-            ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu, patch_radius=np.zeros(c + p), rolling=mu_r
-        )
+        tangents = d - 1 if self.mu_r is None else 2
+        cones = Cones.contacts(self.mu, tangents, rolling=self.mu_r) + Cones.free(len(b) - c * d)
         guess = self._impulse(self.guesses[0]) if self.guesses else None
         name = self.info.get("title", "") or name
         return Problem(b, cones, a, guess=guess, name=name, generalized=general)

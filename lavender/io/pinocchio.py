@@ -14,7 +14,7 @@ A contact's z axis points from the first joint's side to the second's: w > 0 alo
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -102,10 +102,30 @@ def from_pinocchio(
     with told("Pinocchio", OTHER_MODEL):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
+    pairs = zip(constraint_models, constraint_datas, strict=True)
+    rows, target, cones, names = _constraints(model, data, pairs, dt, correction)
+    return Problem.from_jacobian(
+        rows,
+        mass,
+        v + dt * a,
+        target=target,
+        cones=cones,
+        compliance=compliance,
+        friction=friction,
+        names=names,
+        name=name,
+    )
+
+
+def _constraints(
+    model: Any, data: Any, pairs: Iterable[Any], dt: float, correction: float
+) -> tuple[Any, Any, Cones, list[str]]:
+    """J (m, nv), targets (m,), blocks and their names of all constraints, one after the other."""
+    nv = int(model.nv)
     rows: list[Any] = [np.zeros((0, nv))]
     targets: list[Any] = [np.zeros(0)]
     cones, names = Cones.free(0), []
-    for i, (wrapped, kept) in enumerate(zip(constraint_models, constraint_datas, strict=True)):
+    for i, (wrapped, kept) in enumerate(pairs):
         model_of = _plain(wrapped)
         _check_constraint(i, model, model_of, _plain(kept))
         with told("Pinocchio", OTHER_MODEL):
@@ -118,17 +138,7 @@ def from_pinocchio(
         cones = cones + more
         word = f"{type(model_of).__name__.removesuffix('ConstraintModel')} {i}"
         names += [word] if more.n_blocks == 1 else [f"{word}, row {k}" for k in range(more.n_blocks)]
-    return Problem.from_jacobian(
-        np.concatenate(rows),
-        mass,
-        v + dt * a,
-        target=np.concatenate(targets),
-        cones=cones,
-        compliance=compliance,
-        friction=friction,
-        names=names,
-        name=name,
-    )
+    return np.concatenate(rows), np.concatenate(targets), cones, names
 
 
 def _check_given(models: Any, datas: Any, dt: Any, correction: Any) -> tuple[float, float]:

@@ -19,7 +19,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.stored import first_bytes, folder_for_steps, write_text
-from lavender.problem import PRECISIONS
+from lavender.problem import PRECISIONS, Problem
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
@@ -111,31 +111,42 @@ def record(
         if (step + 1) % every:
             continue
         mj.mj_forward(model, data)
-        start = perf_counter()
-        mj.mj_fwdConstraint(model, data)
-        seconds = perf_counter() - start
-        if int(data.nefc) == 0:
-            without += 1
-            continue
+        file = folder / f"step_{step + 1:0{width}d}.npz"
         try:
-            problem = adapter.from_mujoco(model, data, name=f"step {step + 1}")
-            problem = dataclasses.replace(problem, precision=precision, copy=False)
+            found = _solved(mj, model, data, f"step {step + 1}", precision)
         except LavenderError as error:
             left_out.append(f"step {step + 1}: {error}")
             continue
-        own = adapter.impulse(model, data)
-        name = f"step_{step + 1:0{width}d}.npz"
-        npz.write(problem, folder / name, impulse=own)
-        files.append(name)
-        judged = residual(problem, own)
-        lines.append(json.dumps({
-            "file": name, "step": step + 1, "rows": problem.m, "iterations": int(np.sum(data.solver_niter)),
-            "seconds": seconds, "relative": judged.relative, "floor": judged.floor, "verdict": judged.verdict,
-            "precision": precision,
-            "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
-        }))  # fmt: skip
+        if found is None:
+            without += 1
+            continue
+        problem, own, told = found
+        npz.write(problem, file, impulse=own)
+        files.append(file.name)
+        lines.append(json.dumps({"file": file.name, "step": step + 1, **told}))
     write_text(folder / ENGINE, "".join(f"{line}\n" for line in lines))
     return Recording(folder, tuple(files), without, tuple(left_out))
+
+
+def _solved(
+    mj: Any, model: Any, data: Any, name: str, precision: str
+) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
+    """The problem of a step, MuJoCo's impulse, and what is told of both; None without constraints."""
+    start = perf_counter()
+    mj.mj_fwdConstraint(model, data)
+    seconds = perf_counter() - start
+    if int(data.nefc) == 0:
+        return None
+    problem = adapter.from_mujoco(model, data, name=name)
+    problem = dataclasses.replace(problem, precision=precision, copy=False)
+    own = adapter.impulse(model, data)
+    judged = residual(problem, own)
+    told = {
+        "rows": problem.m, "iterations": int(np.sum(data.solver_niter)), "seconds": seconds,
+        "relative": judged.relative, "floor": judged.floor, "verdict": judged.verdict, "precision": precision,
+        "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
+    }  # fmt: skip
+    return problem, own, told
 
 
 def record_file(

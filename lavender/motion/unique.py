@@ -46,7 +46,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, IntArray
 from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
 from lavender.problem import Problem
@@ -156,12 +156,11 @@ def _sticks(
     bounded = rows[(c.kind == ROW)[np.searchsorted(c.ptr, rows, side="right") - 1]]
     if np.any(c.lower[bounded] > 0.0) or np.any(c.upper[bounded] < 0.0):
         return False
-    touching = set(np.searchsorted(c.ptr, rows[friction], side="right") - 1)
-    left = []
-    for i in block:
-        if i not in touching:
+    rubbing, left = _rubbing(c), []
+    for i in block.tolist():
+        if i not in rubbing:
             continue
-        used = max(float(np.linalg.norm(x[part])) / c.reach[part[0]] for part in _parts(c, i))
+        used = max(float(np.linalg.norm(x[part])) / c.reach[part[0]] for part in rubbing[i])
         left.append(x[c.ptr[i]] - used)  # (1 - sigma) lambda_n
     h = float(np.min(np.array(left) / np.sqrt(lifting)))
     size = float(np.sqrt(max(x[rows] @ (w + problem.b[rows]), 0.0)))  # |lambda|_A of the island
@@ -181,7 +180,8 @@ def _kappa(
     size = c.reach[rows[tangents]] / scale[tangents]
     sliding = a[np.ix_(tangents, tangents)] * size[:, None] * size
     lifting = np.linalg.inv(a)[np.ix_(normals, normals)] * scale[normals][:, None] * scale[normals]
-    parts = float(max(len(_parts(c, i)) for i in contacts))
+    rubbing = _rubbing(c)
+    parts = float(max(len(rubbing[i]) for i in contacts.tolist()))
     strongest = np.zeros(len(contacts))
     np.maximum.at(strongest, place, np.diagonal(sliding))
     best = np.inf
@@ -192,12 +192,14 @@ def _kappa(
     return best, np.diagonal(lifting)
 
 
-def _parts(c: Cones, i: int) -> list[np.ndarray]:
-    """Rows of contact i bounded together: tangents, spin or second side of a box, rolling, where a bound is not 0."""
-    first, turning, rolling = int(c.ptr[i]) + 1, int(c.apart_rows[i]), int(c.rolling_rows[i])
-    found = [np.arange(first, first + int(c.n_together[i]))]
-    found += [np.array([turning])] * (turning >= 0) + [np.array([rolling, rolling + 1])] * (rolling >= 0)
-    return [part for part in found if len(part) and c.reach[part[0]] > 0.0]
+def _rubbing(c: Cones) -> dict[int, list[IntArray]]:
+    """The parts of each contact whose bound is not 0."""
+    found: dict[int, list[IntArray]] = {}
+    reach = c.reach
+    for i, part in c.parts():
+        if reach[part[0]] > 0.0:
+            found.setdefault(i, []).append(part)
+    return found
 
 
 def _definite(a: FloatArray) -> bool:

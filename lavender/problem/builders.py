@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of
-from lavender.cones import CONTACT_ROLLING, ROW, Cones, check_shape
+from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, Cones, check_shape
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem.data import checked_matrix
@@ -238,39 +238,21 @@ class Builders(Operators):
         """
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
-        kj, c, mj = rows.n_joints, rows.n_contacts, len(rows.jac)
-        mu = as_array("mu", mu, (c,))
+        mu = as_array("mu", mu, (rows.n_contacts,))
         if tangents is None:
             tangents = np.where(mu > 0.0, 2, 0)
-        tangents = as_array("tangents", tangents, (c,), dtype=np.int32)
-        if c and (tangents.min() < 0 or tangents.max() > 2):
-            raise InputError("tangents must be 0, 1 or 2 for each contact")
-        spin, rolls = patch_radius is not None, rolling is not None
-        if rolls and c and tangents.min() < 2:
-            raise InputError(
-                f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
-                "rolls: give tangents=2"
-            )
-        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
-        if len(smooth) and not spin:
-            raise InputError(
-                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
-            )
-        ptr = np.concatenate([rows.joint_ptr, mj + np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(
-            np.int32
+        tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
+        low, high = (
+            as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
+            for name, x in (("lower", lower), ("upper", upper))
         )
-        kind = np.repeat(np.array([ROW, CONTACT_ROLLING if rolls else 1 + spin], np.int32), [kj, c])
-        m = int(ptr[-1])
-        low, high = np.full(m, -np.inf), np.full(m, np.inf)
-        low[:mj] = as_array("lower", lower, (mj,), finite=False, unit="N s")
-        high[:mj] = as_array("upper", upper, (mj,), finite=False, unit="N s")
-        both = np.zeros((3, kj + c))
-        both[0, kj:] = mu
-        both[1, kj:] = 0.0 if patch_radius is None else as_array("patch_radius", patch_radius, (c,), unit="m")
-        both[2, kj:] = 0.0 if rolling is None else as_array("rolling", rolling, (c,), unit="m")
-        cones = Cones(ptr, kind, low, high, *both)
-        if check_shape("shape", shape) == "box":
-            cones = cones.shaped("box")
+        cones = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
+        if rows.n_joints:
+            none = np.zeros(rows.n_joints)
+            kind = none.astype(np.int32)
+            own = Cones(ptr=rows.joint_ptr, kind=kind, lower=low, upper=high, mu=none, patch_radius=none)
+            cones = own + cones
+        m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
         # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
@@ -412,3 +394,28 @@ class Builders(Operators):
         given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
         return replace(self, generalized=general, b=given, guess=warm, copy=False)
+
+
+def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
+    """Contacts of 0 to 2 tangents each (c,); with a radius all have a spin row, with mu_r two that roll."""
+    spin, rolls, c = patch_radius is not None, rolling is not None, len(mu)
+    if c and (tangents.min() < 0 or tangents.max() > 2):
+        raise InputError("tangents must be 0, 1 or 2 for each contact")
+    if rolls and c and tangents.min() < 2:
+        raise InputError(
+            f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
+            "rolls: give tangents=2"
+        )
+    smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
+    if len(smooth) and not spin:
+        raise InputError(
+            f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+        )
+    ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
+    kind = np.full(c, CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT, np.int32)
+    free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)
+    cones = Cones(
+        ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu,
+        patch_radius=none if patch_radius is None else patch_radius, rolling=none if rolling is None else rolling,
+    )  # fmt: skip
+    return cones.shaped("box") if shape == "box" else cones

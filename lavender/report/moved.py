@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from lavender.bench.record import Entry, Record, level_name
+from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report.tables.advice import Advice, advice_by_level
 from lavender.report.tables.campaigns import Robustness, robustness
@@ -70,15 +70,14 @@ def speed_levels(records: Records) -> tuple[float, ...]:
 def by_speed(records: Records) -> Records:
     """The records as if m/s of motion error were their residual; runs without one reached nothing."""
     levels = speed_levels(records)
-    out = Records(source=records.source)
+    found = records.having(
+        replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0)
+        for r in records
+        if not r.turns
+    )
     for run in records.runs.values():
-        out.add(replace(run, plan={**run.plan, "levels": levels}))
-    others: list[Entry] = [*records.cases.values(), *records.skips, *records.done.values()]
-    for entry in others:
-        out.add(entry)
-    for r in (r for r in records if not r.turns):
-        out.add(replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0))
-    return out
+        found.add(replace(run, plan={**run.plan, "levels": levels}))
+    return found
 
 
 def advice_by_speed(records: Records) -> list[Advice]:
@@ -124,20 +123,8 @@ def working(records: Records) -> Records:
     still = {name for name, info in records.cases.items() if info.nothing_to_do}
     if not still:
         return records
-    out = Records(source=records.source)
-    others: list[Entry] = [
-        *records.runs.values(),
-        *records.cases.values(),
-        *records.skips,
-        *records.done.values(),
-    ]
-    for entry in others:
-        if getattr(entry, "case", None) not in still:
-            out.add(entry)
-    for r in records:
-        if r.case not in still:
-            out.add(r)
-    return out
+    kept = (r for r in records if r.case not in still)
+    return records.having(kept, lambda entry: getattr(entry, "case", None) not in still)
 
 
 def idle(records: Records) -> list[Idle]:

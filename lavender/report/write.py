@@ -13,6 +13,7 @@ from lavender.io.stored import write_text
 
 if TYPE_CHECKING:
     from lavender.bench.peers import Peers
+    from lavender.report.curves import Figures
     from lavender.report.engine import Contestant
 
 __all__ = ["write"]
@@ -60,11 +61,9 @@ def write(
         The folder cannot be written.
     """
     from lavender.report.curves import figures as figures_of
-    from lavender.report.draw import save
     from lavender.report.markdown import summary
     from lavender.report.moved import working
     from lavender.report.page import page
-    from lavender.report.style import looks
 
     folder = Path(folder)
     shown = records.latest()
@@ -96,13 +95,21 @@ def write(
         )
         write_text(folder / "summary.md", summary(busy, times, engines, sweeps))
         if figures and list(drawn):
-            (folder / "figures").mkdir(exist_ok=True)
-            look = looks({r.solver for r in shown} | {c.solver for figure in drawn for c in figure.curves})
-            for figure in drawn:
-                save(figure, look, folder / "figures")
+            _save(drawn, {r.solver for r in shown}, folder / "figures")
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or folder} ({error.strerror or error}): make room, or give a folder that "
             "you may write to; the records are kept"
         ) from None
     return index
+
+
+def _save(drawn: Figures, solvers: set[str], folder: Path) -> None:
+    """Each figure as SVG and PNG."""
+    from lavender.report.draw import save
+    from lavender.report.style import looks
+
+    folder.mkdir(exist_ok=True)
+    look = looks(solvers | {c.solver for figure in drawn for c in figure.curves})
+    for figure in drawn:
+        save(figure, look, folder)

@@ -40,6 +40,7 @@ class State:
 
     problem: Problem
     sweeps: Sweeps | None = None
+    call: bool = True  # the compiled call may be made
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class Auto:
 
     def ready(self, state: State, time_limit: float) -> None:
         """Before the clock of a limit [s] starts: set up the compiled call, and sweeps where others may not end."""
-        if state.problem.generalized is None and call_ends_within(state.problem, time_limit):
+        state.call = call_ends_within(state.problem, time_limit)
+        if state.call and state.problem.generalized is None:
             prepared(state.problem)
         if state.problem.m and self.plan is None and not state.problem.cones.has_round:
             state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
@@ -78,7 +80,7 @@ class Auto:
     ) -> Claim:
         problem = state.problem
         deadline = Deadline(time_limit)
-        if n >= ONE_CALL and call_ends_within(problem, time_limit):
+        if n >= ONE_CALL and state.call:
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1], impulse, made[0].relative)
             if made is not None and claim is not None and claim.iterations <= n:

@@ -9,22 +9,18 @@ solvers. No clock is read: the same problem has the same plan everywhere.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from functools import cache
 from hashlib import sha256
 from math import inf, log10
-from pathlib import Path
 from typing import Any
 
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.solvers.structure import Structure
+from lavender.solvers.weights import READ, of_law, rates
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
-
-RATES = Path(__file__).with_name("rates.json")
 
 #: Solver and options of each candidate.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -58,15 +54,7 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
-READ = 4.0  # times that what steps over velocities read is read before the first (fitted to curves: 3.6)
 SIXTH = 6.0  # decades that counts of sweeps are fitted for
-
-
-@cache
-def rates() -> dict[str, Any]:
-    """Of `rates.json`, read once."""
-    found: dict[str, Any] = json.loads(RATES.read_text(encoding="utf-8"))
-    return found
 
 
 @dataclass(frozen=True)
@@ -218,11 +206,11 @@ class Costs:
                 r["velocities"],
                 0.5 if law == "linear" else 1.0,
             )  # of the steps, where all rows are soft
-            n = half * _of(v["count"], law)
+            n = half * of_law(v["count"], law)
             return float(n * v["step"] + (READ + n) * v["entry"] * self.structure.sweep)
         if name in ("direct", "newton", "newton over rows"):
             part = r["direct" if name == "direct" else "newton"]
-            return float(part["start"] + _of(part["count"], law) * part["row"] * m)
+            return float(part["start"] + of_law(part["count"], law) * part["row"] * m)
         return float(r["admm"]["start"]) if name == "admm" else inf
 
     def least(self, name: str) -> Cost:
@@ -247,7 +235,7 @@ class Costs:
             return self.planned[name]
         if name in ("anderson", "nncg"):
             a = r["anderson"]
-            each = a["row"] * s.m + _of(a["work"], law) * s.sweep
+            each = a["row"] * s.m + of_law(a["work"], law) * s.sweep
             count = self.decades * r[name]["count"]
             return Cost(a["start"], each * (1.0 if name == "anderson" else BOTH_WAYS), count)
         if name == "direct":
@@ -263,7 +251,7 @@ class Costs:
             if s.kernel is None:
                 return Cost(float("inf"), 1.0, 1.0)
             each = v["step"] + v["entry"] * s.read + v["work"] * s.velocities
-            return Cost(v["entry"] * READ * s.sweep, each, _of(v["count"], law) * s.steps)
+            return Cost(v["entry"] * READ * s.sweep, each, of_law(v["count"], law) * s.steps)
         return self._finite("newton", s.newton)
 
     def _relaxation(self) -> Cost:
@@ -274,14 +262,9 @@ class Costs:
         r, s = self.rates[name], self.structure
         setup = r["start"] + self.rates["formed"] * s.formed
         count = (
-            1.0 if name == "direct" and self.problem.law == "linear" else _of(r["count"], self.problem.law)
+            1.0 if name == "direct" and self.problem.law == "linear" else of_law(r["count"], self.problem.law)
         )
         return Cost(setup, r["row"] * s.m + r["work"] * factor, count)
-
-
-def _of(rate: Any, law: str) -> float:
-    """A rate that depends on the law: bounded rows, whether they have bounds or not, and each law of friction."""
-    return float(rate[law if law in rate else "rows"] if isinstance(rate, Mapping) else rate)
 
 
 def candidates(structure: Structure) -> tuple[str, ...]:

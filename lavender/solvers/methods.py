@@ -154,6 +154,7 @@ class Sweeps(Resumed):
     relative = 1.0  # residual of the last look
     least = 0.0  # ns that another method takes at least
     told = 0, 0  # sweeps and restarts of the turns before
+    watched = True
 
     def set_up(self) -> None:
         """All that needs no impulse, and what is to be known when time is short."""
@@ -167,7 +168,9 @@ class Sweeps(Resumed):
         self.log, before = log, log.best
         half = 0.5e9 * (log.deadline.left() or 0.0)
         n = half / self.cost.each if half > self.costs.sure * self.least else ALL
+        self.watched = False
         claim = self.turn(int(min(max(n, 1.0), log.left)))
+        self.watched = True
         log.note(self.name, claim, before)
         if log.ends_late(self.least) or log.done():
             return False
@@ -186,17 +189,15 @@ class Sweeps(Resumed):
         """At most n, given up where they promise no end for less than the others."""
         looks = self.state
         done, step = looks.done, min(max(looks.done // 2, FIRST), n)
-        looks.run(
-            self.impulse, self.relative, done + n, self.log.tol, step, FIRST, self.others / self.cost.each
-        )
-        self.relative, self.status = looks.now.relative, STATUS[looks.status]
+        least = self.others / self.cost.each
+        looks.run(self.impulse, self.relative, done + n, self.log.tol, step, FIRST, least, self.watched)
+        self.relative, self.status = self.log.take(looks.now), STATUS[looks.status]
         return int(looks.done) - done
 
     def close(self) -> None:
         looks, told = self.state, self.told
         self.told = looks.sweeps, looks.restarts
         self.work = {"sweeps": looks.sweeps - told[0], "restarts": looks.restarts - told[1]}
-        self.log.take(looks.now)
         if looks.watch.best_relative < self.log.best:
             self.log.offer(looks.watch.best[1])
 
@@ -308,7 +309,7 @@ class Newton(Finite):
         rows = self.name == "newton over rows" or self.log.problem.rows is None
         if rows != (system.form == "impulse"):
             return super().prepare(solver)
-        return NewtonState(self.log.problem, system if system.sc.m else None)
+        return NewtonState(self.log.problem, system if system.solve.m else None)
 
 
 class Direct(Finite):

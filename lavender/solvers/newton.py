@@ -109,7 +109,7 @@ class Newton:
         if form == "auto":
             form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"
         system = make_system(problem, form, like)
-        return NewtonState(problem, system if system.sc.m else None)
+        return NewtonState(problem, system if system.solve.m else None)
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
         """The same of new numbers: between the same bodies the order of elimination stays."""
@@ -144,7 +144,7 @@ class Newton:
             impulse[:] = problem.start()
         system = make_system(problem, "impulse")
         more = self._run_system(
-            problem, system if system.sc.m else None, impulse, left, tol, deadline.left(1e-3)
+            problem, system if system.solve.m else None, impulse, left, tol, deadline.left(1e-3)
         )
         if not quick(problem, impulse, w, e)[0] <= best:
             impulse[:] = before
@@ -166,7 +166,7 @@ class Newton:
     ) -> Claim:
         if system is None:
             system = make_system(problem, "impulse")
-            impulse[:] = system.sc.fixed
+            impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = worked = 0
@@ -197,10 +197,9 @@ def _turns(
 ) -> tuple[Status, FloatArray | None]:
     """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between."""
     deadline = Deadline(time_limit)
-    sc, solve, certificate = system.sc, system.solve, None
+    solve, certificate = system.solve, None
     late = interrupted = False
-    coulomb = problem.law == "coulomb" and sc.has_friction
-    solve.start(sc.unknown(impulse), tol, n, coulomb, cold)
+    solve.start(impulse, tol, n, cold)
     try:
         while True:
             before = solve.factorisations
@@ -215,16 +214,18 @@ def _turns(
             if solve.factorisations > before:
                 system.took(watch.seconds / (solve.factorisations - before))
             if end == OUTCOMES["certificate"]:
-                certificate = _proof(problem, sc, solve.direction)
-                if certificate is not None:
+                certificate = solve.direction
+                if check_certificate(problem, certificate) is None:
                     solve.prove()
+                else:
+                    certificate = None
             elif end != OUTCOMES["more"]:
                 break
     except KeyboardInterrupt:
         interrupted = True  # the best iterate goes back all the same
         solve.stop()
         solve.step(1)
-    impulse[:] = sc.impulse(solve.best_z)
+    solve.take(impulse)
     if interrupted:
         return Status.INTERRUPTED, None
     if certificate is not None:
@@ -232,13 +233,6 @@ def _turns(
     if end == OUTCOMES["spent"]:
         return (Status.TIME_LIMIT if late and solve.factorisations < n else Status.MAX_ITERATIONS), None
     return _ENDS[end], None
-
-
-def _proof(problem: Problem, sc: Any, y: FloatArray) -> FloatArray | None:
-    """The direction y (scaled) as a certificate (m,), if it proves that there is no solution."""
-    whole = np.zeros(problem.m)
-    whole[sc.keep] = y * sc.scale
-    return whole if check_certificate(problem, whole) is None else None
 
 
 def _refusal(problem: Problem) -> str | None:

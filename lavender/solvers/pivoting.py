@@ -8,7 +8,6 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solvers._counts import dense_factor, sparse_factor
 from lavender.solvers._factor import (
     SMALL_SIZE,
     TINY,
@@ -19,6 +18,7 @@ from lavender.solvers._factor import (
     choose,
     permuted_band,
 )
+from lavender.solvers.weights import dense_factor, sparse_factor
 from lavender_ext.pivot.direct import Pivoting
 
 # s for each multiply-add of a dense factor, and for each nonzero of a sparse one, with as many times more as it has

@@ -1,9 +1,8 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A, islands of few rows under friction, as many as are swept in `LONGEST`
-(`lavender_ext/few/small.pyx`), generalised coordinates where Newton's method is counted to cost little
-(`lavender_ext/few/many.pyx`): what Python costs outweighs such a problem. The call ends with a solution or not at all:
-then the solver runs as on any problem, from the beginning.
+Few rows of bodies or of A, islands of few rows under friction (`lavender_ext/few/small.pyx`), generalised coordinates
+where Newton's method is counted to cost little (`lavender_ext/few/many.pyx`): what Python costs outweighs such a
+problem. The call ends with a solution or not at all: then the solver runs as on any problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.problem import LAWS, Problem
+from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn
-from lavender.solvers import weights
-from lavender.solvers._counts import sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
+from lavender.solvers.weights import READ, of_law, rates, sweep_cost
 from lavender_ext.few.many import Gate, solve_first
 from lavender_ext.few.small import Bounded, Friction, Small
 
@@ -35,23 +33,25 @@ ISLAND = {"coulomb": 150, "cone": 12}
 SWEPT = 32  # sweeps of a part at most, before its factors
 IN_ALL = 5  # times as long, as sweeps and factors of all parts mostly take
 FACTORED = 0.05  # ns of a multiply-add of factors of parts
-LONGEST = 5e8  # ns of SWEPT sweeps of all islands at most
-# All that `general_cost` reads, by law.
-GENERAL = (
-    weights.GENERAL_START,
-    tuple(weights.GENERAL_ROW[law] for law in LAWS),
-    tuple(weights.GENERAL[law] for law in LAWS),
-    tuple(weights.GENERAL_COUNT[law] for law in LAWS),
-)
+# ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
+# Coulomb's law sooner; and up to which nobody looks at the clock in between.
+FIRST = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
+MOST = 1e7
 
 
-def general_cost(problem: Problem, largest: int) -> float:
-    """Newton over generalised velocities, `largest` of them in one island [ns]."""
-    law = problem.law
-    step = weights.GENERAL_ROW[law] * problem.m + weights.GENERAL[law] * general.factor_flops(
-        problem, largest
-    )
-    return weights.GENERAL_START + weights.GENERAL_COUNT[law] * step
+def velocities_cost(problem: Problem, largest: int) -> float:
+    """Newton over generalised velocities, `largest` of them in one island [ns]; `is_cheap` of the compiled call."""
+    v = rates()["velocities"]
+    factor = v["work"] * general.factor_flops(problem, largest)
+    read = v["entry"] * float(problem.metric.work)
+    return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
+
+
+def gate(most: float, most_coulomb: float) -> Gate:
+    """What may be counted to cost so much at most [ns] is let in."""
+    v = rates()["velocities"]
+    count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
+    return Gate(np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM]))
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
@@ -59,7 +59,7 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
     if time_limit is None or (problem.generalized is None and problem.law in ("linear", "lcp")):
         return True
     if problem.generalized is not None:
-        cost = general_cost(problem, problem.generalized.nv)
+        cost = velocities_cost(problem, problem.generalized.nv)
     else:
         cost = IN_ALL * SWEPT * sweep_cost(problem)
         if 4e-9 * cost <= time_limit:
@@ -82,7 +82,7 @@ def _make(problem: Problem) -> Small | None:
     if cones.has_round or cones.has_rolling:
         return None
     if problem.m > SMALL_ROWS:
-        if bounded or SWEPT * sweep_cost(problem) > LONGEST:
+        if bounded:
             return None
         count, label = islands(problem)
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND[law]:
@@ -106,8 +106,9 @@ class Few:
     name: str
     gate: Gate | None  # what it may cost over generalised velocities; None: not at all
     pivots: bool  # bounded rows
-    sweeps: bool  # and cones
-    looks: bool = False  # a start that is a solution is the result, one that is none is not started from
+    hands_over: bool = (
+        False  # and friction; a start that is a solution is the result, a bad one is not started from
+    )
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
@@ -121,15 +122,15 @@ class Few:
         if problem.generalized is not None:
             if self.gate is None:
                 return None
-            found = solve_first(kept.view, impulse, tol, self.gate, general.ROOM) or False
+            found = solve_first(kept.view, impulse, tol, self.gate)
         else:
-            small = prepared(problem) if problem.m <= SMALL_ROWS or self.sweeps else None
-            if small is None or not (self.pivots if small.pivots else self.sweeps):
+            small = prepared(problem) if problem.m <= SMALL_ROWS or self.hands_over else None
+            if small is None or not (self.pivots if small.pivots else self.hands_over):
                 return None
-            found = small.run(impulse, tol, self.looks, WARM) or False
-        if found is False:  # the steps of who solves it the long way need not come twice before
+            found = small.run(impulse, tol, self.hands_over, WARM)
+        if found is None:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
-        return found or None
+        return found
 
     def claim(
         self, problem: Problem, counts: tuple[int, ...] | None, start: FloatArray | None, after: float
@@ -220,6 +221,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", Gate(GENERAL, tuple(weights.GENERAL_FIRST[law] for law in LAWS)), True, True, looks=True)
-DIRECT = Few("direct", None, True, False)
-NEWTON = Few("newton", Gate(GENERAL, len(LAWS) * (weights.GENERAL_MOST,)), False, False)
+AUTO = Few("auto", gate(FIRST["cone"], FIRST["coulomb"]), True, True)
+DIRECT = Few("direct", None, True)
+NEWTON = Few("newton", gate(MOST, MOST), False)

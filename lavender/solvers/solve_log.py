@@ -133,11 +133,9 @@ class SolveLog:
         return islands(self.problem)
 
     def wrong_islands(self) -> IntArray:
-        """Which islands miss their share of the whole tolerance.
+        """Which islands miss an equal share of the whole tolerance, in energy, or the tolerance in velocity.
 
-        Of the energy error each may have as much as makes the tolerance with those that have less,
-        sum min(e_i, share)^2 = (tol E0)^2. A pair of tangents counts by its norm, at most sqrt(2) times its
-        larger entry.
+        A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
         """
         count, label = self.islands
         problem = self.problem
@@ -146,13 +144,7 @@ class SolveLog:
         quick(problem, self.impulse, *room)
         of_row = np.repeat(label, np.diff(problem.cones.ptr))
         own = np.bincount(of_row, problem.d * error**2, minlength=count)
-        own[np.isnan(own)] = np.inf
-        least = np.sort(own)
-        below = np.concatenate([[0.0], np.cumsum(least[:-1])])
-        level = ((self.tol * energy) ** 2 - below) / np.arange(count, 0, -1)
-        above = np.flatnonzero(least > level)
-        share = max(0.0, float(level[above[0]])) if len(above) else np.inf
         fast = np.zeros(count)
         np.maximum.at(fast, of_row, problem.metric.weight * np.abs(error))
-        wrong = (own > share) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
+        wrong = ~(own <= (self.tol * energy) ** 2 / count) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
         return np.flatnonzero(wrong).astype(np.int32)

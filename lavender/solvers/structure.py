@@ -17,12 +17,11 @@ from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.solvers import weights
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers._counts import dense_factor, newton_factor, sparse_factor
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.small import general_cost, prepared
+from lavender.solvers.small import FIRST, prepared, velocities_cost
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph
@@ -89,13 +88,13 @@ class Structure:
         if self.problem.matrix is not None:
             return self.direct
         width = max(3.0, self._width(self.m))
-        return min(weights.BAND * self.m * width**2, dense_factor(self.m))
+        return min(weights.BAND * self.m * width**2, weights.dense_factor(self.m))
 
     @cached_property
     def direct(self) -> float:
         """One factor of A as `direct` makes it; of a factored problem without forming A."""
         p, m = self.problem, self.m
-        dense = dense_factor(m)
+        dense = weights.dense_factor(m)
         if p.rows is not None and p.rows.n_bodies:
             return min(dense, weights.BAND * m * self._body_band() ** 2, self._sparse(self.entries))
         if p.generalized is not None and p.law != "linear":
@@ -106,7 +105,7 @@ class Structure:
         nnz = float(len(p._compressed[1]))
         if form == "sparse" or (form == "general" and p.law == "linear" and PanelsLU.takes(p)):
             return min(dense, self._sparse(nnz))
-        return min(dense, sparse_factor(int(nnz), m))
+        return min(dense, weights.sparse_factor(int(nnz), m))
 
     def _body_band(self) -> float:
         """Of A in the order of blocks, or of a tree."""
@@ -123,7 +122,7 @@ class Structure:
         """A sparse factor of so many entries; with bounds rows are analysed anew for each free set."""
         p = self.problem
         if p.law != "linear":
-            return sparse_factor(int(entries), p.m)
+            return weights.sparse_factor(int(entries), p.m)
         return filled_cost(p) if p.rows is None else panels_cost(int(entries), p.m)
 
     # -- factors of Newton's matrix ----------------------------------------------------------------
@@ -137,7 +136,7 @@ class Structure:
     @cached_property
     def newton(self) -> float:
         """One factor of it."""
-        return newton_factor(self.system)
+        return weights.newton_factor(self.system)
 
     @property
     def newton_least(self) -> float:
@@ -148,7 +147,7 @@ class Structure:
             s, n = 6 if turns else 3, p.rows.n_bodies
             return weights.BLOCK * s**3 * (1.0 + 0.5 * max(1.0, self._width(n)) ** 2) * n
         width = max(1.0, 0.5 * self.entries / max(1, self.m)) if p.matrix is not None else 1.0
-        return min(weights.BAND * self.m * width**2, dense_factor(self.m))
+        return min(weights.BAND * self.m * width**2, weights.dense_factor(self.m))
 
     def _width(self, n: int) -> float:
         """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""
@@ -173,8 +172,7 @@ class Structure:
     def goes_first(self) -> bool:
         """It is what the compiled call for few rows does."""
         kernel = self.kernel
-        most = weights.GENERAL_FIRST[self.problem.law]
-        return kernel is not None and general_cost(self.problem, kernel.largest) <= most
+        return kernel is not None and velocities_cost(self.problem, kernel.largest) <= FIRST[self.problem.law]
 
     @property
     def is_small(self) -> bool:

@@ -1,4 +1,4 @@
-"""Weights of factors and sweeps as kernels make them, and where the compiled calls for few rows have their limits.
+"""What one factor or one sweep of a problem costs, counted from its structure [ns], and the rates of whole solvers.
 
 Nanoseconds of one core; constants, the same on every machine: no clock is read. What `auto` expects of a solver as a
 whole are the fitted rates of `rates.json` (`costs.py`).
@@ -6,6 +6,17 @@ whole are the fitted rates of `rates.json` (`costs.py`).
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from lavender.problem import Problem
+from lavender.solvers._accelerated import sweep_work
+from lavender.solvers.newton_systems.systems import PANELS, MatrixSystem, System
+
+RATES = Path(__file__).with_name("rates.json")
 SWEEP = {"linear": 1.05, "lcp": 1.0, "coulomb": 0.65, "cone": 1.25}  # for each multiply-add of a sweep,
 SWEEP_ROW = 5.0  # and each of its rows
 DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
@@ -17,13 +28,41 @@ SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill gro
 # pattern, and each multiply-add.
 FILLED, FILLED_ENTRY, FILLED_WORK = 50e3, 6.0, 0.12
 
-# Newton over generalised velocities: a call, for each row beside each factor, each multiply-add of the dense factor of
-# an island, most of whose entries are nought unless every contact is inside its cone, and steps to expect.
-GENERAL_START = 60e3
-GENERAL_ROW = {"linear": 40.0, "lcp": 100.0, "cone": 140.0, "coulomb": 400.0}
-GENERAL = {"linear": 0.1, "lcp": 0.06, "cone": 0.06, "coulomb": 0.02}
-GENERAL_COUNT = {"linear": 5.0, "lcp": 5.0, "cone": 12.0, "coulomb": 30.0}
-# ns of it up to which nothing else is looked at first; bounded rows and cones it mostly ends soonest,
-GENERAL_FIRST = {"linear": 0.9e6, "lcp": 2e6, "cone": 2e6, "coulomb": 0.9e6}
-GENERAL_MOST = 1e7  # and up to which nobody looks at the clock in between
-FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries,
+READ = 4.0  # times that what steps over velocities read is read before the first (fitted to curves: 3.6)
+FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries
+
+
+@cache
+def rates() -> dict[str, Any]:
+    """Of `rates.json`, read once."""
+    found: dict[str, Any] = json.loads(RATES.read_text(encoding="utf-8"))
+    return found
+
+
+def of_law(rate: Any, law: str) -> float:
+    """A rate that depends on the law: bounded rows, whether they have bounds or not, and each law of friction."""
+    return float(rate[law if law in rate else "rows"] if isinstance(rate, Mapping) else rate)
+
+
+def sweep_cost(problem: Problem, work: float | None = None) -> float:
+    """Of one sweep [ns]; `work`: its multiply-adds, where they are not those of what `anderson` sweeps over."""
+    return SWEEP[problem.law] * (sweep_work(problem) if work is None else work) + SWEEP_ROW * problem.m
+
+
+def dense_factor(m: float) -> float:
+    """Of m rows [ns]."""
+    return DENSE * float(m) ** 3 / 3.0 + DENSE_ENTRY * float(m) ** 2
+
+
+def sparse_factor(nnz: int, m: int) -> float:
+    """Of a matrix of m rows and nnz entries [ns]."""
+    return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
+
+
+def newton_factor(system: System) -> float:
+    """One symmetric factor of Newton's matrix [ns]."""
+    if not isinstance(system, MatrixSystem):
+        return (BLOCK if system.cost < PANELS else PANEL) * system.cost
+    if system.dense:
+        return dense_factor(system.solve.m)
+    return float(FILLED + FILLED_ENTRY * len(system.sparse.indices) + FILLED_WORK * system.sparse.work)

@@ -147,9 +147,8 @@ def layout() -> dict[str, Any]:
     Returns
     -------
     dict
-        structs: name -> field -> type ("i4", "f8", "3f8", "p" for a pointer); arrays: buffer -> names in order; size,
-        head, setting, joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it
-        writes.
+        structs: name -> field -> type ("i4", "f8", "p" for a pointer); arrays: buffer -> names in order; size, head,
+        setting, joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it writes.
     """
     return {
         "structs": memory.STRUCTS,

@@ -5,59 +5,47 @@ from libc.string cimport memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.core.block cimport COULOMB, has_friction
+from lavender_ext.core.block cimport has_friction
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.flow cimport flow_t
-from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.generalized.islands cimport aim_at, furnish as furnish_flow, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE as G_DONE
 from lavender_ext.generalized.newton cimport SPENT as G_SPENT
 from lavender_ext.generalized.newton cimport descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
-from lavender_ext.judge.measure cimport judge_nothing, scratch_of
-from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
-                                         real_room)
+from lavender_ext.judge.measure cimport judge_nothing
+from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
-from lavender_ext.newton.run cimport VECTORS, impulse_of, lay_vectors, newton_t
-from lavender_ext.newton.scaling cimport (dense_matrix, find_elements, is_known, lay_elements, lay_numbers, scale_elements,
-                                          scaled_index, scaled_real, scaled_t)
+from lavender_ext.newton.run cimport (aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t, own_index,
+                                      own_room, proof_of)
+from lavender_ext.newton.scaling cimport dense_matrix, find_elements, is_known
 from lavender_ext.newton.system cimport DENSE, dense_room
 
 
 cdef struct state_t:            # at the beginning of the caller's float64
     newton_t n
-    scaled_t s
-    bodies_t w
     flow_t f
-    double* rows                # 4 (rows) of the judge, and its scratch
-    double* z                   # (rows)
-    double* proof               # (rows)
 
 
-cdef inline int64_t state_room() noexcept nogil:
-    return sizeof(state_t) // sizeof(double) + 1
+cdef inline int64_t begun_room(const view_t* v) noexcept nogil:
+    """Doubles before those of a form."""
+    return sizeof(state_t) // sizeof(double) + 1 + judge_room(&v.p, v.r, v.g)
 
 
-cdef inline int64_t judge_room(const view_t* v) noexcept nogil:
-    return 6 * <int64_t>v.p.n_rows + scratch_of(v)
-
-
-cdef inline void vanish(double* x, int64_t n) noexcept nogil:
-    memset(x, 0, n * sizeof(double))
-
-
-cdef inline void reference(const view_t* v, state_t* s) noexcept nogil:
-    """Errors of doing nothing, as the judge has them."""
+cdef inline double* begin(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+    """The problem, what is asked, and errors of doing nothing as the judge has them; what is behind (`begun_room`)."""
     cdef double begun[3]
-    cdef newton_t* n = &s.n
-    cdef int64_t m = v.p.n_rows
-    n.problem.p, n.problem.a, n.problem.r, n.problem.g = v.p, v.a, v.r, v.g
-    n.lam, n.problem.w, n.problem.error = s.rows, s.rows + m, s.rows + 2 * m
-    s.z, s.proof, n.problem.x = s.rows + 3 * m, s.rows + 4 * m, s.rows + 6 * m
+    cdef newton_t* n = &(<state_t*>r.real).n
+    memset(r.real, 0, begun_room(v) * sizeof(double))
+    aim(n, &v.p, v.a, v.r, v.g)
+    n.tol, n.budget, n.cold = o.tol, o.budget, o.cold
+    lay_judge(n, r.real + sizeof(state_t) // sizeof(double) + 1)
     judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, False, begun)
     n.problem.e0, n.problem.v0 = begun[0], begun[1]
+    return r.real + begun_room(v)
 
 
 cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
@@ -68,58 +56,27 @@ cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogi
     return enough
 
 
-cdef inline void begin(state_t* s, const asked_t* o, const double* lam, bint coulomb) noexcept nogil:
-    cdef int32_t j
-    cdef newton_t* n = &s.n
-    n.tol, n.budget, n.cold = o.tol, o.budget, o.cold
-    n.without = 0
-    for j in range(n.s.e.m):
-        s.z[j] = lam[n.keep[j] if n.keep != NULL else j] / n.scale[j]
-    newton_start(n, s.z, coulomb)
-
-
 # -- over the rows of A ----------------------------------------------------------------------------------------
 
 
 cdef inline void rows_need(const view_t* v, room_t* r) noexcept nogil:
     """More than enough: as if every row moved, in contacts of six rows."""
     cdef int64_t m = v.p.n_rows
-    cdef bint cones = has_friction(&v.p)
-    r.n_index = scaled_index(m) + 3 * m
-    r.n_real = (state_room() + judge_room(v) + scaled_real(m) + (VECTORS + 5 * 6) * m + 2 * m * m + dense_room(m, cones)
-                + 8)
+    r.n_index = own_index(m)
+    r.n_real = begun_room(v) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, has_friction(&v.p)) + 8
 
 
 cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
-    cdef state_t* s = <state_t*>r.real
-    cdef newton_t* n = &s.n
+    cdef newton_t* n = &(<state_t*>r.real).n
     cdef int64_t m = v.p.n_rows
-    cdef int32_t* index = r.index + scaled_index(m)
-    cdef double* x = r.real + state_room()
-    cdef bint cones
-    vanish(r.real, r.n_real)
-    s.rows = x
-    x += judge_room(v)
-    reference(v, s)
-    lay_elements(&s.s, m, r.index)
-    lay_numbers(&s.s, m, x)
-    find_elements(&s.s, &v.p, v.a, NULL)
-    scale_elements(&s.s, &v.p, v.a, NULL, NULL, NULL)
-    x += scaled_real(m)
-    lay_vectors(n, x, m)
-    x += VECTORS * m
-    n.keep, n.fixed, n.scale, n.speed = s.s.keep, s.s.fixed, s.s.scale, s.s.speed
-    cones = s.s.e.n < s.s.e.m
-    n.s.e = &s.s.e
+    cdef double* x = begin(v, o, r)
+    lay_index(n, m, r.index)
+    find_elements(&n.sc, &v.p, v.a, NULL)
+    x = furnish(n, v.a, NULL, x)
     n.s.form, n.s.wide = DENSE, o.wide
-    n.s.others = NULL
-    n.s.v, n.s.einv, n.s.p, n.s.pair = x, x + s.s.small, x + 2 * s.s.small, x + 3 * s.s.small
-    n.s.bt = x + 4 * s.s.small if cones else NULL
-    x += 5 * s.s.small
     n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
-    n.s.swap, n.s.free, n.exchange.side = index, index + m, index + 2 * m
-    n.s.symmetric = dense_matrix(&s.s, v.a, <int32_t>m, n.s.swap, x)
-    begin(s, o, lam, v.p.law == COULOMB and cones)
+    n.s.symmetric = dense_matrix(&n.sc, v.a, <int32_t>m, n.s.swap, x)
+    newton_start(n, lam)
     return MORE
 
 
@@ -127,18 +84,16 @@ cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, con
 
 
 cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
-    cdef state_t* s = <state_t*>r.real
+    cdef newton_t* n = &(<state_t*>r.real).n
+    cdef double* x = begin(v, o, r)
     cdef pattern_t a
-    cdef int64_t own = state_room() + judge_room(v)
-    lay_pattern(&a, r.index, &v.p, v.r)
-    make_pattern(&a, &v.p, v.r)
-    if not grant(r, index_room(&v.p, v.r), own + real_room(&a, &v.p, v.r)):
+    lay_pattern(n, &a, r.index, &v.p, v.r)
+    find_elements(&n.sc, &v.p, NULL, v.r)
+    make_pattern(&n.sc, &a, v.r)
+    if not grant(r, index_room(&v.p, v.r), begun_room(v) + body_room(n, &a, &v.p, v.r)):
         return ROOM
-    vanish(r.real, r.n_real)
-    s.rows = r.real + state_room()
-    reference(v, s)
-    lay_bodies(&s.n, &s.w, &a, r.real + own, &v.p, v.r)
-    begin(s, o, lam, v.p.law == COULOMB and s.w.s.e.n < s.w.s.e.m)
+    furnish_bodies(n, &a, x, &v.p, v.r)
+    newton_start(n, lam)
     return MORE
 
 
@@ -147,27 +102,20 @@ cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, c
 
 cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
     cdef state_t* s = <state_t*>r.real
+    cdef double* x = begin(v, o, r)
     cdef need_t need
-    cdef flow_t f
     cdef int32_t per = PER_COLUMN
-    cdef int64_t own
     while True:
-        if not grant(r, marks_of(&v.p, v.g, per), state_room() + judge_room(v)):
+        if not grant(r, marks_of(&v.p, v.g, per), begun_room(v)):
             return ROOM
-        settle(&f, &v.p, v.g, per, r.index, &need)
+        settle(&s.f, &v.p, v.g, per, r.index, &need)
         if not need.crowded or 4 * per > v.g.n:
             break
         per *= 2
-    own = state_room() + judge_room(v)
-    if not grant(r, marks_of(&v.p, v.g, per), own + numbers_of(&f, &need)):
+    if not grant(r, marks_of(&v.p, v.g, per), begun_room(v) + numbers_of(&s.f, &need)):
         return ROOM
-    vanish(r.real, own)
-    s.f = f
-    s.rows = r.real + state_room()
-    reference(v, s)
-    furnish(&s.f, &need, r.real + own)
+    furnish_flow(&s.f, &need, x)
     aim_at(&s.f, o.tol, o.budget, s.n.problem.e0, s.n.problem.v0)
-    s.n.budget = o.budget
     return MORE
 
 
@@ -196,7 +144,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
     if o.method != NEWTON or v.p.n_rows == 0:
         return 0
     if v.g != NULL:
-        r.n_index, r.n_real = marks_of(&v.p, v.g, PER_COLUMN), state_room() + judge_room(v)
+        r.n_index, r.n_real = marks_of(&v.p, v.g, PER_COLUMN), begun_room(v)
         return 1
     if not is_known(&v.p):
         return 0
@@ -205,7 +153,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
         return 1
     if v.r != NULL:
         most = index_room(&v.p, v.r)
-        r.n_index, r.n_real = most, state_room() + judge_room(v)
+        r.n_index, r.n_real = most, begun_room(v)
     return most > 0
 
 
@@ -228,7 +176,7 @@ cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r,
     """`work` factorisations or a few more; lam (m) is the best so far."""
     cdef state_t* s = <state_t*>r.real
     cdef newton_t* n = &s.n
-    cdef int32_t how, j
+    cdef int32_t how
     said.direction = NULL
     if v.g != NULL:
         how = step_general(o, s, work, lam)
@@ -240,10 +188,7 @@ cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r,
     impulse_of(n, n.best_z, lam)
     said.factorisations, said.relative = n.s.factorisations, n.best
     if how == CERTIFICATE:
-        vanish(s.proof, v.p.n_rows)
-        for j in range(n.s.e.m):
-            s.proof[n.keep[j] if n.keep != NULL else j] = n.direction[j] * n.scale[j]
-        said.direction = s.proof
+        said.direction = proof_of(n)
     return how
 
 

@@ -4,8 +4,7 @@ One call solves a part over A or over bodies, in room that the caller has. Facto
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
-from libc.stdlib cimport free, malloc
-from libc.string cimport memcmp, memcpy, memset
+from libc.string cimport memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
@@ -14,6 +13,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
+from lavender_ext.few.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE
@@ -132,15 +132,8 @@ cdef inline bint begin_newton(turns_t* t) noexcept nogil:
         return False
     t.said.factorisations = 0
     while True:
-        if t.room.n_index > r.n_index or t.room.n_real > r.n_real:
-            free(r.index)
-            free(r.real)
-            r.n_index, r.n_real = 2 * t.room.n_index, 2 * t.room.n_real
-            r.index = <int32_t*>malloc(r.n_index * sizeof(int32_t))
-            r.real = <double*>malloc(r.n_real * sizeof(double))
-            if r.index == NULL or r.real == NULL:
-                r.n_index = r.n_real = 0
-                return False
+        if not has_room(r, t.room.n_index, t.room.n_real):
+            return False
         t.room.index, t.room.real = r.index, r.real
         t.how = lav_start(&t.s.v, &t.asked, &t.room, t.s.answer)
         if t.how != ROOM:

@@ -14,8 +14,7 @@ from lavender_ext.accelerate.accelerated import allocate, run
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import velocity_change
-from lavender_ext.judge.watch cimport RUNNING
-from lavender_ext.judge.watch import Watch
+from lavender_ext.judge.watch cimport RUNNING, Watch
 from lavender_ext.local import gauss_seidel
 
 cdef enum:
@@ -47,7 +46,8 @@ cdef class Looks:
     cdef readonly Data metric, data
     cdef readonly bint exact
     cdef readonly int split, memory
-    cdef readonly object watch, space, prepared, order, rng     # as `accelerated.run` takes them
+    cdef readonly Watch watch
+    cdef readonly object space, prepared, order, rng     # as `accelerated.run` takes them
     cdef readonly Judged now            # of the last look,
     cdef readonly double before         # relative residual before the last sweeps,
     cdef readonly int last, done        # how many these were, and all of them
@@ -66,10 +66,11 @@ cdef class Looks:
         self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
         self.rng = np.zeros(1, np.uint64)
 
-    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least):
+    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least, bint watched=True):
         """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first look.
 
-        `least`: sweeps left that they promise at most, to go on.
+        `least`: sweeps left that they promise at most, to go on. `watched`: by their watch between two looks as well,
+        whose checks cost as much as the first sweeps.
         """
         cdef Judged now
         cdef int32_t status, last, swept, restarts
@@ -77,8 +78,10 @@ cdef class Looks:
             velocity_change(self.data, lam, self.space[3])
         while True:
             status, last, swept, restarts = run(
-                self.data, self.watch, lam, sweeps, tol, MEMORY, self.prepared, self.exact, 0, self.space, self.order,
-                self.split, 0, self.rng, False)
+                self.data, self.watch, lam, sweeps, tol if watched else 0.0, MEMORY, self.prepared, self.exact, 0,
+                self.space, self.order, self.split, 0, self.rng, False)
+            if not watched:
+                self.watch.state.check_at = self.watch.state.total
             self.done += last
             self.sweeps += swept
             now = Judged(self.metric, lam.copy())

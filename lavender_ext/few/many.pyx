@@ -1,23 +1,24 @@
-"""Many problems in generalised coordinates, one after the other without the interpreter: prepare, solve, judge.
+"""Problems in generalised coordinates, one or many, one after the other without the interpreter: prepare, solve, judge.
 
-The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. Of
-what is worked out of a problem's data the error of doing nothing stays with it; d and Y are made in the same room for
-one after the other, since fresh pages for each cost more than both. A problem that does not end below tol on the judge's
-own measure, has empty rows or is counted to cost more than is asked for, is left to the caller.
+The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. What
+does not end below tol on the judge's own measure, has empty rows or is counted to cost more than is asked for, is left
+to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
-from libc.stdlib cimport calloc, free, malloc
+from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t
+from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
-from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.driver.driver cimport room_t
+from lavender_ext.few.room cimport has_room
 from lavender_ext.generalized.flow cimport flow_t
+from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
@@ -25,22 +26,22 @@ from lavender_ext.judge.score cimport relative, score_t
 
 
 cdef enum:
-    LEFT = 0                    # to the caller
-    SOLVED = 1
-
-cdef enum:
-    STEPS = 64                  # of newton in all, and
-    OF_EACH = 4                 # for each island; as many as `newton` has by default at most
+    STEPS = 128                 # of newton for each island, and in all as many as `newton` has by default
     MOST = 1500
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
-cdef struct gate_t:             # what Newton's method may be counted to cost [ns] to be asked at all
-    double start
-    double row[4]               # by law: linear, lcp, coulomb, cone
-    double factor[4]
-    double count[4]             # factorisations by law
-    double most[4]              # by law
+cdef struct gate_t:             # as `velocities_cost` of lavender/solvers/small.py, ns
+    double step                 # each iteration, as if all islands had theirs at once,
+    double entry                # each multiply-add of a sweep, and
+    double work                 # of a factor
+    double read                 # sweeps before the first iteration
+    double bounded              # iterations by law
+    double coulomb
+    double cone
+    double most                 # what all may cost to be asked at all, and
+    double most_coulomb         # under Coulomb's law
+    double values               # of one island's N
 
 
 cdef struct job_t:
@@ -48,43 +49,13 @@ cdef struct job_t:
     generalized_t g
     made_t made                 # of the data, or in this call; NULL between
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
-    int32_t law                 # as `gate_t.count`
     int32_t cold                # 1: from doing nothing, else from lam as it is
-    int32_t end
+    bint solved
     int32_t counts[5]           # steps, factorisations, updates, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
     score_t score
     double relative, floor
-
-
-cdef struct space_t:            # one after the other in the same room
-    int32_t* marks
-    ssize_t n_marks
-    double* numbers
-    ssize_t n_numbers
-
-
-cdef inline int32_t with_numbers(space_t* s, ssize_t n) noexcept nogil:
-    if n > s.n_numbers:
-        free(s.numbers)
-        s.n_numbers = 2 * n
-        s.numbers = <double*>malloc(s.n_numbers * sizeof(double))
-        if s.numbers == NULL:
-            s.n_numbers = 0
-            return 0
-    return 1
-
-
-cdef inline int32_t with_marks(space_t* s, ssize_t n) noexcept nogil:
-    if n > s.n_marks:
-        free(s.marks)
-        s.n_marks = 2 * n
-        s.marks = <int32_t*>malloc(s.n_marks * sizeof(int32_t))
-        if s.marks == NULL:
-            s.n_marks = 0
-            return 0
-    return 1
 
 
 cdef inline void begin(job_t* j, double* w) noexcept nogil:
@@ -94,75 +65,66 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
 
 
-cdef inline bint is_cheap(const job_t* j, const gate_t* gate, int32_t largest) noexcept nogil:
-    """`general_cost` of lavender/solvers/small.py, in the same order of operations, is no more than the gate lets in."""
-    cdef double flops = <double>j.g.n * (<double>largest * <double>largest) / 6.0
-    if j.law == 2:
-        flops = 2.0 * flops
-    return gate.start + gate.count[j.law] * (gate.row[j.law] * j.p.n_rows + gate.factor[j.law] * flops) <= gate.most[j.law]
+cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) noexcept nogil:
+    cdef double flops = j.g.n * (largest * largest) / 6.0, count = gate.bounded, most = gate.most
+    cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
+    if has_friction(&j.p):
+        count = gate.cone
+        if j.p.law == COULOMB:
+            count, most, flops = gate.coulomb, gate.most_coulomb, 2.0 * flops
+    return gate.entry * gate.read * sweep + count * (gate.step + gate.entry * sweep + gate.work * flops) <= most
 
 
-cdef inline void solve_made(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
+cdef inline bint is_nothing(const job_t* j, double* scratch) noexcept nogil:
+    """Is lam 0, or doing nothing? scratch (2 m)."""
+    cdef int32_t i, m = j.p.n_rows
+    cdef bint zero = True, same = True
+    do_nothing(&j.p, scratch, scratch + m)
+    for i in range(m):
+        zero &= j.lam[i] == 0.0
+        same &= j.lam[i] == scratch[i]
+    return zero or same
+
+
+cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, end, i, steps
-    cdef bint cold = j.cold
-    if j.made.n_empty:
+    cdef int32_t m = j.p.n_rows, steps = MOST
+    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
+        return
+    if j.made.n_empty or not has_room(room, marks_of(&j.p, &j.g, PER_COLUMN), 3 * <ssize_t>m + j.g.n):
         return
     if j.begin[0] < 0.0:
-        if not with_numbers(space, 3 * <ssize_t>m + j.g.n):
-            return
-        begin(j, space.numbers)
-    if not with_marks(space, marks_of(&j.p, &j.g, PER_COLUMN)):
+        begin(j, room.real)
+    settle(&f, &j.p, &j.g, PER_COLUMN, room.index, &need)
+    if need.crowded or need.values > gate.values or not is_cheap(j, gate, need.wide):
         return
-    settle(&f, &j.p, &j.g, PER_COLUMN, space.marks, &need)
-    if need.crowded or need.values > most or not is_cheap(j, gate, need.wide):
+    if not has_room(room, 0, numbers_of(&f, &need)):
         return
-    if not with_numbers(space, numbers_of(&f, &need)):
-        return
-    furnish(&f, &need, space.numbers)
-    if cold:
+    furnish(&f, &need, room.real)
+    if j.cold:
         do_nothing(&j.p, j.lam, j.both)
-    else:                                               # doing nothing, given as a start, is cold as well
-        cold = True
-        for i in range(m):
-            if j.lam[i] != 0.0:
-                cold = False
-                break
-        if not cold:
-            do_nothing(&j.p, j.both, j.both + m)
-            cold = True
-            for i in range(m):
-                if j.lam[i] != j.both[i]:
-                    cold = False
-                    break
-    steps = MOST
-    if f.n_islands < (MOST - STEPS) / OF_EACH:
-        steps = STEPS + OF_EACH * f.n_islands
+    if f.n_islands <= MOST // STEPS:
+        steps = STEPS * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    end = descend_all(&f, j.lam, cold)
-    j.counts[0] = steps - f.steps
-    if end != DONE:
+    if descend_all(&f, j.lam, j.cold or is_nothing(j, j.both)) != DONE:
         return
-    j.counts[1] = f.factorisations
-    j.counts[2] = f.updates
-    j.counts[3] = f.rounds
-    j.counts[4] = f.evaluations
-    if not with_numbers(space, <ssize_t>j.g.n + m):
+    j.counts[0], j.counts[1], j.counts[2] = steps - f.steps, f.factorisations, f.updates
+    j.counts[3], j.counts[4] = f.rounds, f.evaluations
+    if not has_room(room, 0, <ssize_t>j.g.n + m):
         return
     j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, space.numbers, True, &j.score)
+    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, room.real, True, &j.score)
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
-    if j.relative <= tol:
-        j.end = SOLVED
+    j.solved = j.relative <= tol
 
 
-cdef inline void solve_job(job_t* j, space_t* space, const gate_t* gate, double tol, double most) noexcept nogil:
+cdef inline void solve_alone(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
+    """One of many: what was worked out of its data goes with it."""
     cdef bint known = j.made.marks != NULL
-    if not known and make_numbers(&j.p, &j.g, &j.made) != MADE:
-        return
-    solve_made(j, space, gate, tol, most)
+    if j.p.n_rows > 0:
+        solve_job(j, room, gate, tol)
     if not known:
         free(j.made.marks)
         free(j.made.numbers)
@@ -170,102 +132,70 @@ cdef inline void solve_job(job_t* j, space_t* space, const gate_t* gate, double 
     j.made.numbers = NULL
 
 
-cdef inline int32_t law_of(const blocks_t* p) noexcept nogil:
-    """0 where every row is free, 1 where bounds are constants, 2 with Coulomb's friction, 3 with the cone's."""
-    cdef int32_t i, k, law = 0
-    cdef double inf = 1.0 / 0.0
-    for i in range(p.n_blocks):
-        if p.kind[i] != ROW:
-            if p.ptr[i + 1] - p.ptr[i] > 1:
-                return 2 if p.law == COULOMB else 3
-            law = 1
-        elif law == 0:
-            for k in range(p.ptr[i], p.ptr[i + 1]):
-                if p.lower[k] != -inf or p.upper[k] != inf:
-                    law = 1
-                    break
-    return law
-
-
-cdef class Gate:
-    """What Newton's method may be counted to cost to be asked, in the words of `general_cost`.
-
-    Parameters
-    ----------
-    rates : tuple (start, rows, factors, counts)
-        ns; by law.
-    most : tuple
-        ns; by law.
-    """
-    cdef gate_t at
-
-    def __init__(self, rates, most):
-        self.at.start, rows, factors, counts = rates
-        for i in range(4):
-            self.at.row[i], self.at.factor[i], self.at.count[i], self.at.most[i] = rows[i], factors[i], counts[i], most[i]
-
-
-def solve_first(Data p, start, double tol, Gate gate, double most):
-    """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
-
-    From `start` (m,) [N s], or from doing nothing where it is None. What the judge finds and the counts, as
-    `Batch.judged`; False where it does not end below tol, None where it was not tried: it has empty rows or costs more than
-    the gate lets in. d, Y and the error of doing nothing stay with the data.
-    """
-    cdef job_t j
-    cdef space_t space
-    cdef Py_ssize_t m = p.blocks.n_rows
-    cdef double[::1] lam, both
+cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
+    """The problem of `p` from `start` (m,) [N s], or from doing nothing where it is None."""
     cdef const double[::1] given
-    cdef made_t made
-    cdef bint known = p.ready
-    impulse = np.empty(m)
-    results = np.empty(2 * m + 1)
-    lam = impulse
-    both = results
-    j.p = p.blocks
-    j.g = p.general
-    j.begin[0] = p.start_energy
-    j.begin[1] = p.start_velocity
-    j.begin[2] = p.start_relative
-    j.law = law_of(&j.p)
-    j.cold = start is None
+    j.p, j.g = p.blocks, p.general
+    j.made.marks = NULL
+    j.made.numbers = NULL
+    if p.ready:
+        j.made = p.made
+    j.begin[0], j.begin[1], j.begin[2] = p.start_energy, p.start_velocity, p.start_relative
+    j.lam, j.both = lam, both
+    j.solved, j.cold = False, start is None
     if not j.cold:
         given = start
-        memcpy(&lam[0], &given[0], m * sizeof(double))
-    j.lam = &lam[0]
-    j.both = &both[0]
-    j.end = LEFT
-    j.counts[0] = 0
-    space.marks = NULL
-    space.numbers = NULL
-    space.n_marks = space.n_numbers = 0
-    with nogil:
-        if known or make_numbers(&j.p, &j.g, &made) == MADE:
-            if not known:
-                j.made = made
-            else:
-                j.made = p.made
-            solve_made(&j, &space, &gate.at, tol, most)
-        else:
-            j.end = -1
-    free(space.marks)
-    free(space.numbers)
-    if j.end < 0:
-        return None                                     # which `prepare` puts in words
-    if not known:
-        p.adopt(&made)
-    if p.start_energy < 0.0 and j.begin[0] >= 0.0:
-        p.set_start(j.begin[0], j.begin[1])
-        p.start_relative = j.begin[2]
-    if j.end != SOLVED:
-        return False if j.counts[0] > 0 else None
-    return judged_from(p, impulse, results, &j.score, j.relative, j.floor), (
+        if given.shape[0] != j.p.n_rows:
+            raise ValueError(f"{given.shape[0]} numbers for {j.p.n_rows} rows")
+        memcpy(lam, &given[0], j.p.n_rows * sizeof(double))
+
+
+cdef result(job_t* j, Data p, impulse, both):
+    """(What the judge found, counts as of `Newton.run`); doing nothing is kept with the data."""
+    return judged_from(p, impulse, both, &j.score, j.relative, j.floor), (
         j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])
 
 
+cdef void remember(job_t* j, Data p):
+    if p.start_energy < 0.0 and j.begin[0] >= 0.0:
+        p.set_start(j.begin[0], j.begin[1])
+        p.start_relative = j.begin[2]
+
+
+cdef class Gate:
+    """Of the numbers of a `gate_t` (10,)."""
+    cdef gate_t at
+
+    def __init__(self, const double[::1] numbers):
+        self.at = (<const gate_t*>&numbers[0])[0]
+
+
+def solve_first(Data p, start, double tol, Gate gate):
+    """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
+
+    What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, has empty rows or costs
+    more than the gate (`gate_t`) lets in. d, Y and the error of doing nothing stay with the data.
+    """
+    cdef job_t j
+    cdef room_t room = room_t(0, 0, NULL, NULL)
+    cdef Py_ssize_t m = p.blocks.n_rows
+    cdef double[::1] lam, both
+    cdef bint known = p.ready
+    impulse, results = np.empty(m), np.empty(2 * m + 1)
+    lam, both = impulse, results
+    take(&j, p, start, &lam[0], &both[0])
+    with nogil:
+        solve_job(&j, &room, &gate.at, tol)
+        free(room.index)
+        free(room.real)
+    if not known and j.made.numbers != NULL:
+        p.adopt(&j.made)
+    remember(&j, p)
+    return result(&j, p, impulse, results) if j.solved else None
+
+
 cdef class Batch:
-    """Problems and what came of them; `run` once.
+    """Problems and what came of them; of what is worked out of their data the error of doing nothing stays with it.
 
     Parameters
     ----------
@@ -274,85 +204,46 @@ cdef class Batch:
     starts : list of (m,) N s or None
         None: from doing nothing.
     gate : Gate
-    most : float
-        Values of one island's N, as of `Newton`.
     """
 
     cdef job_t* jobs
-    cdef Py_ssize_t n
-    cdef space_t space
     cdef list data
     cdef object impulses, both
-    cdef gate_t gate
-    cdef double tol, most
 
-    def __init__(self, list data, list starts, double tol, Gate gate, double most):
-        cdef Py_ssize_t i, at = 0, n = len(data)
+    def __init__(self, list data, list starts, double tol, Gate gate):
+        cdef Py_ssize_t i, end, done = 0, at = 0, n = len(data)
+        cdef room_t room = room_t(0, 0, NULL, NULL)
         cdef Data p
-        cdef job_t* j
         cdef double[::1] whole, measured
-        cdef const double[::1] given
-        self.data, self.tol, self.most = data, tol, most
-        self.gate = gate.at
-        for i in range(n):
-            p = data[i]
+        self.data = data
+        for p in data:
             at += p.blocks.n_rows
-        self.jobs = <job_t*>calloc(n if n else 1, sizeof(job_t))
+        self.jobs = <job_t*>calloc(n + 1, sizeof(job_t))
         if self.jobs == NULL:
             raise MemoryError(f"{n} problems")
-        self.n = n
         self.impulses = whole = np.empty(at + 1)
         self.both = measured = np.empty(2 * at + n + 1)
         at = 0
+        try:
+            for i in range(n):
+                p = data[i]
+                take(&self.jobs[i], p, starts[i], &whole[0] + at, &measured[0] + 2 * at + i)
+                at += p.blocks.n_rows
+            while done < n:
+                end = done + AT_A_TIME if done + AT_A_TIME < n else n
+                with nogil:
+                    while done < end:
+                        solve_alone(&self.jobs[done], &room, &gate.at, tol)
+                        done += 1
+                PyErr_CheckSignals()
+        finally:
+            free(room.index)
+            free(room.real)
         for i in range(n):
-            p = data[i]
-            j = &self.jobs[i]
-            j.p = p.blocks
-            j.g = p.general
-            j.begin[0] = j.begin[1] = j.begin[2] = -1.0
-            if p.ready:
-                j.made = p.made
-                j.begin[0] = p.start_energy
-                j.begin[1] = p.start_velocity
-            j.law = law_of(&j.p)
-            j.lam = &whole[0] + at
-            j.both = &measured[0] + 2 * at + i
-            j.cold = starts[i] is None
-            if not j.cold:
-                given = starts[i]
-                if given.shape[0] != j.p.n_rows:
-                    raise ValueError(f"{given.shape[0]} numbers for {j.p.n_rows} rows")
-                memcpy(j.lam, &given[0], j.p.n_rows * sizeof(double))
-            at += j.p.n_rows
+            remember(&self.jobs[i], data[i])
 
     def __dealloc__(self):
         free(self.jobs)
-        free(self.space.marks)
-        free(self.space.numbers)
-
-    def run(self):
-        """Solve; how many were."""
-        cdef Py_ssize_t i = 0, end, solved = 0
-        cdef Data p
-        cdef job_t* j
-        while i < self.n:
-            end = i + AT_A_TIME if i + AT_A_TIME < self.n else self.n
-            with nogil:
-                while i < end:
-                    if self.jobs[i].p.n_rows > 0:
-                        solve_job(&self.jobs[i], &self.space, &self.gate, self.tol, self.most)
-                    i += 1
-            PyErr_CheckSignals()
-        for i in range(self.n):
-            j = &self.jobs[i]
-            p = self.data[i]
-            if j.end != SOLVED:
-                continue
-            solved += 1
-            if p.start_energy < 0.0:
-                p.set_start(j.begin[0], j.begin[1])
-                p.start_relative = j.begin[2]
-        return solved
 
     def hand_out(self, type kind, function, common, list at, list made):
         """Into `made`, at the places `at`, an empty `kind` for each problem solved, which knows how to fill itself.
@@ -360,8 +251,8 @@ cdef class Batch:
         Its `_rest` is (function, (common, i)).
         """
         cdef Py_ssize_t i
-        for i in range(self.n):
-            if self.jobs[i].end == SOLVED:
+        for i in range(len(at)):
+            if self.jobs[i].solved:
                 x = object.__new__(kind)
                 x.__dict__["_rest"] = (function, (common, i))
                 made[at[i]] = x
@@ -373,5 +264,4 @@ cdef class Batch:
         impulse = self.impulses[at:at + m].copy()
         impulse.setflags(write=False)
         at = j.both - self.jobs[0].both
-        return judged_from(self.data[i], impulse, self.both[at:at + 2 * m + 1].copy(), &j.score, j.relative, j.floor), (
-            j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])
+        return result(j, self.data[i], impulse, self.both[at:at + 2 * m + 1].copy())

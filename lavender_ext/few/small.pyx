@@ -71,9 +71,10 @@ cdef class Small:
     def run(self, impulse, double tol, bint look, double warm):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
-        look: something else comes next. Is `impulse` a solution? It is no start where its residual is above `warm`.
-        And what pivots find is good where it is below tol, not to rounding alone, with Lemke's path where exchanges are
-        stuck. None where it does not end below tol. What was done is None where `impulse` is the solution.
+        look: something else comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
+        nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
+        with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
+        None where `impulse` is the solution.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
@@ -87,7 +88,7 @@ cdef class Small:
                 before = found.relative
                 if before <= tol:
                     return found, None
-            if not before <= warm:
+            if not before <= (warm if self.pivots else 1.0):
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
         counts = self.solve(own, tol, look)

@@ -19,23 +19,27 @@ from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_time
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
 
-cdef struct wait_t:             # a descent whose steps were used up, to go on with
-    int32_t island              # -1: none waits
-    int32_t worst               # end of the islands before it
-    int32_t cold                # those after it begin from nothing
-    int32_t law                 # that it is under
-    int32_t rounds              # of Coulomb friction before this one
+cdef struct descent_t:          # Newton steps under one law
     int32_t idle
     int32_t n                   # steps of it
     int32_t fresh               # s was formed anew, not moved
     int32_t stale               # N is to be formed anew
+    int32_t known               # lambda and V are those at s
     double share                # of d
-    double kept                 # error of the island's best, which a cut may have found,
-    double least                # of the best that one run knows of,
-    double found                # of the descent's as its caller keeps it,
+    double least                # lowest error, that of `best`,
     double lowest               # and of its own steps
     double last_center
     double sizes[3]             # |G| of the last steps
+
+
+cdef struct wait_t:             # an island whose steps may be used up, to go on with
+    int32_t island              # -1: none waits
+    int32_t worst               # end of the islands before it
+    int32_t cold                # those after it begin from nothing
+    int32_t at                  # of a round of Coulomb friction
+    int32_t rounds              # of Coulomb friction before this one
+    double kept                 # error of the island's best, which a cut may have found,
+    double least                # and of the best that one run knows of
 
 
 cdef struct flow_t:
@@ -92,6 +96,7 @@ cdef struct flow_t:
     int32_t rounds              # of Coulomb friction
     int32_t evaluations         # of lambda(s) along a line
     wait_t wait
+    descent_t descent
 
 
 # -- rows and blocks of a run of panels ------------------------------------------------------------------

@@ -26,8 +26,8 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
 from lavender_ext.core.contact_map cimport length
 from lavender_ext.core.generalized cimport dot
-from lavender_ext.generalized.flow cimport (blank, block_end, block_from, flow_t, gather, measure, renew, respond_all,
-                                            row_end, row_from)
+from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
+                                            respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, newton_step
 from lavender_ext.generalized.sparse cimport is_worth
 
@@ -38,6 +38,11 @@ cdef enum:
     STUCK = 2                   # nothing moves any more
     FAILED = 3                  # a factorisation failed
     LOST = 4                    # numbers are no longer finite
+
+cdef enum:                      # a round of Coulomb friction
+    BEGINS = 0
+    RELAXED = 1                 # descends under the cone law
+    OWN = 2                     # under its own
 
 cdef enum:
     IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
@@ -234,68 +239,55 @@ cdef inline double excess(const flow_t* f, double energy, double velocity) noexc
     return x if x > v else v
 
 
-cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* share, double* least) noexcept nogil:
-    """Newton steps under the law of f.p until the error is `goal` times its limits, or nothing moves.
+cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double least) noexcept nogil:
+    """Newton steps under a law from y, s still to be formed; `best` has that error, or none has."""
+    cdef descent_t* x = &f.descent
+    f.p.law = law
+    x.idle = x.n = x.known = 0
+    x.fresh = x.stale = 1
+    x.share = f.share
+    x.least = least
+    x.lowest = 1.0 / 0.0
+    x.last_center = x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
+    soften(f, island, x.share)
+    renew(f, island)
 
-    The iterate with the least error stands in `best`, that error in least[0]; `share` of d is the softness of rows
-    without one, lowered where the centre's progress is slow. Idle is what does not lower the least error of this
-    descent: the first step of one often leaves a larger one than it began with. Where the steps are used up it waits,
-    and goes on from there when it is called again.
+
+cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nogil:
+    """Newton steps until the error is `goal` times its limits, or nothing moves; SPENT: call again to go on.
+
+    The iterate with the least error stands in `best`; `share` of d is the softness of rows without one, lowered where the
+    centre's progress is slow. Idle is what does not lower the least error of this descent: the first step of one often
+    leaves a larger one than it began with.
     """
-    cdef int32_t a, c, idle = 0, n = 0
-    cdef bint square = f.p.law == COULOMB, rigid, stale = True, fresh = True, known = False, moves
-    cdef double energy, velocity, over, t, size, last_center = -1.0, bound, lowest = 1.0 / 0.0
-    cdef double sizes[3]
-    sizes[0] = sizes[1] = sizes[2] = -1.0
-    if f.wait.island == island:                         # its N, s and lambda are as they were
-        idle = f.wait.idle
-        n = f.wait.n
-        fresh = f.wait.fresh
-        lowest = f.wait.lowest
-        last_center = f.wait.last_center
-        for a in range(3):
-            sizes[a] = f.wait.sizes[a]
-        f.wait.island = -1
-        stale = f.wait.stale
-        known = True
-    else:
-        soften(f, island, share[0])
-        renew(f, island)
+    cdef descent_t* x = &f.descent
+    cdef int32_t a, c
+    cdef bint square = f.p.law == COULOMB, rigid, moves
+    cdef double energy, velocity, over, t, size, bound
     rigid = is_rigid(f, island)
     while True:
-        if not known:
+        if not x.known:
             respond_all(f, island, f.s, f.lam)
-        known = False
+        x.known = 0
         moves = gather(f, island, f.lam, f.u)
         energy = measure(f, island, f.lam, moves, &velocity)
         over = excess(f, energy, velocity)
         if over != over:
             return LOST
-        if over < lowest:
-            idle = idle if over > 0.9 * lowest else 0
-            lowest = over
-        if over < least[0]:
-            least[0] = over
+        if over < x.lowest:
+            x.idle = x.idle if over > 0.9 * x.lowest else 0
+            x.lowest = over
+        if over < x.least:
+            x.least = over
             keep(f, island, f.lam, f.best)
         if over <= goal:
             return DONE
         if f.steps <= 0:
-            f.wait.island = island
-            f.wait.law = f.p.law
-            f.wait.idle = idle
-            f.wait.n = n
-            f.wait.fresh = fresh
-            f.wait.stale = stale
-            f.wait.share = share[0]
-            f.wait.found = least[0]
-            f.wait.lowest = lowest
-            f.wait.last_center = last_center
-            for a in range(3):
-                f.wait.sizes[a] = sizes[a]
+            x.known = 1                                 # N, s and lambda stay as they are
             return SPENT
-        idle += 1
-        n += 1
-        if idle > IDLE_STEPS:
+        x.idle += 1
+        x.n += 1
+        if x.idle > IDLE_STEPS:
             return STUCK
         size = 0.0
         for a in range(f.cptr[island], f.cptr[island + 1]):
@@ -305,53 +297,49 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal, double* shar
         size = sqrt(size)
         if rigid and (size <= 0.1 * energy or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
-            if last_center >= 0.0 and energy > 0.3 * last_center and share[0] > 1e-9:
-                share[0] = 0.1 * share[0]
-                follow(f, island)
-                soften(f, island, share[0])
-                stale = True
-            else:
-                follow(f, island)
-            last_center = energy
+            follow(f, island)
+            if x.last_center >= 0.0 and energy > 0.3 * x.last_center and x.share > 1e-9:
+                x.share = 0.1 * x.share
+                soften(f, island, x.share)
+                x.stale = 1
+            x.last_center = energy
             f.steps -= 1
-            sizes[0] = sizes[1] = sizes[2] = -1.0
+            x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if form(f, island, stale or n % RENEW == 0, square) or stale:
+        if form(f, island, x.stale or x.n % RENEW == 0, square) or x.stale:
             if not factor(f, island, square):
-                if not stale:
-                    stale = True
+                if not x.stale:
+                    x.stale = 1
                     continue
                 return FAILED
-        stale = False
+        x.stale = 0
         newton_step(f, island, square)
         if square:
             bound = size
             for a in range(3):
-                if sizes[a] > bound:
-                    bound = sizes[a]
-            sizes[n % 3] = size
+                if x.sizes[a] > bound:
+                    bound = x.sizes[a]
+            x.sizes[x.n % 3] = size
             t = backtrack(f, island, bound)
         else:
             t = search(f, island)
         if t == 0.0:
-            if fresh:
+            if x.fresh:
                 return STUCK
-            fresh = True                                # s anew, once: rounding may be in the way
-            stale = True
+            x.fresh = x.stale = 1                       # s anew, once: rounding may be in the way
             renew(f, island)
             continue
         for a in range(f.cptr[island], f.cptr[island + 1]):
             c = f.icols[a]
             f.y[c] += t * f.step[c]
         f.still = False
-        if n % RENEW == 0:
+        x.fresh = x.n % RENEW == 0
+        if x.fresh:
             renew(f, island)
-            fresh = True
         else:
             arrive(f)                                   # both ended where they looked last
-            known = True
-            fresh = False
+            x.known = 1
 
 
 cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
@@ -393,7 +381,7 @@ cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept 
         f.y[c] = f.u[c]
 
 
-cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* least, double* kept) noexcept nogil:
+cdef inline bint offer(flow_t* f, int32_t island, const double* lam) noexcept nogil:
     """Keep lam in `first_best` where its error under the problem's own law is less than is kept; phi must be 0.
 
     Is it less than the least?
@@ -402,115 +390,102 @@ cdef inline bint offer(flow_t* f, int32_t island, const double* lam, double* lea
     f.p.law = f.law
     energy = measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     over = excess(f, energy, velocity)
-    if over < kept[0]:
-        kept[0] = over
+    if over < f.wait.kept:
+        f.wait.kept = over
         keep(f, island, lam, f.first_best)
-    if over < least[0]:
-        least[0] = over
+    if over < f.wait.least:
+        f.wait.least = over
         return True
     return False
 
 
-cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse, bint cold, double* least,
-                                 double* kept) noexcept nogil:
-    """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem."""
-    cdef bint waits = f.wait.island == island, convex
-    cdef int32_t n, rounds
-    cdef double found, share
-    for rounds in range(f.wait.rounds if waits else 0, ROUNDS):
-        convex = f.wait.law == CONE if waits else rounds > 0 or cold
-        if convex:
-            f.p.law = CONE
-            found = f.wait.found if waits else 1.0 / 0.0
-            share = f.wait.share if waits else f.share
-            if waits:
-                keep(f, island, f.aside, f.phi)
-            else:
-                f.rounds += 1
-            waits = False
-            n = descend(f, island, 1e-2 * least[0] if least[0] > 1e2 else 1.0, &share, &found)
+cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noexcept nogil:
+    """Rounds of Newton's method on Coulomb's law, each from the answer of a convex problem, on from where they wait.
+
+    What a descent that waits began with, phi or the impulse, stands `aside`: the best so far is in its place.
+    """
+    cdef wait_t* x = &f.wait
+    cdef int32_t n
+    cdef double least
+    if x.at == RELAXED:
+        keep(f, island, f.aside, f.phi)
+    elif x.at == OWN:
+        keep(f, island, f.aside, impulse)
+    while x.rounds < ROUNDS:
+        least = x.least
+        if x.at == BEGINS:
+            f.rounds += 1
+            x.at = RELAXED if x.rounds > 0 or x.cold else OWN
+            if x.at == OWN:
+                restart(f, island, impulse)
+            begin_descent(f, island, CONE if x.at == RELAXED else COULOMB, 1.0 / 0.0)
+        f.p.law = CONE if x.at == RELAXED else COULOMB
+        n = descend(f, island, 1e-2 * least if x.at == RELAXED and least > 1e2 else 1.0)
+        if x.at == RELAXED:
             if n == LOST or n == FAILED:
                 return n
             if n == SPENT:
-                f.wait.rounds = rounds
-                f.wait.least = least[0]
                 keep(f, island, f.phi, f.aside)
             keep(f, island, f.best, impulse)
             level(f, island)
-            offer(f, island, impulse, least, kept)
-            if least[0] <= 1.0:
-                f.wait.island = -1
-                return DONE
-            if n == SPENT:
-                return SPENT
-        if waits:
-            keep(f, island, f.aside, impulse)
+            offer(f, island, impulse)
         else:
-            if not convex:
-                f.rounds += 1
-            restart(f, island, impulse)
-        f.p.law = COULOMB
-        found = f.wait.found if waits else 1.0 / 0.0
-        share = f.wait.share if waits else f.share
-        waits = False
-        n = descend(f, island, 1.0, &share, &found)
-        if n == SPENT:
-            f.wait.rounds = rounds
-            f.wait.least = least[0]
-            keep(f, island, impulse, f.aside)
-        if n != LOST and offer(f, island, f.best, least, kept):
-            keep(f, island, f.best, impulse)
-        if least[0] <= 1.0:
-            f.wait.island = -1
+            if n == SPENT:
+                keep(f, island, impulse, f.aside)
+            if n != LOST and offer(f, island, f.best):
+                keep(f, island, f.best, impulse)
+        if x.least <= 1.0:
             return DONE
         if n == SPENT:
+            x.least = least                             # as if nobody had looked
             return SPENT
-        lower_normals(f, island, impulse)
+        if x.at == OWN:
+            lower_normals(f, island, impulse)
+            x.rounds += 1
         restart(f, island, impulse)
+        x.at = OWN if x.at == RELAXED else BEGINS
+        if x.at == OWN:
+            begin_descent(f, island, COULOMB, 1.0 / 0.0)
     return STUCK
 
 
-cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse, bint cold) noexcept nogil:
+cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """One island from `impulse`, or from where it waits, into it; how it ended."""
     cdef int32_t end
-    cdef double least = 1.0 / 0.0, kept = 1.0 / 0.0, share = f.share
+    cdef bint waits = f.wait.island == island
     f.island = island
     f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
-    if f.wait.island == island:
-        least = f.wait.least
-        kept = f.wait.kept
-        share = f.wait.share
-    else:
+    if not waits:
         restart(f, island, impulse)
         level(f, island)
-        if not offer(f, island, impulse, &least, &kept):
+        f.wait.at, f.wait.rounds = BEGINS, 0
+        f.wait.least = f.wait.kept = 1.0 / 0.0
+        if not offer(f, island, impulse):
             return LOST
-        if least <= 1.0:
+        if f.wait.least <= 1.0:
             return DONE
     if f.law == COULOMB:
-        end = with_coulomb(f, island, impulse, cold, &least, &kept)
-        f.wait.kept = kept
+        end = with_coulomb(f, island, impulse)
         keep(f, island, f.first_best, impulse)
     else:
-        end = descend(f, island, 1.0, &share, &least)
-        f.wait.least = least
+        if not waits:
+            begin_descent(f, island, f.law, f.wait.least)
+        end = descend(f, island, 1.0)
         keep(f, island, f.best, impulse)
+    f.wait.island = island if end == SPENT else -1
     return end
 
 
 cdef inline int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
     """All islands from `impulse` (m), or from the one that waits on, into it: DONE, or how the worst of them ended."""
-    cdef int32_t i, end, first = 0, worst = DONE
-    if f.wait.island >= 0:
-        first = f.wait.island
-        worst = f.wait.worst
-        cold = f.wait.cold
+    cdef int32_t i, end, first = f.wait.island
+    if first < 0:
+        first = 0
+        f.wait.worst, f.wait.cold = DONE, cold
     for i in range(first, f.n_islands):
-        end = solve_island(f, i, impulse, cold)
+        end = solve_island(f, i, impulse)
         if end == SPENT:                                # N is of this one
-            f.wait.worst = worst
-            f.wait.cold = cold
             return SPENT
-        if end > worst:
-            worst = end
-    return worst
+        if end > f.wait.worst:
+            f.wait.worst = end
+    return f.wait.worst

@@ -1,4 +1,4 @@
-"""What a host without Python needs beside the kernels: layouts, settings, values, copies, room.
+"""What a host without Python needs beside the kernels: layouts, values, room.
 
 Such a host (WebAssembly) allocates every buffer and struct itself, so it must know where things lie. It asks
 here instead of counting bytes, and what the compiler answers is compared with what the host expects.
@@ -13,30 +13,10 @@ import numpy as np
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_ITERATIONS, H_NEED_CONTACTS, H_NEED_PAIRS,
-                                         H_ORDER, H_PAIRS_VALID, H_POSITION_ITERATIONS, H_SEED, H_WARM_START,
-                                         N_CACHE_IMPULSE, N_JOINT, N_SIZES, S_MARGIN, S_MATCH, S_OUT, S_SKIN, bind,
-                                         engine_t)
+from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID,
+                                         N_CACHE_IMPULSE, N_JOINT, N_SIZES, S_OUT, bind, engine_t)
 from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals
 from lavender_ext.judge.score cimport score_t
-
-
-cdef struct settings_t:
-    int32_t iterations          # sweeps
-    int32_t warm_start          # 0 or 1
-    int32_t position_iterations
-    int32_t order               # as engine/arrays.pxd numbers them
-    int32_t seed
-    int32_t unused              # 0
-    double h                    # s, substep; from here on as engine/arrays.pxd has `setting`
-    double gravity[3]           # m/s^2
-    double slop                 # m
-    double margin               # m
-    double skin                 # m
-    double beta                 # -
-    double max_push             # m
-    double bounce               # m/s
-    double match_distance       # m
 
 
 cdef inline int32_t apart(const void* base, const void* field) noexcept nogil:
@@ -49,7 +29,6 @@ cdef public void lav_layout(int32_t* out) noexcept nogil:
     cdef csr_t a
     cdef rows_t r
     cdef score_t s
-    cdef settings_t t
     out[0] = <int32_t>sizeof(blocks_t)
     out[1] = apart(&p, &p.n_blocks)
     out[2] = apart(&p, &p.n_rows)
@@ -93,52 +72,6 @@ cdef public void lav_layout(int32_t* out) noexcept nogil:
     out[40] = apart(&s, &s.floor_velocity)
     out[41] = apart(&s, &s.worst)
     out[42] = apart(&s, &s.finite)
-    out[43] = <int32_t>sizeof(settings_t)
-    out[44] = apart(&t, &t.iterations)
-    out[45] = apart(&t, &t.warm_start)
-    out[46] = apart(&t, &t.position_iterations)
-    out[47] = apart(&t, &t.order)
-    out[48] = apart(&t, &t.seed)
-    out[49] = apart(&t, &t.unused)
-    out[50] = apart(&t, &t.h)
-    out[51] = apart(&t, &t.gravity)
-    out[52] = apart(&t, &t.slop)
-    out[53] = apart(&t, &t.margin)
-    out[54] = apart(&t, &t.skin)
-    out[55] = apart(&t, &t.beta)
-    out[56] = apart(&t, &t.max_push)
-    out[57] = apart(&t, &t.bounce)
-    out[58] = apart(&t, &t.match_distance)
-
-
-cdef public void lav_engine_read_settings(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                          settings_t* out) noexcept nogil:
-    cdef engine_t e
-    cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    out.iterations = e.head[H_ITERATIONS]
-    out.warm_start = e.head[H_WARM_START]
-    out.position_iterations = e.head[H_POSITION_ITERATIONS]
-    out.order = e.head[H_ORDER]
-    out.seed = e.head[H_SEED]
-    out.unused = 0
-    copy_reals(e.setting, &out.h, S_MATCH + 1)          # from h to match_distance they stand in one order
-
-
-cdef public void lav_engine_write_settings(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                           const settings_t* given) noexcept nogil:
-    """Settings from the next substep on; the pair list is made anew, since margin and skin are its own."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    e.head[H_ITERATIONS] = given.iterations
-    e.head[H_WARM_START] = given.warm_start
-    e.head[H_POSITION_ITERATIONS] = given.position_iterations
-    e.head[H_ORDER] = given.order
-    e.head[H_SEED] = given.seed
-    if e.setting[S_MARGIN] != given.margin or e.setting[S_SKIN] != given.skin:
-        e.head[H_PAIRS_VALID] = 0
-    copy_reals(&given.h, e.setting, S_MATCH + 1)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -150,17 +83,6 @@ cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* i
     bind(size, real, index, keys, &e, n)
     for k in range(8):
         out[k] = e.setting[S_OUT + k]
-
-
-cdef public void lav_engine_copy(const int32_t* size, const double* real, const int32_t* index, const uint64_t* keys,
-                                 double* to_real, int32_t* to_index, uint64_t* to_keys) noexcept nogil:
-    """All three buffers: a snapshot is a copy, and restoring one is a copy back."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    bind(size, to_real, to_index, to_keys, &e, n)
-    copy_reals(real, to_real, n[0])
-    copy_ints(index, to_index, n[1])
-    copy_keys(keys, to_keys, n[2])
 
 
 cdef inline int32_t quarter_more(int32_t need) noexcept nogil:
@@ -220,11 +142,6 @@ STRUCTS = {
     "score_t": {
         "energy": "f8", "velocity": "f8", "floor_energy": "f8", "floor_velocity": "f8", "worst": "i4", "finite": "i4",
     },
-    "settings_t": {
-        "iterations": "i4", "warm_start": "i4", "position_iterations": "i4", "order": "i4", "seed": "i4",
-        "unused": "i4", "h": "f8", "gravity": "3f8", "slop": "f8", "margin": "f8", "skin": "f8", "beta": "f8",
-        "max_push": "f8", "bounce": "f8", "match_distance": "f8",
-    },
 }
 
 
@@ -234,19 +151,6 @@ def layout():
     lav_layout(&out[0])
     numbers = iter(np.asarray(out).tolist())
     return {name: (next(numbers), {field: next(numbers) for field in fields}) for name, fields in STRUCTS.items()}
-
-
-def read_settings(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
-    """The bytes of settings_t."""
-    cdef settings_t out
-    lav_engine_read_settings(&size[0], &real[0], &index[0], &keys[0], &out)
-    return (<char*>&out)[:sizeof(settings_t)]
-
-
-def write_settings(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys,
-                   const settings_t[::1] given):
-    """From one settings_t, a structured array (1,)."""
-    lav_engine_write_settings(&size[0], &real[0], &index[0], &keys[0], &given[0])
 
 
 def more_room(const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):

@@ -8,7 +8,8 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.newton.elements cimport Elements, elements_t
+from lavender_ext.newton.elements cimport elements_t
+from lavender_ext.newton.solve cimport Solve
 
 
 cdef public int32_t lav_element_graph(int32_t n, const int32_t* ptr, const int32_t* element, const int32_t* indptr,
@@ -161,7 +162,7 @@ def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const doub
     return out_array
 
 
-def coupled(Elements e, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
+def coupled(Solve s, const int32_t[::1] to, const int32_t[::1] other, const int32_t[::1] indptr,
             const double[::1] h, const double[::1] left, right, double own, double[::1] out):
     """(1); right may be None."""
     cdef const double[::1] r
@@ -170,4 +171,4 @@ def coupled(Elements e, const int32_t[::1] to, const int32_t[::1] other, const i
         r = right
         second = &r[0]
     with nogil:
-        lav_coupled(&e.e, &to[0], &other[0], &indptr[0], &h[0], &left[0], second, own, &out[0])
+        lav_coupled(s.n.s.e, &to[0], &other[0], &indptr[0], &h[0], &left[0], second, own, &out[0])

@@ -40,12 +40,6 @@ cdef struct elements_t:
     const double* ar            # (n) a_r, read on CONTACT_ROLLING
 
 
-cdef class Elements:
-    cdef elements_t e
-    cdef list keep
-    cdef readonly int m, n, n_small
-
-
 cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
     # Gauss-Jordan with row pivots; a is lost. A zero pivot leaves zeros in its column.
     cdef int32_t i, j, k, best

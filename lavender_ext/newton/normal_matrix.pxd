@@ -5,13 +5,6 @@ from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.newton.elements cimport elements_t
 
 
-cdef class Factor:
-    cdef factor_t f
-    cdef list keep
-    cdef readonly int n, s
-    cdef bint lu, unsymmetric
-
-
 cdef inline void add_product(double* out, const double* left, const double* right, int32_t nr,
                              const int32_t s) noexcept nogil:
     # out += left^T right, (nr, 2 s) rows of which s columns are read

@@ -20,7 +20,7 @@ from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchan
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
                                       PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, WALKS, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
-                                      take_back, tries_t, with_products)
+                                      take_back, tries_t, unknown_of, with_products)
 from lavender_ext.newton.steps cimport begin_interior, delta_of, interior_step
 from lavender_ext.newton.system cimport BODIES, DENSE, OF_BARRIER, system_factor, system_natural, system_solve, system_times
 
@@ -77,7 +77,7 @@ cdef inline void refine(newton_t* n, double* z, int32_t most, double contraction
         size = fast = 0.0
         for j in range(m):
             size += n.r[j] * n.r[j]
-            x = n.speed[j] * (n.r[j] if n.r[j] > 0.0 else -n.r[j])
+            x = n.sc.speed[j] * (n.r[j] if n.r[j] > 0.0 else -n.r[j])
             fast = x if x > fast else fast
         size = sqrt(size)                               # |F| where every row still holds
         found = relative(size, fast, n.problem.e0, n.problem.v0)
@@ -310,8 +310,8 @@ cdef inline void go(newton_t* n) noexcept nogil:
         go_rounds(n, phase // WALKS)
 
 
-cdef inline void newton_start(newton_t* n, const double* z, bint coulomb) noexcept nogil:
-    """From z (m), with system, problem, vectors, tol and budget given; `coulomb`: that law, and a contact that rubs."""
+cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
+    """From lam (rows), with problem, system, tol and budget given."""
     cdef int32_t i
     n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = 0
     n.s.augmented = n.s.factorisations = 0
@@ -320,10 +320,11 @@ cdef inline void newton_start(newton_t* n, const double* z, bint coulomb) noexce
     n.best = 1.0 / 0.0
     n.floor = 0.0
     n.loops = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= LARGEST_AUGMENTED
-    take(n, n.best_z, z)
-    score(n, z)
+    unknown_of(n, lam, n.trial)
+    take(n, n.best_z, n.trial)
+    score(n, n.trial)
     if not done(n):
-        enter(n, PLAN_COULOMB if coulomb else PLAN_CONVEX)
+        enter(n, PLAN_COULOMB if n.problem.p.law == COULOMB and n.s.e.n < n.s.e.m else PLAN_CONVEX)
 
 
 cdef inline int32_t newton_step(newton_t* n, int32_t work) noexcept nogil:

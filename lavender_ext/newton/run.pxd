@@ -4,16 +4,18 @@ A point counts by the judge's relative residual alone (`score`). Phases stand on
 at a time, so that whoever asked can look at a clock in between.
 """
 from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
+from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.judge.measure cimport judge_view, relative_of
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.newton.natural_map cimport convex_error
+from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
 from lavender_ext.newton.system cimport system_t, system_times
 
 
@@ -44,7 +46,7 @@ cdef enum:                      # what is counted
 
 cdef enum:
     DEEP = 8                    # of the stack
-    VECTORS = 35                # (m) of `lay_vectors`
+    VECTORS = 31                # (m) of `lay_vectors`
     INNER = 20                  # Newton steps of one proximal round at most
 
 
@@ -144,13 +146,11 @@ cdef struct tries_t:            # De Saxce's interior points
     int32_t augmented
 
 
-cdef struct newton_t:
+cdef struct newton_t:           # may not move once it is furnished
     system_t s
+    scaled_t sc
+    factor_t blocks             # of s over bodies
     problem_t problem
-    const double* scale         # (m) D^-1/2
-    const double* fixed         # (rows) impulse of rows that do not move
-    const int32_t* keep         # (m) rows that do, or NULL: all
-    const double* speed         # (m) velocity error per unit of the natural map
     double tol
     int32_t budget              # factorisations
     int32_t most                # of this turn
@@ -176,6 +176,7 @@ cdef struct newton_t:
     double* before_z
     double* direction
     double* lam                 # (rows)
+    double* proof               # (rows) `direction` as an impulse
     double* f
     double* r
     double* da
@@ -198,6 +199,46 @@ cdef struct newton_t:
     tries_t tries
 
 
+# -- places in the caller's room -----------------------------------------------------------------------------------
+
+
+cdef inline void aim(newton_t* n, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g) noexcept nogil:
+    """The problem that is judged, by one of a, r, g."""
+    n.problem.p, n.problem.a, n.problem.r, n.problem.g = p[0], a, r, g
+
+
+cdef inline int64_t judge_room(const blocks_t* p, const rows_t* r, const generalized_t* g) noexcept nogil:
+    """Doubles that `lay_judge` hands out."""
+    cdef int64_t m = p.n_rows
+    if r != NULL:
+        return 4 * m + 12 * <int64_t>r.n_bodies
+    return 4 * m + (g.n + m if g != NULL else 0)
+
+
+cdef inline double* lay_judge(newton_t* n, double* room) noexcept nogil:
+    """What the judge writes to, of `aim`; what is behind it."""
+    cdef int64_t m = n.problem.p.n_rows
+    n.lam, n.proof = room, room + m
+    n.problem.w, n.problem.error, n.problem.x = room + 2 * m, room + 3 * m, room + 4 * m
+    return room + judge_room(&n.problem.p, n.problem.r, n.problem.g)
+
+
+cdef inline int64_t own_index(int64_t m) noexcept nogil:
+    """Whole numbers that `lay_index` hands out, of m rows."""
+    return scaled_index(m) + 3 * m
+
+
+cdef inline void lay_index(newton_t* n, int64_t m, int32_t* index) noexcept nogil:
+    lay_elements(&n.sc, m, index)
+    index += scaled_index(m)
+    n.exchange.side, n.s.swap, n.s.free = index, index + m, index + 2 * m
+
+
+cdef inline int64_t own_room(int64_t m, int64_t small) noexcept nogil:
+    """Doubles that `furnish` hands out, of m rows and so many entries of small matrices."""
+    return scaled_real(m) + VECTORS * m + 5 * small
+
+
 cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogil:
     """Places in room (VECTORS m)."""
     cdef double** at[VECTORS]
@@ -210,8 +251,35 @@ cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogi
     at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.everything, &n.exchange.z, &n.exchange.hz
     at[24], at[25], at[26], at[27] = &n.exchange.kept, &n.look.kept, &n.polish.z, &n.walk[0].z
     at[28], at[29], at[30] = &n.walk[1].z, &n.s.t, &n.s.q
-    for i in range(31):
+    for i in range(VECTORS):
         at[i][0] = room + i * m
+
+
+cdef inline double* furnish(newton_t* n, const csr_t* a, const rows_t* r, double* room) noexcept nogil:
+    """Elements of A or of bodies (`find_elements`) scaled, with vectors and small matrices; what is behind them.
+
+    What factors is still to come: form, symmetric and what belongs to the form.
+    """
+    cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
+    cdef int32_t j
+    cdef double* x = room + scaled_real(rows)
+    memset(room, 0, own_room(rows, small) * sizeof(double))
+    lay_numbers(&n.sc, rows, room)
+    scale_elements(&n.sc, &n.problem.p, a, r, n.problem.w, n.problem.x)
+    lay_vectors(n, x, rows)
+    x += VECTORS * rows
+    n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = x, x + small, x + 2 * small, x + 3 * small, x + 4 * small
+    for j in range(n.sc.e.m):
+        if n.sc.e.theta[j] != 0.0:                      # B is for rigid cones
+            n.s.bt = NULL
+    if n.sc.e.n == n.sc.e.m:
+        n.s.bt = NULL
+    n.s.e, n.s.f, n.s.others = &n.sc.e, &n.blocks, NULL
+    n.s.wide = n.s.augmented = n.s.factorisations = n.without = 0
+    return x + 5 * small
+
+
+# -- the best point ------------------------------------------------------------------------------------------------
 
 
 cdef inline void take(newton_t* n, double* to, const double* x) noexcept nogil:
@@ -233,13 +301,25 @@ cdef inline void leave(newton_t* n) noexcept nogil:
 cdef inline void impulse_of(const newton_t* n, const double* z, double* lam) noexcept nogil:
     """lambda (rows) of z."""
     cdef int32_t j
-    if n.keep == NULL:
-        for j in range(n.s.e.m):
-            lam[j] = z[j] * n.scale[j]
-        return
-    memcpy(lam, n.fixed, n.problem.p.n_rows * sizeof(double))
+    memcpy(lam, n.sc.fixed, n.problem.p.n_rows * sizeof(double))
     for j in range(n.s.e.m):
-        lam[n.keep[j]] = z[j] * n.scale[j]
+        lam[n.sc.keep[j]] = z[j] * n.sc.scale[j]
+
+
+cdef inline void unknown_of(const newton_t* n, const double* lam, double* z) noexcept nogil:
+    """z of lambda (rows)."""
+    cdef int32_t j
+    for j in range(n.s.e.m):
+        z[j] = lam[n.sc.keep[j]] / n.sc.scale[j]
+
+
+cdef inline const double* proof_of(newton_t* n) noexcept nogil:
+    """`direction` on all rows."""
+    cdef int32_t j
+    memset(n.proof, 0, n.problem.p.n_rows * sizeof(double))
+    for j in range(n.s.e.m):
+        n.proof[n.sc.keep[j]] = n.direction[j] * n.sc.scale[j]
+    return n.proof
 
 
 cdef inline double judged(newton_t* n, const double* z, bint floor) noexcept nogil:
@@ -267,7 +347,7 @@ cdef inline double score(newton_t* n, const double* z) noexcept nogil:
 cdef inline double relative_at(newton_t* n, const double* z, const double* hz) noexcept nogil:
     """The judge's residual of the convex law from hz = H z."""
     cdef double energy, velocity
-    convex_error(n.s.e, z, hz, n.speed, &energy, &velocity)
+    convex_error(n.s.e, z, hz, n.sc.speed, &energy, &velocity)
     return relative(energy, velocity, n.problem.e0, n.problem.v0)
 
 

@@ -1,24 +1,29 @@
 """Newton's method on one scaled problem for Python: `plan.pxd` turn by turn, and its systems one by one for tests."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
+from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
+from lavender_ext.core.rows cimport rows_t
+from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.elements cimport Elements
-from lavender_ext.newton.normal_matrix cimport Factor
+from lavender_ext.newton.bodies cimport find_groups, narrow_panel, panel_of
+from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport (CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK, newton_start, newton_step)
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, POLISH, PROXIMAL, PURSUIT,
-                                      RELAXED, VECTORS, lay_vectors, newton_t, relative_at)
+                                      RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
+                                      own_index, own_room, proof_of, relative_at)
+from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (BODIES, DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
                                          system_natural, system_solve, system_times)
 
 OUTCOMES = {"more": MORE, "reached": REACHED, "floor": FLOOR, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT}
-FORMS = {"velocity": BODIES, "dense": DENSE, "sparse": SPARSE}
 WHATS = {"barrier": OF_BARRIER, "pair": OF_PAIR, "natural": OF_NATURAL}
 #: Phases by the bits of `Solve.without`.
 PHASES = {
@@ -69,92 +74,172 @@ cdef void call_solve(void* at, int32_t augmented, double* x) noexcept with gil:
 
 
 cdef class Solve:
-    """A scaled problem and its Newton systems; `start`, then `step` after `step`.
+    """A problem as Newton's method has it, and what factors it by one of `over_...`; `start`, then `step` after `step`.
 
-    Every array is C-contiguous, float64 or int32, of m rows that move (`keep`, None: all), checked by the caller.
-    matrix: H (m, m), or its (indptr, indices, data), or the `Factor` over bodies. others: who factors what is not
-    factored here, or None.
+    Fixed rows (equal bounds, mu = 0 tangents, empty rows) are taken out: keep (m,) are the rows that move, block (n,) that
+    of each element, fixed (rows,) the impulse of the others; scale (m,) is D^-1/2; ptr, kind, wptr, lower, upper, theta, g,
+    a_t and a_s are those of `elements_t`, v, einv, p, pair and bt its small matrices.
+
+    Parameters
+    ----------
+    data : Data
+        With d and nu, its error of doing nothing known.
+    matrix : Data or None
+        Of A in compressed rows; None: over the bodies of `data`.
     """
 
-    def __init__(self, Data data, Elements e, matrix, bint symmetric, bint cones, scale, fixed, keep, speed, others=None,
-                 bint wide=True):
+    def __init__(self, Data data, Data matrix=None):
         cdef newton_t* n = &self.n
-        cdef Factor f
-        cdef int rows = data.blocks.n_rows
-        m = self.m = e.m
-        small = np.zeros((5, e.n_small + 1))
-        self.v, self.einv, self.p, self.pair = small[:4, : e.n_small]
-        room = np.zeros(VECTORS * m + 1)
-        judge = np.empty(3 * rows + 12 * data.rows.n_bodies * data.factored + (data.general.n + rows) * data.is_general + 1)
-        marks = np.zeros((3, m + 1), np.int32)
-        self.keep = [data, e, matrix, scale, fixed, keep, speed, small, room, judge, marks]
-        cdef double[::1] r = room
-        cdef double[::1] j = judge
-        cdef double[:, ::1] w = small
-        cdef int32_t[:, ::1] k = marks
-        lay_vectors(n, &r[0], m)
-        n.scale, n.fixed, n.speed = <double*>address(scale), <double*>address(fixed), <double*>address(speed)
-        n.keep = NULL
-        if keep is not None:
-            n.keep = <int32_t*>address(keep)
-        n.problem.p = data.blocks
-        n.problem.a = NULL
-        n.problem.r = NULL
-        n.problem.g = NULL
+        cdef const csr_t* a = NULL
+        cdef const rows_t* r = NULL
+        cdef int64_t rows = data.blocks.n_rows, k
+        aim(n, &data.blocks, NULL, NULL, NULL)
+        n.problem.e0, n.problem.v0 = data.start_energy, data.start_velocity
         if data.is_general:
             n.problem.g = &data.general
         elif data.factored:
             n.problem.r = &data.rows
         else:
             n.problem.a = &data.csr
-        n.problem.e0, n.problem.v0 = data.start_energy, data.start_velocity
-        n.lam, n.problem.w, n.problem.error, n.problem.x = &j[0], &j[0] + rows, &j[0] + 2 * rows, &j[0] + 3 * rows
-        n.exchange.side = &k[0, 0]
-        n.s.e = &e.e
-        n.s.symmetric, n.s.wide = symmetric, wide and has_wide()
-        n.without = 0
-        n.s.augmented = n.s.factorisations = 0
-        n.s.v, n.s.einv, n.s.p, n.s.pair = &w[0, 0], &w[1, 0], &w[2, 0], &w[3, 0]
-        n.s.bt = NULL
-        if cones:
-            n.s.bt = &w[4, 0]
-            self.bt = small[4, : e.n_small]
-        n.s.swap, n.s.free = &k[1, 0], &k[2, 0]
-        n.s.others = NULL
-        self.others = others
-        self.calls = others_t(<void*>self, call_factor, call_solve)
-        if others is not None:
-            n.s.others = &self.calls
-        if isinstance(matrix, Factor):
-            f = matrix
-            n.s.form = BODIES
-            n.s.f = &f.f
-            self._hold_bodies(f.n * f.s)
-        elif isinstance(matrix, tuple):
-            n.s.form = SPARSE
-            n.s.a.indptr, n.s.a.indices = <int32_t*>address(matrix[0]), <int32_t*>address(matrix[1])
-            n.s.a.data = <double*>address(matrix[2])
+        if matrix is not None:
+            a = &matrix.csr
         else:
-            n.s.form = DENSE
-            n.s.h = <double*>address(matrix)
-            self._hold_dense(cones)
+            r = &data.rows
+        judge = np.empty(judge_room(&n.problem.p, n.problem.r, n.problem.g) + 1)
+        self.index = np.empty(own_index(rows) + 1, np.int32)
+        self.data, self.held = data, [matrix, judge]
+        lay_judge(n, <double*>address(judge))
+        lay_index(n, rows, <int32_t*>address(self.index))
+        find_elements(&n.sc, &n.problem.p, a, r)
+        self.real = np.empty(own_room(rows, n.sc.small) + 1)
+        furnish(n, a, r, <double*>address(self.real))
+        m = self.m = n.sc.e.m
+        k = n.sc.e.n
+        self.keep, self.block, self.ptr = self._whole(n.sc.keep, m), self._whole(n.sc.block, k), self._whole(n.sc.e.ptr, k + 1)
+        self.kind, self.wptr = self._whole(n.sc.e.kind, k), self._whole(n.sc.e.wptr, k + 1)
+        self.fixed, self.scale = self._real(n.sc.fixed, rows), self._real(n.sc.scale, m)
+        self.theta, self.g = self._real(n.sc.e.theta, m), self._real(n.sc.e.g, m)
+        self.lower, self.upper = self._real(n.sc.e.lower, m), self._real(n.sc.e.upper, m)
+        self.a_t, self.a_s = self._real(n.sc.e.at, k), self._real(n.sc.e.as_, k)
+        self.v, self.einv = self._real(n.s.v, n.sc.small), self._real(n.s.einv, n.sc.small)
+        self.p, self.pair = self._real(n.s.p, n.sc.small), self._real(n.s.pair, n.sc.small)
+        self.bt = self._real(n.s.bt, n.sc.small) if n.s.bt != NULL else None
+        self.calls = others_t(<void*>self, call_factor, call_solve)
 
-    def _hold_bodies(self, int unknowns):
-        cdef double[::1] y = np.zeros(unknowns + 1)
-        self.keep.append(y)
-        self.n.s.y = &y[0]
+    cdef _real(self, const double* at, Py_ssize_t n):
+        cdef Py_ssize_t i = at - <double*>address(self.real)
+        return self.real[i:i + n]
 
-    def _hold_dense(self, bint cones):
-        cdef double[::1] whole = np.empty(self.m * self.m + 1), lower = np.empty(dense_room(self.m, cones) + 1)
-        self.keep += [whole, lower]
-        self.n.s.whole, self.n.s.lower = &whole[0], &lower[0]
+    cdef _whole(self, const int32_t* at, Py_ssize_t n):
+        cdef Py_ssize_t i = at - <int32_t*>address(self.index)
+        return self.index[i:i + n]
 
-    def start(self, const double[::1] z, double tol, int budget, bint coulomb, bint cold):
-        """From z (m,), to a relative residual of tol, with so many factorisations; `coulomb`: a contact rubs so."""
-        self.n.tol, self.n.budget, self.n.cold = tol, budget, cold
+    @property
+    def whole(self):
+        """Every row moves."""
+        return bool(self.n.sc.whole)
+
+    @property
+    def has_friction(self):
+        """Some element has more rows than one: a contact with tangents or spin that move."""
+        return self.n.sc.e.n < self.n.sc.e.m
+
+    # -- what factors it ---------------------------------------------------------------------------
+
+    def ask(self, others):
+        """Who factors and solves what is not factored here."""
+        self.others, self.n.s.others = others, &self.calls
+
+    def over_rows(self, double[:, ::1] h, bint symmetric, bint wide):
+        """H (m, m), dense."""
+        cdef double[::1] whole = np.empty(self.m * self.m + 1), lower = np.empty(dense_room(self.m, self.has_friction) + 1)
+        self.held += [h, whole, lower]
+        self.n.s.form, self.n.s.symmetric, self.n.s.wide = DENSE, symmetric, wide and has_wide()
+        self.n.s.h, self.n.s.whole, self.n.s.lower = &h[0, 0] if self.m else NULL, &whole[0], &lower[0]
+
+    def over_entries(self, indptr, indices, values, bint symmetric):
+        """H in compressed rows, which others factor."""
+        self.held += [indptr, indices, values]
+        self.n.s.form, self.n.s.symmetric = SPARSE, symmetric
+        self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>address(indptr), <int32_t*>address(indices)
+        self.n.s.a.data = <double*>address(values)
+
+    def jacobian(self):
+        """K = D^-1/2 J M^-1/2 (rows, 12) of the bodies, and the columns that hold anything, of a body's six, as bits.
+
+        What is at most 1e-9 (spheres turned by the rounding of their arms) is nothing: H = K K^T + theta has a unit
+        diagonal, and feels 1e-18 of it.
+        """
+        cdef const rows_t* r = &self.data.rows
+        cdef int64_t i
+        cdef int32_t used = 0, c
+        panel = np.zeros((self.data.blocks.n_rows, 12))
+        cdef double[:, ::1] k = panel
+        cdef double[::1] root = np.empty(10 * r.n_bodies + 1)
+        if r.n_bodies == 0 or k.shape[0] == 0:
+            return panel, 0
+        with nogil:
+            panel_of(&self.data.blocks, r, &root[0], &k[0, 0])
+            for i in range(k.shape[0]):
+                for c in range(12):
+                    if not -1e-9 <= k[i, c] <= 1e-9:
+                        used = used | (1 << (c if c < 6 else c - 6))
+                if used == 63:
+                    break
+        return panel, used
+
+    def over_bodies(self, double[:, ::1] panel, const int32_t[::1] columns, pattern, structure, bint lu, panels, bint wide):
+        """K of `jacobian`, in place: of each body these columns.
+
+        pattern: node, slot and turned, of each element; structure: (nptr, nind, lptr, lind, rptr, rind), the pattern of N
+        and of its factor; lu: L U may be asked for; panels: what `symbolic.block_panels` gives, for a factor by dense
+        panels, which L U has none of.
+        """
+        cdef newton_t* n = &self.n
+        cdef factor_t* f = &n.blocks
+        cdef int32_t s = <int32_t>columns.shape[0]
+        cdef SparsePanels held
+        cdef const int64_t[::1] spot
+        node, slot, turned = pattern
+        nptr, nind, lptr, lind, rptr, rind = structure
+        count, blocks = len(nptr) - 1, s * s
+        panels = None if lu else panels
+        group, y = np.empty(len(self.kind) + 1, np.int32), np.zeros(count * s + 1)
+        below = int(lptr[count]) * blocks
+        values = [np.zeros(size + 1) for size in (
+            len(nind) * blocks, len(nind) * blocks * lu, below * (panels is None), below * lu, count * blocks, count * blocks,
+            count * blocks * lu)]
+        pivot, following = np.zeros(count * s + 1, np.int32), np.zeros(count + 1, np.int32)
+        self.held += [panel, pattern, structure, group, y, values, pivot, following]
+        if self.m:
+            narrow_panel(&n.sc, <int32_t*>address(turned), &columns[0], s, &panel[0, 0])
+        n.sc.e.s, n.sc.e.panel = s, &panel[0, 0] if panel.shape[0] else NULL
+        n.sc.e.node, n.sc.e.slot = <int32_t*>address(node), <int32_t*>address(slot)
+        find_groups(&n.sc.e, <int32_t*>address(group))
+        f.n, f.s, f.super = count, s, NULL
+        f.nptr, f.nind = <int32_t*>address(nptr), <int32_t*>address(nind)
+        f.lptr, f.lind = <int32_t*>address(lptr), <int32_t*>address(lind)
+        f.rptr, f.rind = <int32_t*>address(rptr), <int32_t*>address(rind)
+        f.nval, f.mval = <double*>address(values[0]), <double*>address(values[1])
+        f.lval, f.uval, f.dval = <double*>address(values[2]), <double*>address(values[3]), <double*>address(values[4])
+        f.work, f.work2 = <double*>address(values[5]), <double*>address(values[6])
+        f.pivot, f.next = <int32_t*>address(pivot), <int32_t*>address(following)
+        if panels is not None:
+            held = SparsePanels.of_blocks(panels[1:], count * s, wide)
+            spot = panels[0]
+            self.held += [held, panels[0]]
+            f.super, f.spot = &held.f, &spot[0]
+        n.s.form, n.s.symmetric, n.s.y = BODIES, True, <double*>address(y)
+
+    # -- turns -------------------------------------------------------------------------------------
+
+    def start(self, const double[::1] impulse, double tol, int budget, bint cold):
+        """From impulse (rows,), to a relative residual of tol, with so many factorisations; `cold`: that is doing nothing."""
+        cdef newton_t* n = &self.n
+        n.tol, n.budget, n.cold = tol, budget, cold
         self.raised = None
         with nogil:
-            newton_start(&self.n, &z[0], coulomb)
+            newton_start(n, &impulse[0])
 
     def step(self, int work):
         """`work` factorisations or a few more; one of `OUTCOMES`."""
@@ -165,6 +250,10 @@ cdef class Solve:
             error, self.raised = self.raised, None
             raise error
         return how
+
+    def take(self, double[::1] impulse):
+        """The best so far into impulse (rows,)."""
+        impulse_of(&self.n, self.n.best_z, &impulse[0])
 
     def stop(self):
         """There is no time for another factorisation: the next step judges what is there, and ends."""
@@ -185,14 +274,9 @@ cdef class Solve:
         return self.n.best
 
     @property
-    def best_z(self):
-        """(m,) of that."""
-        return np.asarray(<double[:self.m]>self.n.best_z).copy()
-
-    @property
     def direction(self):
-        """(m,) along which a certificate was asked for."""
-        return np.asarray(<double[:self.m]>self.n.direction).copy()
+        """(rows,) along which a certificate was asked for."""
+        return np.asarray(<double[:self.n.problem.p.n_rows]><double*>proof_of(&self.n)).copy()
 
     @property
     def counts(self):
@@ -275,10 +359,12 @@ cdef class Solve:
         return tuple(np.asarray(x).copy() for x in (
             <double[:self.m]>n.ip.z, <double[:self.m]>n.ip.u1, <double[:self.m]>n.ip.u2))
 
-    def weigh(self, Elements e, double delta):
-        """The interior point's V and B into v and bt, by its elements."""
-        z, u1, u2 = self.point
-        return e.scale(z, u1, u2, delta, self.v, self.bt)
+    def weigh(self, double delta):
+        """The interior point's V = (W + theta + delta)^-1 and B, V = B B^T, into v and bt; the gap."""
+        cdef newton_t* n = &self.n
+        cdef double gap
+        ipm_scale(n.s.e, n.ip.z, n.ip.u1, n.ip.u2, delta, n.s.v, n.s.bt, &gap)
+        return gap
 
     def slip(self, const double[::1] s, double share=1.0):
         """phi on normals and psi (m,) of s (m,)."""

@@ -199,5 +199,5 @@ cdef inline bint interior_step(newton_t* n) noexcept nogil:
     p.gap = mu
     p.first_gap = mu if mu > p.first_gap else p.first_gap
     system_times(s, p.z, p.hz)
-    convex_error(e, p.z, p.hz, n.speed, &p.energy, &p.velocity)
+    convex_error(e, p.z, p.hz, n.sc.speed, &p.energy, &p.velocity)
     return p.length > 0.0

@@ -33,7 +33,7 @@ cpdef enum:                     # how it ended
     JUDGED = 1                  # met tol as it came
     SWEPT = 2                   # met it after some sweeps
     SOLVED = 3                  # met it after one factorisation
-    WALKED = 5                  # met it after the proximal Newton walks of substep.pyx
+    FACTORED = 5                # met it after turns of Newton's method (substep.pyx)
 
 
 cdef struct warm_t:
@@ -253,19 +253,24 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     return UNDECIDED
 
 
+cdef inline bint is_cold(const blocks_t* p, const double* lam) noexcept nogil:
+    """lam = 0."""
+    cdef int32_t j
+    for j in range(p.n_rows):
+        if lam[j] != 0.0:
+            return False
+    return True
+
+
 cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
     """lam (m), not all zero, to tol; v (n_bodies, 6) is left M^-1 J^T lam, given so with `has_velocity`."""
     cdef double e0, v0
-    cdef int32_t j, found, cold = 1
+    cdef int32_t j, found
     s.sweeps = 0
     s.factorisations = 0
     s.traced = 0
-    for j in range(p.n_rows):
-        if lam[j] != 0.0:
-            cold = 0
-            break
-    if cold or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
+    if is_cold(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
         return UNDECIDED
     if not has_velocity:
         rows_velocity(p, r, lam, v)

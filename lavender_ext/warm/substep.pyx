@@ -1,51 +1,40 @@
-"""The velocity solve of a substep by Newton's method, whole, on the engine's arrays: what a browser has of `newton`.
+"""The velocity solve of a substep by Newton's method on the engine's arrays: natively its first phase, in a browser whole.
 
 After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (start.pxd), then proximal rounds (newton/phases.pxd) and sweeps; the
-                    judge's residual decides
+    solve           the first phase of `newton` (start.pxd), then its turns (newton/plan.pxd); the judge's residual decides
 
-Natively and in WebAssembly the same lines, the same bits. `newton` itself goes on to interior points where walks end
-short of tol; here the best impulse found stays, and is told as such.
+Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
+where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport COULOMB, blocks_t
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
-from lavender_ext.core.velocity cimport rows_velocity
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.newton.bodies cimport (bodies_t, index_room, lay_bodies, lay_pattern, make_pattern, pattern_t,
-                                         real_room)
-from lavender_ext.newton.phases cimport LIMITLESS, begin_rounds, enter_rounds, go_rounds
+from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
+from lavender_ext.newton.plan cimport CERTIFICATE, MORE, newton_start, newton_step
 from lavender_ext.newton.scaling cimport find_elements
-from lavender_ext.newton.run cimport INNER, N_ROUNDS, impulse_of, newton_t
-from lavender_ext.warm.start cimport (JUDGED, MOST_SWEEPS, MOST_TRACED, UNDECIDED, WALKED, band_width, judged, lay_out,
-                                      observe, room_of, scored, start_errors, warm_solve, warm_t)
+from lavender_ext.newton.run cimport aim, impulse_of, judge_room, lay_judge, newton_t
+from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, is_cold, judged, lay_out,
+                                      observe, room_of, start_errors, warm_solve, warm_t)
 
 
 cdef enum:
-    HEAD = 4                    # whole numbers before the pattern: width of the band, whether walks apply
+    HEAD = 4                    # whole numbers before the pattern: width of the band, those of the pattern
     MOST = 2147483647
-    FIRST_STEPS = 20            # factorisations of the first walk
-    NEXT_STEPS = 40             # of each that follows
-    TURNS = 4
-    SMALL = 64                  # rows up to which the first weight is smaller, from `LARGE` on it is larger
-    LARGE = 1000
+    BUDGET = 200                # factorisations: a picture waits for them
 
 
-cdef inline int64_t warm_indices(const rows_t* r) noexcept nogil:
-    return <int64_t>r.n_bodies + 2 * r.n_joints
-
-
-cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int32_t* index,
-                                          uint64_t* keys) noexcept nogil:
-    """Whole numbers of scratch for the prepared substep, -1 for 2^31 and more."""
+cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+                                          int32_t turns) noexcept nogil:
+    """Whole numbers of scratch for the prepared substep, -1 for 2^31 and more; turns 0: the first phase alone."""
     cdef engine_t e
     cdef int64_t used[3]
     cdef int64_t room
@@ -53,87 +42,56 @@ cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int
     cdef rows_t r
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    room = HEAD + index_room(&p, &r) + warm_indices(&r) + 1
+    room = HEAD + (index_room(&p, &r) if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1
     return <int32_t>room if room < MOST else -1
 
 
-cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
+cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* index, uint64_t* keys, int32_t turns,
                                     int32_t* scratch) noexcept nogil:
     """Fills scratch, which begins at a multiple of 8 bytes; doubles that the solve needs, -1 for 2^31 and more."""
     cdef engine_t e
     cdef int64_t used[3]
-    cdef int64_t room, walks
+    cdef int64_t room
     cdef blocks_t p
     cdef rows_t r
+    cdef newton_t n
     cdef pattern_t a
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    walks = index_room(&p, &r)
-    scratch[0] = band_width(&p, &r, scratch + HEAD + walks)
-    scratch[1] = walks > 0
+    scratch[1] = <int32_t>index_room(&p, &r) if turns else 0
+    scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
     room = room_of(&p, &r, scratch[0]) + p.n_rows
-    if walks > 0:
-        lay_pattern(&a, scratch + HEAD, &p, &r)
-        make_pattern(&a, &p, &r)
-        room += real_room(&a, &p, &r)
+    if scratch[1] > 0:
+        lay_pattern(&n, &a, scratch + HEAD, &p, &r)
+        find_elements(&n.sc, &p, NULL, &r)
+        make_pattern(&n.sc, &a, &r)
+        room += judge_room(&p, &r, NULL) + body_room(&n, &a, &p, &r)
     return <int32_t>room if room < MOST else -1
 
 
-cdef inline void take_best(const rows_t* r, const blocks_t* p, const newton_t* n, double* lam, double* v) noexcept nogil:
-    impulse_of(n, n.best_z, lam)
-    rows_velocity(p, r, lam, v)
-
-
-cdef inline void walk(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double alpha, int32_t limit,
-                      double* lam, double* v) noexcept nogil:
-    """Proximal rounds from lam until the judge is content, `limit` factorisations are spent, or nothing moves."""
-    cdef int32_t j
-    for j in range(p.n_rows):
-        n.trial[j] = lam[j] / n.scale[j]
-    begin_rounds(n, 0, n.trial, COULOMB, alpha, INNER)
-    enter_rounds(n, 0, limit)
-    while n.depth > 0:
-        go_rounds(n, 0)
+cdef inline int32_t solve_in_turns(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double tol, double* lam,
+                                   double* v) noexcept nogil:
+    """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
+    cdef int32_t how = MORE
+    n.tol, n.budget, n.cold = tol, BUDGET, is_cold(p, lam)
+    newton_start(n, lam)
+    while how == MORE or how == CERTIFICATE:
+        how = newton_step(n, 1)
         s.factorisations = n.s.factorisations
         if s.trace != NULL:
             judged(p, r, s, n.lam, v, n.problem.e0, n.problem.v0)
+    impulse_of(n, n.best_z, lam)
+    s.relative = judged(p, r, s, lam, v, n.problem.e0, n.problem.v0)
+    return FACTORED if n.best <= tol else UNDECIDED
 
 
-cdef inline int32_t solve_with_walks(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double tol, double* lam,
-                                     double* v) noexcept nogil:
-    """What `warm_solve` has left undecided, also from lam = 0: walks, 64 sweeps from the best between them.
-
-    UNDECIDED where none met tol: lam is then the best that was scored.
-    """
-    cdef int32_t i, k, _
-    cdef double alpha = 1e-5 if p.n_rows <= SMALL else 1e-3 if p.n_rows < LARGE else 1e-2
-    n.tol, n.budget = tol, LIMITLESS
-    n.stop = n.asked = n.proven = n.depth = n.counts[N_ROUNDS] = 0
-    n.best = 1.0 / 0.0
-    for k in range(TURNS):
-        if k > 0:
-            take_best(r, p, n, lam, v)
-            for _ in range(MOST_SWEEPS):
-                for i in range(p.n_blocks):
-                    relax_rows_block(p, r, i, lam, v)
-            s.sweeps += MOST_SWEEPS
-            alpha = 1e-3 if k == 1 else 10.0 * alpha
-        walk(p, r, s, n, alpha, FIRST_STEPS if k == 0 else NEXT_STEPS, lam, v)
-        if n.best <= tol:
-            break
-    take_best(r, p, n, lam, v)
-    s.relative = scored(p, r, s, lam, v, n.problem.e0, n.problem.v0)
-    return WALKED if n.best <= tol else UNDECIDED
-
-
-cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t* scratch,
-                                   double* room, double* lam, double* v) noexcept nogil:
+cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t turns,
+                                   int32_t* scratch, double* room, double* lam, double* v) noexcept nogil:
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
     cdef newton_t n
-    cdef bodies_t w
     cdef pattern_t a
-    if how != UNDECIDED or p.n_rows == 0:
+    if how != UNDECIDED or p.n_rows == 0 or not turns:
         return how
     s.relative = 1.0 / 0.0
     if not start_errors(p, &e0, &v0):
@@ -146,19 +104,22 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     if not scratch[1]:
         return UNDECIDED
-    lay_pattern(&a, scratch + HEAD, p, r)
-    find_elements(&a.s, p, NULL, r)                     # the pattern stands from `lav_newton_plan`
-    lay_bodies(&n, &w, &a, room, p, r)
+    lay_pattern(&n, &a, scratch + HEAD, p, r)
+    find_elements(&n.sc, p, NULL, r)                    # the pattern stands from `lav_newton_plan`
+    aim(&n, p, NULL, r, NULL)
+    furnish_bodies(&n, &a, lay_judge(&n, room), p, r)
     n.problem.e0, n.problem.v0 = e0, v0
-    return solve_with_walks(p, r, s, &n, tol, lam, v)
+    return solve_in_turns(p, r, s, &n, tol, lam, v)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
-                                       int32_t* scratch, double* room, double* trace, double* said) noexcept nogil:
+                                       int32_t turns, int32_t* scratch, double* room, double* trace,
+                                       double* said) noexcept nogil:
     """Impulses, dv and the solver values of the prepared substep; how it ended, UNDECIDED where short of tol.
 
-    scratch and room as `lav_newton_plan` has them; trace (MOST_TRACED, 3) or NULL takes work, E [sqrt J] and max |e_n|
-    [N s] of each score; said (4) takes sweeps, factorisations, relative residual and scores noted.
+    Of the first phase alone (turns 0) UNDECIDED leaves all of it as it was. scratch and room as `lav_newton_plan` has them;
+    trace (MOST_TRACED, 3) or NULL takes work, E [sqrt J] and max |e_n| [N s] of each score; said (4) takes sweeps,
+    factorisations, relative residual and scores noted.
     """
     cdef engine_t e
     cdef int64_t used[3]
@@ -174,14 +135,11 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     p.nu = room
     s.width = scratch[0]
     s.trace = trace
-    s.sweeps = 0
-    s.factorisations = 0
-    s.traced = 0
     s.relative = 0.0
     own = room_of(&p, &r, s.width) + p.n_rows
-    lay_out(&s, room + p.n_rows, scratch + HEAD + index_room(&p, &r), &p, &r)
-    how = newton_substep(&p, &r, &s, tol, scratch, room + own, e.impulse, e.dv)
-    if p.n_rows > 0:
+    lay_out(&s, room + p.n_rows, scratch + HEAD + scratch[1], &p, &r)
+    how = newton_substep(&p, &r, &s, tol, turns, scratch, room + own, e.impulse, e.dv)
+    if p.n_rows > 0 and (turns or how != UNDECIDED):
         observe(&p, &r, &s, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
     said[0] = s.sweeps
     said[1] = s.factorisations
@@ -191,37 +149,42 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
 
 
 cdef class Substep:
-    """The same for Python, beside an engine's three buffers."""
+    """The same for Python, beside an engine's three buffers; `turns`: after the first phase, noting each score."""
     cdef const int32_t[::1] size
     cdef double[::1] real
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
+    cdef double[::1] scratch, room
     cdef double[:, ::1] noted
     cdef double[4] said
+    cdef int32_t turns
 
-    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
-        self.size = size
-        self.real = real
-        self.index = index
-        self.keys = keys
-        self.noted = np.zeros((MOST_TRACED, 3))
+    def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys, bint turns):
+        self.size, self.real, self.index, self.keys, self.turns = size, real, index, keys, turns
+        self.scratch, self.room = np.empty(1), np.empty(1)
+        self.noted = np.zeros((MOST_TRACED if turns else 0, 3))
 
     def solve(self, double tol):
         """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations, relative residual)."""
         cdef int32_t how, n
-        cdef double[::1] room, scratch
-        n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
-        if n < 0:
-            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
-        scratch = np.zeros(n // 2 + 1)
-        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], <int32_t*>&scratch[0])
-        if n < 0:
-            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
-        room = np.zeros(n + 1)
+        cdef double* trace = NULL
+        n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
+        self.scratch = self._grown(self.scratch, n, 2)
+        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns,
+                            <int32_t*>&self.scratch[0])
+        self.room = self._grown(self.room, n, 1)
+        if self.turns:
+            trace = &self.noted[0, 0]
         with nogil:
-            how = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol,
-                                     <int32_t*>&scratch[0], &room[0], &self.noted[0, 0], self.said)
+            how = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol, self.turns,
+                                     <int32_t*>&self.scratch[0], &self.room[0], trace, self.said)
         return how, <int>self.said[0], <int>self.said[1], self.said[2]
+
+    cdef double[::1] _grown(self, double[::1] room, Py_ssize_t n, int each):
+        """`room` where it holds n numbers, `each` of them in a double, else a larger one."""
+        if n < 0:
+            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
+        return room if each * room.shape[0] >= n else np.empty((n + n // 4) // each + 1)
 
     @property
     def trace(self):

@@ -74,13 +74,6 @@ def test_nobody_is_timed_on_what_nobody_solves():
     assert found.best == ""
 
 
-def test_candidates_are_ours_and_auto_is_not_one():
-    own = regret.own_solvers()
-    assert "newton" in own
-    assert "auto" not in own
-    assert "osqp" not in own
-
-
 CASES = [wild(seed=seed, rows=200) for seed in (0, 12, 28, 30)]
 
 

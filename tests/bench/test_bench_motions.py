@@ -1,6 +1,6 @@
 """`python -m benchmarks motions`: what its tables count."""
 
-import csv
+import json
 
 import numpy as np
 import pytest
@@ -19,12 +19,12 @@ def sample(relative, motion, law="lcp", structure="stack + redundant"):
 
 def test_factors_are_those_of_the_samples():
     found = [sample(1e-3, 2e-3), sample(1e-3, 4e-3), sample(1e-2, 9e-2, structure="stack")]
-    rows = {row[0]: row for row in motions.calibration(found)}
+    rows = {row.structure: row for row in motions.calibration(found)}
     assert set(rows) == {"stack", "redundant", "law lcp", "all"}
-    assert rows["all"][1] == 3
-    assert rows["all"][2] == pytest.approx(4.0)
-    assert rows["all"][4] == pytest.approx(9.0)
-    assert rows["redundant"][1] == 2
+    assert rows["all"].iterates == 3
+    assert rows["all"].median == pytest.approx(4.0)
+    assert rows["all"].largest == pytest.approx(9.0)
+    assert rows["redundant"].iterates == 2
     names = {name: (median, spread) for name, _, median, spread in motions.predictors(found)}
     assert names["V / V0 alone"][0] == pytest.approx(2 * names["E / E0 alone"][0])
     assert "median 1" in motions.table(found)
@@ -42,25 +42,6 @@ def test_samples_are_iterates_with_both_errors():
         assert s.found <= s.bound
 
 
-def test_shares_count_what_they_say():
-    def branch(found, unique="", mu=0.5, sliding=0.2, warm=""):
-        return motions.Branches(
-            "c", "coulomb", "pile", 9, mu, sliding, found, 7, 0.1 * (found > 1), 0.1, unique, warm
-        )
-
-    text = motions.several_table(
-        [
-            branch(3, warm="nearest"),
-            branch(2, mu=0.7, warm="another"),
-            branch(1),
-            branch(1, "friction is small", mu=0.1),
-        ]
-    )
-    assert "| all | 4 | 1 | 1 | 2 (50%) | 0.1 m/s | c |" in text
-    assert "| friction from 0 to 0.3 | 1 | 1 | 0 | 0 (0%) |  |  |" in text
-    assert "sweeps from 1 of 2" in text
-
-
 def test_a_problem_with_several_motions_is_counted_as_one():
     p = suite.case("granularF(n=3, sliding=0.5)").problem
     found = motions.branches("granular", p, "pile", 6)
@@ -71,13 +52,14 @@ def test_a_problem_with_several_motions_is_counted_as_one():
 
 def test_the_command_writes_both_tables(tmp_path):
     path = tmp_path / "figure.png"
-    args = ["stack(n=8)", "box_stackF(n=2)", "--runs", "3", "--out", str(tmp_path)]
+    args = ["stack(n=8)", "box_stackF(n=2)", "--runs", "3", "--out", str(tmp_path / "m.json")]
     result = CliRunner().invoke(motions.command, [*args, "--figure", str(path)])
     assert result.exit_code == 0, result.output
     assert path.read_bytes().startswith(b"\x89PNG")
     assert "| all |" in result.output
     assert "| Coulomb problems |" in result.output
-    with open(tmp_path / "motions.csv", newline="") as stream:
-        assert [row["case"] for row in csv.DictReader(stream)] == ["stack(n=8)", "box_stackF(n=2)"]
-    bad = CliRunner().invoke(motions.command, ["stack(n=8)", "--out", str(tmp_path / "no")])
+    kept = json.loads((tmp_path / "m.json").read_text())
+    assert [line["case"] for line in kept["lines"]] == ["stack(n=8)", "box_stackF(n=2)"]
+    assert {sample["case"] for sample in kept["samples"]} <= {"stack(n=8)", "box_stackF(n=2)"}
+    bad = CliRunner().invoke(motions.command, ["stack(n=8)", "--out", str(tmp_path / "no" / "m.json")])
     assert isinstance(bad.exception, lv.InputError)

@@ -12,8 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks.peers import command
-from benchmarks.peers.compared import engines_table, solvers_tables
+from benchmarks.peers import command, engines_table, solvers_tables
 from lavender import suite
 from lavender.bench import peers
 from lavender.bench.peers import adapters, engines, problems, race

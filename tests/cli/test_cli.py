@@ -182,7 +182,6 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--pass-limit", "3"), "--pass-limit has no effect without a sequence"),
         (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),
         (("report", "stack(n=4)", "--solvers", "direct", "--orders", "reverse"), "--orders has no effect"),
-        (("report", "stack(n=4)", "--solvers", "pgs", "--in-process"), "--in-process has no effect"),
         (("report", "--campaign", "--time-limit", "3"), "--time-limit has no effect with --campaign"),
         (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),

@@ -1,7 +1,5 @@
 """The engine against closed forms, conservation laws, and the convergence laws of its own sweeps."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -202,81 +200,6 @@ def test_a_motor_turns_and_its_torque_is_bounded():
 
 
 # -- stacks and sweeps -----------------------------------------------------------------------------
-
-
-def first_errors(sweeps, **more):
-    problem = lv.Simulation(lv.Scene("stack", warm_start=False, **more)).constraint_problem()
-    impulse = lv.solve(
-        problem, "sequential_impulses", tol=0, max_iter=sweeps, order=more.get("order", "given")
-    ).impulse
-    normal = problem.cones.ptr[:-1]
-    return np.abs(lv.residual(problem, impulse).error[normal]).max(), impulse
-
-
-@pytest.mark.parametrize(("order", "ratio"), [("bottom_up", 32.1), ("top_down", 46.1)])
-def test_the_first_cold_solve_falls_as_the_dense_twin(order, ratio):
-    few, many = (first_errors(n, friction=0.0, order=order)[0] for n in (4, 64))
-    assert few / many == pytest.approx(ratio, abs=0.06)  # the law is stated with three digits
-
-
-def test_with_the_friction_disk_it_falls_too_and_friction_acts():
-    (few, _), (many, impulse) = (first_errors(n, friction=0.5) for n in (4, 64))
-    assert 20 < few / many < 50
-    assert np.abs(impulse.reshape(-1, 3)[:, 1:]).max() > 1e-4
-
-
-def steady(sweeps, steps=60, **more):
-    # one direction of sweeping and whole steps, as the dense twin has it
-    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, substeps=1, order="given", **more))
-    rows = [run(sim, 1) for _ in range(steps)][20:]
-    return np.array([r["solver"] for r in rows]), np.array([r["contacts"]["depth"].max() for r in rows])
-
-
-def test_a_cold_stack_in_the_steady_state_carries_its_weight_through_the_sweeps():
-    """After a while every cold solve must hold the weight W: W = (1 - G^n) A^+ b, so the error is that of b.
-
-    With G the error matrix of one sweep, the predicted ratio of 4 to 64 sweeps is the dense twin's 169.
-    """
-    problem = lv.Simulation(lv.Scene("stack", friction=0.0)).constraint_problem()
-    a, m = problem.dense(), problem.m
-    g = np.eye(m) - np.linalg.solve(np.tril(a), a)
-    weight = np.repeat(np.arange(6, 0, -1), 4) * G / 120.0 / 4.0
-    predicted = []
-    for n in (4, 64):
-        x = np.linalg.lstsq(np.eye(m) - np.linalg.matrix_power(g, n), weight, rcond=None)[0]
-        predicted.append(np.abs((a @ (weight - x)) / np.diag(a)).max())
-    measured = [np.median(steady(n, friction=0.0, warm_start=False)[0][:, 5]) for n in (4, 64)]
-    # Four sweeps are still on their way to that state within 60 steps, 64 are there.
-    assert measured[1] == pytest.approx(predicted[1], rel=0.25)
-    assert 0.5 * predicted[0] < measured[0] < 1.1 * predicted[0]
-    assert measured[0] / measured[1] > 25
-
-
-@pytest.mark.parametrize(("friction", "least"), [(0.0, 25), (0.5, 15)])
-def test_more_sweeps_leave_less_residual_violation_and_penetration(friction, least):
-    values = [steady(n, friction=friction, warm_start=False) for n in (4, 8, 16, 32, 64)]
-    residual = [np.median(v[:, 5]) for v, _ in values]
-    violation = [np.median(v[:, 7]) for v, _ in values]
-    depth = [d.max() for _, d in values]
-    for series in (residual, violation, depth):
-        assert all(b < a for a, b in pairwise(series))
-    assert residual[0] / residual[-1] > least
-
-
-def test_warm_starting_matches_every_point_and_starts_two_orders_lower():
-    warm, cold = (steady(4, friction=0.0, warm_start=w)[0] for w in (True, False))
-    assert np.all(warm[:, 3] == 24) and np.all(cold[:, 3] == 0)
-    assert 40 < np.median(cold[:, 4]) / np.median(warm[:, 4]) < 400
-
-
-def test_a_stack_stands_for_ten_minutes_on_eight_warm_sweeps():
-    sim = lv.Simulation(lv.Scene("stack", solver_iterations=8))
-    start = sim.reset()[0]["positions"]
-    end = run(sim, 600 * 120)
-    slop = sim.scene.parameters.slop
-    assert np.abs(end["positions"] - start).max() < slop
-    assert np.abs(end["velocities"]).max() < 1e-12
-    assert end["contacts"]["depth"].max() < 1.01 * slop
 
 
 def test_position_projection_adds_no_kinetic_energy():

@@ -10,7 +10,7 @@ from lavender.scene.scene import SCENE_ORDERS
 
 SCENES = {
     "stack": {},
-    "pyramid": {"base": 4},
+    "pyramid": {"base": 4, "friction_shape": "box"},
     "chain": {"n": 8},
     "spinner": {},
     "ramp": {},
@@ -203,6 +203,7 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
     for other in (
         lv.Scene("stack", n=4),
         lv.Scene("stack", n=3, friction=0.3),
+        lv.Scene("stack", n=3, friction_shape="box"),
         lv.Scene("stack", n=3, mass=2.0),
     ):
         with pytest.raises(lv.InputError, match="another scene"):

@@ -30,7 +30,7 @@ def problems():
         yield rp.random_contact_problem(seed)
         yield rp.random_contact_problem(seed, "cone")
     yield rp.random_contact_problem(9, bodies=20, joints=6, contacts=40)  # enough blocks to be swept in pairs
-    yield rp.box_stack(3)
+    yield lv.suite.box_stack(3).problem
     for friction in ("coulomb", "cone"):
         rng = np.random.default_rng(7)
         root = np.diag(rng.uniform(1.0, 2.0, size=12))

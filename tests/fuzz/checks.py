@@ -16,7 +16,7 @@ from pathlib import Path
 import doors
 import files
 import folders
-import judge
+import judge_twin
 import numpy as np
 import problems
 import promises
@@ -184,7 +184,7 @@ def claims(spec, problem, solution):
     if not wanted:
         return
     COUNTS["judged"] += 1
-    twin = judge.Problem(spec["problem"])
+    twin = judge_twin.Problem(spec["problem"])
     j = twin.judge(solution.impulse)
     slop = 1.0 + 1e-6
     if status == "INFEASIBLE" and not solution.contradicted:

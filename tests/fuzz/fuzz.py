@@ -130,7 +130,7 @@ def work(kind, folder, seed, until, most, limit, guided):
         import atheris
 
         covered = atheris.instrument_imports(include=COVERED[kind])
-    sys.path[:0] = [str(HERE), str(HERE.parent.parent)]
+    sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
     with covered:
         import checks
     faulthandler.enable()
@@ -233,7 +233,7 @@ def keep(finding):
 
 def replay(paths):
     """Files of found/, each in this process; what still fails."""
-    sys.path[:0] = [str(HERE), str(HERE.parent.parent)]
+    sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
     import checks
 
     failed = 0

@@ -9,7 +9,6 @@ import pytest
 
 import lavender as lv
 import lavender.cli
-from benchmarks.output import write_csv
 from lavender import bench, io
 from lavender.bench.store import Records, Store
 from lavender.engine import run
@@ -47,7 +46,6 @@ WRITERS = {
     "records": (".jsonl", store),
     "records as CSV": (".csv", lambda made, path: bench.write_csv(Records(), path)),
     "records as JSON": (".json", lambda made, path: bench.write_json(Records(), path)),
-    "samples": (".csv", lambda made, path: write_csv(path, [lv.Cones.free(1)])),
     "text": (".txt", lambda made, path: write_text(path, "a")),
 }
 everybody = pytest.mark.parametrize(("suffix", "write"), WRITERS.values(), ids=WRITERS)

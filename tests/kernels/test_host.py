@@ -1,4 +1,4 @@
-"""What a host without Python asks of the kernels: layouts, settings, copies and room, checked natively."""
+"""What a host without Python asks of the kernels: layouts and room, checked natively."""
 
 import ctypes
 
@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender.engine.layout import HEAD, SETTING
+from lavender.engine.layout import SETTING
 from lavender.engine.state import State
 from lavender_ext.engine.arrays import SHAPES, offsets
 from lavender_ext.host import memory
 
-C_TYPES = {"i4": ctypes.c_int32, "f8": ctypes.c_double, "3f8": 3 * ctypes.c_double, "p": ctypes.c_void_p}
-SETTINGS = np.dtype(
-    [(f, {"3f8": ("f8", 3)}.get(kind, kind)) for f, kind in memory.STRUCTS["settings_t"].items()]
-)
+C_TYPES = {"i4": ctypes.c_int32, "f8": ctypes.c_double, "p": ctypes.c_void_p}
 
 
 def buffers(state):
@@ -56,41 +53,6 @@ def test_arrays_lie_where_the_engine_has_them(name):
                     assert view.ctypes.data == total[buffer][start:].ctypes.data, n
     named = {n for names in SHAPES.values() for n in names}
     assert set(state.a) <= named
-
-
-def test_settings_are_those_of_the_scene():
-    scene = lv.Scene("stack", solver_iterations=24, warm_start=False, order="top_down", seed=7, slop=2e-3)
-    state = State.of_scene(scene)
-    (found,) = np.frombuffer(memory.read_settings(*buffers(state)), SETTINGS)
-    p = scene.parameters
-    assert [found[k].item() for k in ("iterations", "warm_start", "position_iterations", "seed", "unused")] == [
-        24, 0, p.position_iterations, 7, 0,
-    ]  # fmt: skip
-    assert found["gravity"].tolist() == list(p.gravity)
-    assert [found[k].item() for k in ("h", "slop", "margin", "bounce")] == [
-        p.dt / p.substeps, p.slop, p.margin, p.restitution_threshold,
-    ]  # fmt: skip
-    names = {"skin": "skin", "beta": "beta", "max_push": "max_push", "match_distance": "match"}
-    for field, place in names.items():
-        assert found[field] == state.setting[SETTING[place]]
-    assert found["order"] == state.head[HEAD["order"]]
-
-
-def test_settings_read_and_written_change_nothing_else():
-    simulation = running("pyramid", base=4)
-    state, before = simulation.state, simulation.snapshot()
-    given = np.frombuffer(memory.read_settings(*buffers(state)), SETTINGS).copy()
-    memory.write_settings(*buffers(state), given)
-    assert state.real.tobytes() == before.real.tobytes()
-    assert state.index.tobytes() == before.index.tobytes()
-    for field in SETTINGS.names:
-        if field != "unused":
-            given[field] = given[field] * 2 + 3
-    memory.write_settings(*buffers(state), given)
-    assert memory.read_settings(*buffers(state)) == given.tobytes()
-    assert state.head[HEAD["pairs_valid"]] == 0  # another margin: the pair list no longer holds
-    changed = np.flatnonzero(state.real != before.real)
-    assert changed.max() < state.setting.size and SETTING["out"] > changed.max()
 
 
 def test_room_is_made_as_the_simulation_makes_it():

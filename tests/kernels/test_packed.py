@@ -1,10 +1,11 @@
 """Sweeps over packed blocks give the bits of one block after the other, whatever the kinds, the order and the scene."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem
+from random_problems import CONTACTS, random_contact_problem
 
 import lavender as lv
 from benchmarks.kernels import lattice_pile
@@ -136,17 +137,18 @@ FIXED = ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array
 
 
 KINDS = {
-    "normal": {"tangents": 0, "spin": False},
-    "disk": {"tangents": 2, "spin": False},
-    "spin": {"tangents": 2, "spin": True},
-    "mixed": {"tangents": None, "spin": False},
-    "one tangent": {"tangents": 1, "spin": True},  # no lanes
+    "normal": partial(random_contact_problem, tangents=0, spin=False),
+    "spin": partial(random_contact_problem, tangents=2),
+    "mixed": partial(random_contact_problem, spin=False),
+    "one tangent": partial(random_contact_problem, tangents=1),
+    **{kind: CONTACTS[kind] for kind in ("disks", "rolling", "boxes")},
 }
+NO_LANES = ("one tangent", "rolling")
 
 
-def tangled(seed, contacts, joints, bodies=None, kind="disk"):
+def tangled(seed, contacts, joints, bodies=None, kind="disks"):
     bodies = bodies or max(3, (contacts + joints) // 2)
-    return random_contact_problem(seed, bodies=bodies, joints=joints, contacts=contacts, **KINDS[kind])
+    return KINDS[kind](seed, bodies=bodies, joints=joints, contacts=contacts)
 
 
 def in_chunks(problem, order, counts, start, *, packs=True):
@@ -181,7 +183,7 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
             assert (packing is not None) == (problem.n_blocks >= 24)
             if packing is not None:
                 pairs, _ = packing.shape
-                if max(counts) < 8 or (kind == "one tangent" and contacts > joints):
+                if max(counts) < 8 or (kind in NO_LANES and contacts > joints):
                     assert pairs == 0
                 elif problem.n_blocks > 100:  # else too few may be free of each other
                     assert pairs > 0

@@ -5,17 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, dragged, random_contact_problem, seeds
+from random_problems import as_matrix, dragged, seeds
 
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
 from lavender.solvers.polyhedral import as_rows
 
-HERE = lv.available()
-OURS = {n for n in HERE if registry.specs()[n].own and not registry.specs()[n].external}
 LAWS = ("coulomb", "cone")
 
 
@@ -123,42 +120,6 @@ def test_fixed_normals_make_constant_bounds():
 # -- solutions ---------------------------------------------------------------------------------------------------------
 
 
-def enumerated(problem):
-    """Every solution with a regular system: each contact open, each of its tangents sticking or sliding either way."""
-    a, c = problem.dense(), problem.cones
-    n = c.n_blocks
-    ways = [None, *itertools.product((-1, 0, 1), repeat=2)]
-    found = []
-    for choice in itertools.product(ways, repeat=n):
-        equal, rhs = np.zeros((problem.m, problem.m)), np.zeros(problem.m)
-        for i, way in enumerate(choice):
-            j = 3 * i
-            if way is None:
-                equal[j : j + 3, j : j + 3] = np.eye(3)
-                continue
-            equal[j], rhs[j] = a[j], problem.b[j]
-            for k, s in enumerate(way):
-                if s == 0:
-                    equal[j + 1 + k], rhs[j + 1 + k] = a[j + 1 + k], problem.b[j + 1 + k]
-                else:
-                    equal[j + 1 + k, j + 1 + k], equal[j + 1 + k, j] = 1.0, -s * c.coefficients[i, k]
-        if np.linalg.cond(equal) > 1e10:
-            continue
-        x = np.linalg.solve(equal, rhs)
-        if lv.residual(problem, x).relative < 1e-10:
-            found.append(x)
-    return found
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_lemke_finds_one_of_all_solutions(seed):
-    problem = free(seed, contacts=2)
-    truth = enumerated(problem)
-    assert truth
-    x = lv.solve(problem, "lemke", tol=1e-12).raise_for_status().impulse
-    assert min(np.abs(x - y).max() for y in truth) < 1e-9 * (1.0 + np.abs(x).max())
-
-
 @pytest.mark.parametrize("name", ["lemke", "direct"])
 @pytest.mark.parametrize("seed", range(14))
 def test_pivoting_ends_on_every_problem(seed, name):
@@ -166,28 +127,6 @@ def test_pivoting_ends_on_every_problem(seed, name):
     solution = lv.solve(problem, name, tol=1e-10)
     assert solution.status is lv.Status.CONVERGED, solution
     assert not solution.contradicted
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_the_relaxation_is_the_quadratic_program(seed):
-    osqp = pytest.importorskip("osqp")
-    problem = free(seed, friction="cone")
-    c, m = problem.cones, problem.m
-    sides = []
-    for i in range(c.n_blocks):
-        for k, s in itertools.product((0, 1), (1.0, -1.0)):
-            row = np.zeros(m)
-            row[3 * i + 1 + k], row[3 * i] = s, -c.coefficients[i, k]
-            sides.append(row)
-    solver = osqp.OSQP()
-    solver.setup(
-        sp.csc_matrix(problem.dense()), -problem.b, sp.csc_matrix(np.array(sides)), np.full(len(sides), -np.inf),
-        np.zeros(len(sides)), eps_abs=1e-10, eps_rel=1e-10, max_iter=100_000, verbose=False,
-    )  # fmt: skip
-    x = solver.solve(raise_error=True).x
-    for name in ("direct", "newton", "lemke"):
-        ours = lv.solve(problem, name, tol=1e-9).raise_for_status().impulse
-        np.testing.assert_allclose(ours, x, atol=1e-6 * np.abs(x).max())
 
 
 def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
@@ -242,68 +181,6 @@ def test_no_impulse_meets_every_row():
         assert not solution.contradicted
 
 
-@settings(max_examples=25)
-@given(seed=seeds)
-def test_the_motion_bound_holds(seed):
-    problem = free(seed % 1000, friction="cone")
-    best = lv.solve(problem, "lemke", tol=1e-12).raise_for_status()
-    rough = lv.solve(problem, "anderson", tol=0.0, max_iter=4)
-    error = lv.motion_error(problem, rough.impulse)
-    apart = problem.velocity(rough.impulse) - problem.velocity(best.impulse)
-    size = np.linalg.norm(apart) / np.sqrt(2.0)  # M is the identity
-    if error.kinetic is not None:
-        assert error.kinetic == pytest.approx(size, rel=1e-4, abs=1e-9)
-    if error.bound is not None:
-        assert size <= error.bound * (1.0 + 1e-9) + 1e-12
-
-
-def test_several_motions_of_boxes_are_solutions():
-    found = lv.motions(free(2, contacts=3))
-    assert len(found) >= 1
-
-
-# -- sweeps ------------------------------------------------------------------------------------------------------------
-
-
-def scene_problem(name="pile", steps=30):
-    sim = lv.Simulation(lv.Scene(name, friction_shape="box"))
-    for _ in range(steps):
-        sim.step()
-    return sim.constraint_problem()
-
-
-def test_bits_are_those_of_one_block_after_the_other():
-    problem = scene_problem()
-    alone = registry.get("sequential_impulses").load()()
-    x, y = problem.start(), problem.start()
-    state = alone.prepare(problem)
-    for _ in range(60):  # too few at a time to be packed in lanes
-        alone.run(state, x, 1, 0.0, None)
-    alone.run(alone.prepare(problem), y, 60, 0.0, None)
-    np.testing.assert_array_equal(x, y)
-    threads = [
-        lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=30, order="colored", threads=t).impulse
-        for t in (1, 2)
-    ]
-    np.testing.assert_array_equal(*threads)
-
-
-@settings(max_examples=60)
-@given(seed=seeds)
-def test_one_contact_alone_is_solved_at_once(seed):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(3, 5))
-    problem = lv.Problem(
-        rng.normal(size=3) + np.array([1.0, 0, 0]),
-        lv.Cones.contacts([rng.uniform(0, 1.5, 2)], shape="box"),
-        g @ g.T,
-    )
-    start = np.abs(rng.normal(size=3))
-    x = lv.solve(problem, "block_gauss_seidel", tol=0.0, max_iter=1, impulse=start).impulse
-    judged = lv.residual(problem, x)
-    assert judged.relative <= 1e-9 or judged.nothing_to_do
-
-
 # -- the engine --------------------------------------------------------------------------------------------------------
 
 
@@ -334,19 +211,6 @@ def test_a_box_grips_more_on_the_diagonal(more):
     assert slope(np.arctan(mu) + 0.05, np.pi / 4, "disk", **more) > 0.3
 
 
-def test_a_substep_is_the_solve_of_its_problem_to_the_bit():
-    sim = lv.Simulation(lv.Scene("pyramid", friction_shape="box", substeps=1))
-    for _ in range(10):
-        sim.step()
-    problem = sim.constraint_problem()
-    assert problem.cones.has_box
-    budget = sim.scene.parameters.solver_iterations
-    x = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=budget).impulse
-    observation = sim.step()[0]
-    impulses = observation["contacts"]["impulses"]
-    np.testing.assert_array_equal(x, impulses.ravel())
-
-
 def test_what_no_scene_of_boxes_has_is_told():
     with pytest.raises(lv.UnknownName, match="friction_shape"):
         lv.Scene("stack", friction_shape="square")
@@ -364,40 +228,3 @@ def test_fclib_has_no_boxes(tmp_path):
     pytest.importorskip("h5py")
     with pytest.raises(lv.LavenderError, match="box"):
         as_matrix(free(3)).save(tmp_path / "box.hdf5")
-
-
-# -- longer rows ------------------------------------------------------------------------------------------------------
-
-
-def test_a_snapshot_of_another_shape_is_refused():
-    sims = [lv.Simulation(lv.Scene("stack", friction_shape=shape)) for shape in ("disk", "box")]
-    for sim in sims:
-        for _ in range(20):
-            sim.step()
-    state = sims[1].snapshot()
-    again = lv.Simulation(lv.Scene("stack", friction_shape="box"))
-    again.restore(state)
-    np.testing.assert_array_equal(again.step()[0]["positions"], sims[1].step()[0]["positions"])
-    with pytest.raises(lv.InputError):
-        sims[0].restore(state)
-
-
-@pytest.mark.parametrize("name", sorted(n for n in OURS if registry.specs()[n].boxes))
-def test_unpleasant_boxes_come_back_with_a_result(name):
-    spec, taken = registry.specs()[name], 0
-    for seed in range(120):
-        rng = np.random.default_rng(seed)
-        problem = random_contact_problem(seed, friction=LAWS[seed % 2], spin=False, bodies=2, contacts=3)
-        if seed % 3:  # in units far from one
-            scale = rng.choice([1e-300, 1e-150, 1e-12, 1.0, 1e12, 1e150])
-            b = problem.b * rng.choice([1e-150, 1e-12, 1.0, 1e12, 1e150])
-            problem = lv.Problem(b, problem.cones, scale * problem.dense(), friction=LAWS[seed % 2])
-        c = problem.cones.shaped("box")
-        ratio = rng.choice([1.0, 0.0, 0.5, 1e-12, 1e12], c.n_blocks)
-        problem = replace(
-            problem, cones=replace(c, patch_radius=np.where(c.kind == lv.CONTACT_BOX, ratio, c.patch_radius))
-        )
-        if c.has_box and spec.refuses(problem) is None:
-            taken += 1
-            assert not lv.solve(problem, name, tol=1e-8, max_iter=300).contradicted, (seed, problem)
-    assert taken > 10

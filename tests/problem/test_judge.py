@@ -2,11 +2,12 @@
 
 import dataclasses
 
+import judge_twin
 import numpy as np
 import pytest
-import twins
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from judge_twin import spec_of
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds
 from random_trees import random_general
 from scipy.linalg import block_diag
@@ -22,18 +23,24 @@ from lavender.residuals import judged, known, remember
 
 def equals_the_twin(problem, lam):
     """Everything the judge says of an impulse, and what it is made of; 1e-9: M and its inverse, roots of many terms."""
-    a, found = problem.dense(), lv.residual(problem, lam)
-    np.testing.assert_allclose(
-        problem.d, twins.diagonal(a, problem.cones, problem.operator != "matrix"), rtol=1e-12
-    )
-    size = np.abs(a) @ np.abs(lam) + np.abs(problem.b)
-    np.testing.assert_allclose(found.slack, a @ lam - problem.b, rtol=0, atol=1e-12 * size.max())
-    e, energy, velocity, row = twins.judged(problem, lam)
-    np.testing.assert_allclose(found.error, e, rtol=0, atol=1e-10 * np.abs(e).max())
-    np.testing.assert_allclose([found.energy, found.velocity], [energy, velocity], rtol=1e-9)
-    assert found.worst_row in row
-    _, energy0, velocity0, _ = twins.judged(problem, problem.start())
-    np.testing.assert_allclose(found.relative, max(energy / energy0, velocity / velocity0), rtol=1e-9)
+    twin, found = judge_twin.Problem(spec_of(problem)), lv.residual(problem, lam)
+    close = 1e-9 if problem.operator == "generalized" else 1e-12
+    np.testing.assert_allclose(problem.disk.d, twin.d.astype(float), rtol=close)
+    np.testing.assert_allclose(problem.disk.metric.nu, twin.nu.astype(float), rtol=close)
+    x = lam / twin.stretch
+    w = twin.slack(x)
+    e, size = twin.error(x, w), (twin.size @ np.abs(x) + twin.b_size).astype(float)
+    np.testing.assert_allclose(found.slack * twin.stretch, w, rtol=0, atol=close * size.max())
+    np.testing.assert_allclose(found.error, twin.stretch * e, rtol=0, atol=1e-10 * np.abs(e).max())
+    said = twin.judge(lam)
+    np.testing.assert_allclose([found.energy, found.velocity], [said.energy, said.velocity], rtol=1e-9)
+    speeds = twin.speeds(e)
+    assert speeds[found.worst_row] == pytest.approx(float(speeds.max()), rel=1e-9)
+    for impulse in (lam, lv.solve(problem, tol=1e-9).impulse):
+        found, said = lv.residual(problem, impulse), twin.judge(impulse)
+        assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed
+        # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
+        assert 0.1 * found.floor <= said.floor <= 100.0 * found.floor
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -70,6 +77,8 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
             p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max()
         )
         np.testing.assert_allclose(p.dense(), a, atol=atol * np.abs(a).max())
+        assert p.csr.has_canonical_format
+        np.testing.assert_array_equal(p.dense(), p.dense().T)
         if form != "matrix":
             np.testing.assert_allclose(p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol)
 
@@ -118,34 +127,6 @@ def test_zero_at_bounds_of_boxed_rows():
 
 
 # -- invariance ----------------------------------------------------------------------------------------
-
-
-@given(seed=seeds)
-@pytest.mark.parametrize("kg, m, s", [(1e3, 1.0, 1.0), (1.0, 1e3, 1.0), (1.0, 1.0, 1e3), (1e-6, 1e4, 1e-3)])
-def test_units_change_no_relative_residual(kg, m, s, seed):
-    """All-linear rows: A scales with 1/kg, b with m/s, lambda with kg m/s."""
-    problem = random_contact_problem(seed, spin=False, joints=0)
-    matrix = as_matrix(problem)
-    lam = np.random.default_rng(seed).normal(size=problem.m)
-    scaled = lv.Problem(problem.b * (m / s), problem.cones, problem.delassus() / kg)
-    judged, again = lv.residual(matrix, lam), lv.residual(scaled, lam * (kg * m / s))
-    np.testing.assert_allclose(again.relative, judged.relative, rtol=1e-12)  # roundings of the products
-    np.testing.assert_allclose(again.velocity, judged.velocity * m / s, rtol=1e-12)
-    np.testing.assert_allclose(again.energy, judged.energy * np.sqrt(kg) * m / s, rtol=1e-12)
-
-
-@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e30, 1e150])
-def test_extreme_units_neither_overflow_nor_underflow(scale):
-    problem = random_lcp(3)
-    lam = np.random.default_rng(0).normal(size=problem.m)
-    scaled = lv.Problem(
-        problem.b * scale,
-        lv.Cones.bounded(problem.cones.lower * scale, problem.cones.upper * scale),
-        problem.matrix,
-    )
-    np.testing.assert_allclose(
-        lv.residual(scaled, lam * scale).relative, lv.residual(problem, lam).relative, rtol=1e-12
-    )
 
 
 @given(seed=seeds)
@@ -257,17 +238,6 @@ def test_floor_bounds_the_rounded_exact_solution(seed):
     assert judged.floor <= 1e-6
 
 
-@given(seed=seeds)
-def test_floor_of_rows_is_a_little_above_that_of_the_matrix(seed):
-    problem = random_contact_problem(seed)
-    lam = np.random.default_rng(seed).normal(size=problem.m)
-    rows, matrix = lv.residual(problem, lam), lv.residual(as_matrix(problem), lam)
-    # |J||M^-1||J|^T |lam| >= |A||lam| entry by entry; the two judges weigh angular rows differently, so compare E.
-    ratio = rows.floor * rows.energy_start / (matrix.floor * matrix.energy_start)
-    assert ratio > 0.1
-    assert ratio < 100.0
-
-
 @pytest.mark.parametrize(
     "problem", [suite.case("four_bar(tilt=0.3)").problem, suite.case("ring(n=8)").problem]
 )
@@ -372,16 +342,17 @@ def test_the_floor_of_a_tiny_matrix_does_not_underflow():
     assert (tiny.relative, tiny.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-12)
 
 
-@pytest.mark.parametrize("form", ["rows", "coulomb", "cone", "rolling"])
+@pytest.mark.parametrize("kind", ["rows", *CONTACTS])
 @given(seed=seeds)
-@settings(max_examples=40)
-def test_the_size_of_the_numbers_changes_no_residual(form, seed):
+@settings(max_examples=20)
+def test_the_size_of_the_numbers_changes_no_residual(kind, seed):
     """Powers of two, so that A, b and lambda keep their bits: squares of e, w or d alone would vanish or overflow."""
-    if form == "rows":
-        problem = random_lcp(seed, boxed=False)
-    else:  # a disk, a twist, what rolls: pairs of rows have one speed
-        friction, rolling = ("coulomb", True) if form == "rolling" else (form, False)
-        problem = as_matrix(random_contact_problem(seed, friction, joints=0, rolling=rolling))
+    friction = ("coulomb", "cone")[seed % 2]
+    problem = (
+        random_lcp(seed, boxed=False)
+        if kind == "rows"
+        else as_matrix(CONTACTS[kind](seed, friction, joints=0))
+    )
     lam = np.random.default_rng(seed).normal(size=problem.m)
     usual = lv.residual(problem, lam)
     for a, b in (
@@ -400,9 +371,7 @@ def test_the_size_of_the_numbers_changes_no_residual(form, seed):
         got = lv.residual(scaled, lam * 2.0 ** (b - a))
         # A dozen sums of positive terms: 1e-13 is a hundred roundings.
         assert (got.relative, got.floor) == pytest.approx((usual.relative, usual.floor), rel=1e-13)
-        assert got.velocity / got.velocity_start == pytest.approx(
-            usual.velocity / usual.velocity_start, rel=1e-13
-        )
+        assert got.velocity == pytest.approx(usual.velocity * 2.0**b, rel=1e-13)
         assert got.worst_row == usual.worst_row
 
 

@@ -71,19 +71,6 @@ def test_velocity_form_is_the_same_problem(seed):
     np.testing.assert_allclose(form.impulse(z), s)
 
 
-@given(seed=seeds)
-def test_the_assembled_matrix_is_symmetric_to_the_bit_and_sorted(seed):
-    problem = random_contact_problem(seed, bodies=4, contacts=12)
-    a = problem.csr
-    assert a.has_canonical_format
-    np.testing.assert_array_equal(a.toarray(), a.toarray().T)
-    minv = problem.rows.inverse_mass_matrix()
-    expected = (problem.jacobian @ minv @ problem.jacobian.T).toarray() + np.diag(problem.compliance)
-    np.testing.assert_allclose(
-        a.toarray(), expected, atol=1e-13 * np.abs(expected).max()
-    )  # a dozen roundings
-
-
 def test_from_rows_forms_b_from_target_and_free_velocity():
     rng = np.random.default_rng(2)
     rows = random_rows(rng)

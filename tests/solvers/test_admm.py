@@ -9,46 +9,30 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender.deadline import Deadline
 from lavender.solvers import admm
-
-
-def box_stack(n, ratio, friction=None, speed=0.0):
-    """n unit cubes on four corner points each, the top one `ratio` times as heavy: A has rank deficiency."""
-    mass = np.ones(n)
-    mass[-1] = ratio
-    corners = np.array([(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    c = 4 * n
-    body = np.repeat(np.stack([np.arange(n) - 1, np.arange(n)], 1), 4, axis=0)
-    arm_b = np.c_[np.tile(corners, (n, 1)), np.full(c, -0.5)]
-    arm_a = np.where(body[:, :1] >= 0, arm_b * [1, 1, -1], 0.0)
-    v = np.zeros((n, 6))
-    v[:, 2], v[:, 0] = -0.0981, speed
-    rows = lv.Rows(
-        1.0 / mass, (6.0 / mass)[:, None, None] * np.eye(3), v, normal=np.tile([0.0, 0.0, 1.0], (c, 1)),
-        tangent=np.tile([1.0, 0.0, 0.0], (c, 1)), arm_a=arm_a, arm_b=arm_b, contact_body=body,
-    )  # fmt: skip
-    return lv.Problem.from_rows(rows, mu=friction or 0.0, tangents=0 if friction is None else 2)
+from lavender.suite import box_stack
+from lavender.suite.build import FALL
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
 def test_heavy_box_on_light_ones(ratio):
-    problem = box_stack(6, ratio)
+    problem = box_stack(6, ratio).problem
     solution = lv.solve(problem, "admm", tol=1e-9)
     assert solution.success or solution.residual.relative <= 2 * solution.residual.floor
     # Four points carry what lies above them; velocities vanish.
-    above = np.r_[np.full(5, 1.0), ratio][::-1].cumsum()[::-1] * 0.0981
+    above = np.r_[np.full(5, 1.0), ratio][::-1].cumsum()[::-1] * FALL
     np.testing.assert_allclose(solution.impulse.reshape(6, 4).sum(1), above, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
 def test_coulomb_with_mass_ratios(ratio, speed):
     # Sweeps do not get below 1e-2 here in 20,000.
-    problem = box_stack(4, ratio, friction=0.5, speed=speed)
+    problem = box_stack(4, ratio, "coulomb", speed).problem
     solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
     assert solution.success, solution
 
 
 def test_iterations_do_not_grow_with_the_mass_ratio_as_sweeps_do():
-    counts = [lv.solve(box_stack(6, ratio), "admm", tol=1e-8).iterations for ratio in (1.0, 1e2, 1e4)]
+    counts = [lv.solve(box_stack(6, ratio).problem, "admm", tol=1e-8).iterations for ratio in (1.0, 1e2, 1e4)]
     assert max(counts) < 500  # Gauss-Seidel: contraction R / (1 + R), 200,000 sweeps at 1e4
 
 
@@ -232,7 +216,7 @@ def test_work_is_told_once_however_a_run_is_cut(m):
 
 
 def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
-    problem = box_stack(20, 10.0, 0.5)
+    problem = box_stack(20, 10.0, "coulomb").problem
     prepared = lv.prepare(problem, "admm")
     solver, state = prepared.solver, prepared.state
     impulse, made = problem.start(), state.factorisations
@@ -249,7 +233,7 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
 
 
 def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
-    problem = box_stack(8, 10.0)
+    problem = box_stack(8, 10.0).problem
     before = lv.solve(problem, "admm", max_iter=200, tol=1e-8)
     monkeypatch.setattr("lavender.solvers.admm.AT_ONCE", -1.0)
     prepared = lv.prepare(problem, "admm")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, good, random_contact_problem, random_lcp, seeds
+from random_problems import FORMS, as_matrix, good, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -31,30 +31,23 @@ def several(count, seed=0, friction="coulomb"):
     return lv.Problem(np.concatenate([p.b for p in parts]), cones, a, friction=friction), offset
 
 
+@pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
-@settings(max_examples=30)
-def test_islands_of_rows_and_of_their_matrix_are_the_same(seed):
-    problem = random_contact_problem(seed, bodies=9, joints=2, contacts=5)
+@settings(max_examples=25)
+def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
+    problem = FORMS[form](random_contact_problem(seed, bodies=9, joints=2, contacts=6))
     count, label = islands(problem)
-    count_of_matrix, label_of_matrix = islands(as_matrix(problem))
     # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.
+    count_of_matrix, label_of_matrix = islands(as_matrix(problem))
     assert count == count_of_matrix
     assert np.array_equal(label, label_of_matrix)
     assert np.array_equal(np.unique(label), np.arange(count))
-
-
-@pytest.mark.parametrize("form", ["rows", "matrix"])
-@given(seed=seeds)
-@settings(max_examples=25)
-def test_an_island_alone_is_the_part_of_the_whole(form, seed):
-    problem = random_contact_problem(seed, bodies=9, joints=2, contacts=6)
-    problem = problem if form == "rows" else as_matrix(problem)
-    count, label = islands(problem)
     a = problem.dense()
     for i in range(count):
         blocks = np.flatnonzero(label == i)
         rows = rows_of(problem, blocks)
         part = restrict(problem, blocks, rows)
+        assert part.operator == problem.operator
         # Sums over one body in another order: a few roundings.
         np.testing.assert_allclose(part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max())
         np.testing.assert_array_equal(part.b, problem.b[rows])

@@ -19,7 +19,7 @@ from lavender_ext.newton.solve import PHASES
 
 
 def dense_h(system):
-    return np.array([system.solve.times(e) for e in np.eye(system.sc.m)]).T
+    return np.array([system.solve.times(e) for e in np.eye(system.solve.m)]).T
 
 
 def problem_of(seed, compliant, friction="coulomb"):
@@ -34,7 +34,7 @@ def problem_of(seed, compliant, friction="coulomb"):
 @settings(max_examples=30)
 def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     system = make_system(problem_of(seed, True), "velocity")
-    sc, solve = system.sc, system.solve
+    sc = solve = system.solve
     rng = np.random.default_rng(seed)
     s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
     phi, psi = solve.slip(s)
@@ -66,11 +66,11 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
     problem = problem_of(seed, compliant)
     with mock.patch.multiple(systems, DENSE_ROWS=0 if form == "sparse" else 150, DENSE_FILL=2.0):
         system = make_system(problem, "velocity" if form in ("velocity", "augmented") else "impulse")
-    sc, solve = system.sc, system.solve
+    sc = solve = system.solve
     first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
     solve.begin(1e-10, 0.9)
     for _ in range(3):
-        solve.weigh(system.elements, 1e-10)
+        solve.weigh(1e-10)
         w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
         c = np.eye(sc.m)
         np.subtract.at(c, (first, np.arange(sc.m)), solve.turn(0.9))
@@ -89,10 +89,11 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
 def test_augmented_system_is_the_same_newton_system(law, seed):
     problem = problem_of(seed, True, "cone" if law == LAWS["cone"] else "coulomb")
     system = make_system(problem, "velocity")
-    solve, m = system.solve, system.sc.m
+    solve = system.solve
+    m = solve.m
     rng = np.random.default_rng(seed)
     z, r = rng.normal(size=m), rng.normal(size=m)
-    solve.natural(z, solve.times(z) - system.sc.g, law, 1e-3)
+    solve.natural(z, solve.times(z) - system.solve.g, law, 1e-3)
     assert solve.factor("natural", 1e-3, augmented=True)
     p = block_diagonal(system, solve.p)
     matrix = np.eye(m) - p + p @ (dense_h(system) + 1e-3 * np.eye(m))
@@ -103,14 +104,13 @@ def test_augmented_system_is_the_same_newton_system(law, seed):
 
 def without(monkeypatch, *phases):
     """Newton's method goes without these."""
-    given = System.new_solve
+    given = System.__init__
 
-    def solve(self, *args):
-        made = given(self, *args)
-        made.without = sum(PHASES[name] for name in phases)
-        return made
+    def begin(self, problem, solve):
+        given(self, problem, solve)
+        solve.without = sum(PHASES[name] for name in phases)
 
-    monkeypatch.setattr(System, "new_solve", solve)
+    monkeypatch.setattr(System, "__init__", begin)
 
 
 # -- scenes at rest: many redundant points, few of which slip -------------------------------------------

@@ -4,7 +4,6 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from enumeration import enumerate_lcp
 from hypothesis import assume, given
 from random_problems import good, random_lcp, seeds, without_solution
 
@@ -92,40 +91,6 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
         np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
-
-
-@given(seed=seeds, m=st.integers(1, 7), boxed=st.booleans(), whole=st.booleans())
-def test_positive_definite_pivoting_equals_enumeration(seed, m, boxed, whole):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, m + 2))
-    if whole:  # small whole numbers: degenerate, w = 0 and lambda = 0 at once
-        g = np.rint(g)
-    a = g @ g.T + 0.25 * np.eye(m)
-    b = np.rint(2.0 * rng.normal(size=m)) if whole else rng.normal(size=m)
-    low = np.where(rng.random(m) < 0.2, -np.inf, -np.rint(2.0 * rng.random(m)) if boxed else 0.0)
-    high = np.where(rng.random(m) < 0.5, np.inf, np.maximum(low, 0.0) + 1.0) if boxed else np.full(m, np.inf)
-    solution = lv.solve(lv.Problem.lcp(a, b, low, high), "direct", tol=1e-9)
-    assert good(solution), solution
-    truth = enumerate_lcp(a, b, low, high)
-    assert truth
-    for x, _ in truth:  # all spellings of the one solution
-        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
-
-
-@given(seed=seeds, m=st.integers(2, 8), whole=st.booleans())
-def test_semidefinite_pivoting_finds_the_slack_of_enumeration(seed, m, whole):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, max(1, m // 2)))
-    if whole:
-        g = np.rint(g)
-    a = g @ g.T
-    b = a @ np.maximum(rng.normal(size=m), 0.0) - np.maximum(rng.normal(size=m), 0.0)
-    solution = lv.solve(lv.Problem.lcp(a, b), "direct", tol=1e-9)
-    assert solution.success, solution
-    assert not solution.contradicted
-    truth = enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf))
-    for _, w in truth:  # the slack of a symmetric semidefinite LCP is unique
-        np.testing.assert_allclose(solution.slack, w, atol=1e-6)
 
 
 @given(seed=seeds, rank=st.integers(2, 12))

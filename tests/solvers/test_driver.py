@@ -140,7 +140,7 @@ def test_webassembly_gives_the_same_bits(tmp_path):
     wasmtime = pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)")
     out = tmp_path / "driver.wasm"
     built = wasm.build(out, ROOT, ("driver.driver",), largest=250_000)
-    assert built.imports == () and set(built.functions) == {"lav_room", "lav_start", "lav_step"}
+    assert set(built.functions) == {"lav_room", "lav_start", "lav_step"}
     engine = wasmtime.Engine()
     store = wasmtime.Store(engine)
     exports = wasmtime.Instance(store, wasmtime.Module(engine, out.read_bytes()), []).exports(store)

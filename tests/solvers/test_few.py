@@ -20,9 +20,10 @@ from benchmarks.drawn import wild
 from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
-from lavender.solvers import weights
+from lavender.solvers.costs import candidates
 from lavender.solvers.newton_systems import general
-from lavender.solvers.small import AUTO, ISLAND, Few, call_ends_within, general_cost
+from lavender.solvers.small import AUTO, FIRST, ISLAND, Few, call_ends_within, velocities_cost
+from lavender.solvers.structure import Structure
 from lavender_ext.few.many import solve_first
 
 SHORT = ("auto", "direct", "newton")
@@ -197,6 +198,7 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
     with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
         lv.solve(problem, "newton", form="impulse")
+    assert "newton over rows" not in candidates(Structure(problem))
     # What it cannot take further ends as a result, not in a solver that reads past such a block.
     hard = lv.prepare(problem, "auto").solve(tol=1e-15)
     assert np.isfinite(hard.residual.relative) and not hard.contradicted
@@ -217,10 +219,10 @@ def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(se
     assert facts(limited) == facts(short), "a limit chooses nothing"
 
 
-@pytest.mark.parametrize("seed", [1076])  # of 48 rows, for which newton takes more steps than the call has
+@pytest.mark.parametrize("seed", [1224, 1351])  # of 48 and 105 rows, where newton is stuck
 def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
     problem = wild(seed=seed).problem
-    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.gate, general.ROOM) is False
+    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.gate) is None
     fresh = replace(problem, copy=False)
     assert registry.get("auto").few.solve(fresh, None, 1e-6) is None
     assert fresh.derived.vain is not None
@@ -229,14 +231,14 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
 
 @pytest.mark.parametrize("seed", range(40))
 def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
-    """`general_cost` and the gate of the compiled loops say the same of each law."""
+    """`velocities_cost` and the gate of the compiled loops say the same of each law."""
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
     n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60))
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
-    found = solve_first(problem.metric, None, np.inf, AUTO.gate, general.ROOM)
-    cost = general_cost(problem, general.prepare(problem).largest)
-    assert (found is not None) == (cost <= weights.GENERAL_FIRST[problem.law])
+    found = solve_first(problem.metric, None, np.inf, AUTO.gate)
+    cost = velocities_cost(problem, general.prepare(problem).largest)
+    assert (found is not None) == (cost <= FIRST[problem.law])
 
 
 def side_by_side(parts):
@@ -384,8 +386,8 @@ def test_one_call_has_steps_for_every_island_of_velocities():
         compliance=np.tile(part.compliance, many),
         friction=part.friction,
     )
-    found = solve_first(problem.metric, None, 1e-6, AUTO.gate, general.ROOM)
-    assert found and found[1][0] > 64
+    found = solve_first(problem.metric, None, 1e-6, AUTO.gate)
+    assert found and found[1][0] > many
 
 
 def test_the_one_call_keeps_to_what_newton_does_by_default():

@@ -23,40 +23,12 @@ def random_bounds(rng, m):
     return low, high
 
 
-@given(seed=seeds, m=st.integers(1, 8), whole=st.booleans())
-def test_p_matrices_have_the_one_solution_of_enumeration(seed, m, whole):
-    rng = np.random.default_rng(seed)
-    g = rng.normal(size=(m, m))
-    skew = rng.normal(size=(m, m))
-    if whole:
-        g, skew = np.rint(g), np.rint(skew)
-    a = g @ g.T + 0.5 * np.eye(m) + skew - skew.T  # positive definite, not symmetric
-    b = np.rint(2.0 * rng.normal(size=m)) if whole else rng.normal(size=m)
-    solution = lv.solve(lv.Problem.lcp(a, b), "lemke", tol=1e-9)
-    assert good(solution), solution
-    truth = enumerate_lcp(a, b, np.zeros(m), np.full(m, np.inf))
-    assert truth
-    for x, _ in truth:
-        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
-
-
 def random_mix(seed, m):
     """(A, b, lower, upper): A asymmetric and positive definite, every kind of row."""
     rng = np.random.default_rng(seed)
     g, skew = rng.normal(size=(2, m, m))
     low, high = random_bounds(rng, m)
     return g @ g.T + 0.5 * np.eye(m) + skew - skew.T, 2.0 * rng.normal(size=m), low, high
-
-
-@given(seed=seeds, m=st.integers(1, 6))
-def test_every_kind_of_row_against_enumeration(seed, m):
-    a, b, low, high = random_mix(seed, m)
-    solution = lv.solve(lv.Problem.lcp(a, b, low, high), "lemke", tol=1e-9)
-    assert good(solution), solution
-    truth = enumerate_lcp(a, b, low, high)
-    assert truth
-    for x, _ in truth:
-        np.testing.assert_allclose(solution.impulse, x, atol=1e-7)
 
 
 @given(seed=seeds, m=st.integers(1, 6))

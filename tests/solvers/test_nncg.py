@@ -106,22 +106,6 @@ def test_wrong_options_are_refused():
 
 
 @pytest.mark.parametrize("name", ["nncg", "anderson"])
-def test_a_sliding_pile_is_solved(name):
-    # Contacts that slide: the map is not a gradient, and is accelerated all the same.
-    problem = sliding_pile()
-    plain = lv.solve(problem, "sequential_impulses", tol=1e-9, max_iter=50_000)
-    solution = lv.solve(problem, name, tol=1e-9, max_iter=50_000)
-    assert plain.success
-    assert solution.success
-    slides = [
-        np.linalg.norm(solution.impulse[i + 1 : i + 3]) > 0.999 * mu * solution.impulse[i] > 0.0
-        for i, mu in zip(problem.cones.ptr, problem.cones.mu, strict=False)
-    ]
-    assert sum(slides) >= 3
-    assert solution.work["sweeps"] < plain.work["sweeps"]
-
-
-@pytest.mark.parametrize("name", ["nncg", "anderson"])
 def test_starting_from_the_convex_answer(name):
     # b is that of impulses well inside their cones: nothing slides, and the cone law's answer is Coulomb's.
     rng = np.random.default_rng(3)

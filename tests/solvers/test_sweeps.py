@@ -72,15 +72,20 @@ def test_row_order_given_by_name_or_by_numbers_is_the_same(name, seed):
 
 
 @given(seed=seeds)
-def test_gauss_seidel_and_sor_are_their_formulas(seed):
+def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
     problem = random_lcp(seed, boxed=False)
     a, b = problem.matrix, problem.b
     linear = lv.Problem.linear(a, b)
-    for name, omega, options in (("gauss_seidel", 1.0, {}), ("sor", 1.3, {"omega": 1.3})):
+    for name, omega, options in (
+        ("gauss_seidel", 1.0, {}),
+        ("sor", 1.3, {"omega": 1.3}),
+        ("jacobi", 0.3, {"omega": 0.3}),
+    ):
         lam = np.zeros(len(b))
         for _ in range(3):
+            seen = lam.copy() if name == "jacobi" else lam
             for i in range(len(b)):
-                lam[i] -= omega * (a[i] @ lam - b[i]) / a[i, i]
+                lam[i] -= omega * (a[i] @ seen - b[i]) / a[i, i]
         np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
 
 
@@ -157,7 +162,7 @@ def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
 # -- threads -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["pgs", "sequential_impulses"])
+@pytest.mark.parametrize("name", lv.available(threads=True))
 def test_threads_change_no_bit(name, monkeypatch):
     """Small problems fall back to one thread; here they may not."""
     monkeypatch.setattr(sweeping, "GRAIN", 0)

@@ -222,6 +222,13 @@ def test_chains_are_banded_and_hold_their_weight():
         "boxed_friction(n=4, scene=pyramid)",
         "hang(n=20, tip_mass=1e6)",
         "random_spd(n=60, condition=1e10)",
+        *(
+            f"slider(mu={mu}, speed={v}, friction={law})"
+            for mu in (0, 0.1, 10)
+            for v in (0.01, 6)
+            for law in ("coulomb", "cone")
+        ),
+        *(f"anisotropic(ratio={ratio}, speed={v})" for ratio in (0.1, 100, 1e6) for v in (0.1, 100)),
     ],
 )
 def test_a_reference_is_a_solution(name):

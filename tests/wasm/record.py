@@ -20,7 +20,6 @@ from random_problems import as_matrix, random_contact_problem, random_lcp
 import lavender as lv
 from lavender.ordering import block_order
 from lavender.web.scenes import describe, layout
-from lavender_ext.host import memory
 
 STEPS = 600
 BODY_ARRAYS = ("x", "q", "v")
@@ -105,9 +104,6 @@ def record_scene(writer, name, parameters, changes, steps=STEPS):
         "steps": steps,
         "changes": {str(step): change for step, change in changes.items()},
         **describe(start),
-        "settings": list(
-            memory.read_settings(start.size, start.real.copy(), start.index.copy(), start.keys.copy())
-        ),
         "states": writer.put(states, "<f8"),
         "values": writer.put(values, "<f8"),
         "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),

@@ -1,6 +1,5 @@
-"""The kernels in WebAssembly give the bits of the native ones: under Node, and under wasmtime from Python."""
+"""The kernels in WebAssembly give the bits of the native ones, under Node."""
 
-import hashlib
 import json
 import os
 import shutil
@@ -16,7 +15,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.scene import SCENES
 from lavender.web import compile as wasm
 from lavender.web import cut, pages
-from lavender.web.scenes import describe, layout, page_scenes
+from lavender.web.scenes import describe, page_scenes
 from lavender_ext.host import memory
 
 HERE = Path(__file__).resolve().parent.parent
@@ -52,13 +51,6 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recording")
     subprocess.run([sys.executable, str(HERE / "wasm" / "record.py"), str(folder)], check=True, cwd=ROOT)
     return folder
-
-
-@pytest.fixture(scope="session")
-def host():
-    return pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)") and __import__(
-        "wasm_host"
-    )
 
 
 # -- the module ------------------------------------------------------------------------------------------------
@@ -249,130 +241,17 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     assert sign in done.stderr
 
 
-# -- wasmtime --------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="session")
-def recorded(recording, host):
-    return host.Recording(recording)
-
-
-def same_bits(found, expected):
-    return np.asarray(found, expected.dtype).tobytes() == expected.tobytes()
-
-
-def test_wasmtime_structs_are_those_of_c_and_of_the_native_build(module, host):
-    # C's rules: every field at a multiple of its width, the whole at a multiple of the widest.
-    kernels, native = host.Kernels(module, layout()), memory.layout()
-    for pointer, (sizes, offsets) in {
-        4: (kernels.sizes, kernels.offsets),
-        np.dtype(np.intp).itemsize: (
-            {name: size for name, (size, _) in native.items()},
-            {(name, f): at for name, (_, places) in native.items() for f, at in places.items()},
-        ),
-    }.items():
-        for name, fields in memory.STRUCTS.items():
-            at, widest = 0, 1
-            for field, kind in fields.items():
-                width = pointer if kind == "p" else int(kind[-1])
-                at = -(-at // width) * width
-                assert offsets[name, field] == at, (name, field)
-                at += width * int(kind[:-2] or 1)
-                widest = max(widest, width)
-            assert sizes[name] == -(-at // widest) * widest, name
-
-
-def test_wasmtime_scenes_are_the_same_to_the_bit(module, host, recorded):
-    steps = 0
-    for scene in recorded.contents["scenes"]:
-        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
-        assert simulation.read_settings() == bytes(scene["settings"])
-        values = recorded.array(scene["values"]).reshape(-1, 8)
-        states = recorded.array(scene["states"]).reshape(len(values), -1)
-        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
-        assert len(values) >= 600
-        for step in range(len(values)):
-            if str(step) in scene["changes"]:
-                simulation.set(**scene["changes"][str(step)])
-            assert simulation.step() == 0
-            where = f"{scene['name']}, step {step + 1}"
-            assert same_bits(simulation.values(), values[step]), where
-            state = np.concatenate([simulation.array(name) for name in recorded.contents["body_arrays"]])
-            assert same_bits(state, states[step]), where
-            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
-            steps += 1
-        assert same_bits(simulation.array("x"), states[-1][: 3 * scene["size"][0]])
-    assert steps == 10800
-
-
-def test_wasmtime_solves_by_newton_are_the_same_to_the_bit(module, newton_module, host, recorded):
-    for scene in recorded.contents["newton"]:
-        simulation = host.Simulation(host.Kernels(module, recorded.contents["layout"]), scene)
-        newton = host.Newton(newton_module, simulation.k)
-        values = recorded.array(scene["values"]).reshape(-1, 8)
-        said = recorded.array(scene["said"]).reshape(-1, 4)
-        hashes = recorded.array(scene["hashes"]).reshape(-1, 32)
-        for step in range(40):  # Node goes on to the end
-            if str(step) in scene["changes"]:
-                simulation.set(**scene["changes"][str(step)])
-            where = f"{scene['name']}, step {step + 1}"
-            assert same_bits(newton.step(simulation, 1e-6), said[step]), where
-            assert same_bits(simulation.values(), values[step]), where
-            assert hashlib.sha256(b"".join(simulation.everything())).digest() == hashes[step].tobytes(), where
-
-
-def test_wasmtime_problems_are_the_same_to_the_bit(module, host, recorded):
-    for problem in recorded.contents["problems"]:
-        found = host.run_problem(host.Kernels(module, recorded.contents["layout"]), problem, recorded)
-        for name, place in problem["expected"].items():
-            assert same_bits(found[name], recorded.array(place)), (problem["name"], name)
-        assert [found[key] for key in ("energy", "velocity", "worst")] == [
-            problem[key] for key in ("energy", "velocity", "worst")
-        ]
-
-
-def test_wasmtime_errors_along_the_sweeps_are_the_native_ones(module, host):
-    for name in ("stack", "chain"):
-        simulation = lv.Simulation(lv.Scene(name, substeps=1))
-        twin = host.Simulation(
-            host.Kernels(module, layout()), {"substeps": 1, **describe(simulation.snapshot())}
-        )
-        for _ in range(20):
-            state = simulation.state.copy()
-            assert state.kernel.prepare() == 0
-            curve = np.zeros((simulation.solver_iterations + 1, 2))
-            state.kernel.solve_watched(curve)
-            observation = simulation.step()[0]
-            assert same_bits(twin.step_watched(simulation.solver_iterations), curve)
-            assert same_bits(twin.values(), observation["solver"])
-            assert curve[0, 0] == observation["solver"][4] and curve[-1, 0] == observation["solver"][5]
-
-
-def test_wasmtime_packed_sweeps_are_the_plain_ones(module, host):
-    for scene in page_scenes()["scenes"]:
-        plain, packed = (host.Simulation(host.Kernels(module, layout()), scene) for _ in range(2))
-        for _ in range(60):
-            assert plain.step() == packed.step(packed=True) == 0
-        assert plain.everything() == packed.everything(), scene["name"]
-
-
-def test_wasmtime_snapshot_leads_back(module, host):
-    (scene,) = (s for s in page_scenes()["scenes"] if s["name"] == "pyramid")
-    simulation = host.Simulation(host.Kernels(module, layout()), scene)
-    for _ in range(10):
-        simulation.step()
-    kept = simulation.everything()
-    ends = []
-    for _ in range(2):
-        for _ in range(10):
-            simulation.step()
-        ends.append(simulation.everything())
-        simulation.restore(kept)
-        simulation.set(warm_start=0)
-        simulation.step()
-        assert simulation.values()[3] == 0.0
-        simulation.restore(kept)
-    assert ends[0] == ends[1] != kept
+def test_structs_lie_by_the_rules_of_c():
+    """Every field at a multiple of its width, the whole at a multiple of the widest."""
+    for name, (size, offsets) in memory.layout().items():
+        at, widest = 0, 1
+        for field, kind in memory.STRUCTS[name].items():
+            width = np.dtype(np.intp).itemsize if kind == "p" else int(kind[-1])
+            at = -(-at // width) * width
+            assert offsets[field] == at, (name, field)
+            at += width * int(kind[:-2] or 1)
+            widest = max(widest, width)
+        assert size == -(-at // widest) * widest, name
 
 
 # -- scenes and command ----------------------------------------------------------------------------------------

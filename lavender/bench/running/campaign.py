@@ -22,15 +22,15 @@ from typing import Any
 from lavender import registry
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, is_path, resolve
-from lavender.bench.record import CaseInfo, Done, Record, Skip
-from lavender.bench.running.moved import with_motion
+from lavender.bench.record import CaseInfo, Done, Record, Run, Skip
 from lavender.bench.running.plan import Plan
-from lavender.bench.running.runner import Event, Watch, is_foreign, not_loaded, solver_names
-from lavender.bench.running.timing import Task, measure_impulse, one_thread
+from lavender.bench.running.runner import Event, Runner, Watch, is_foreign, not_loaded, solver_names
+from lavender.bench.running.timing import Task, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
 from lavender.errors import InputError
 from lavender.problem import Problem
+from lavender.registry import SolverSpec
 
 __all__ = ["CampaignPlan", "campaign", "seeds"]
 
@@ -70,7 +70,7 @@ class Order:
     """What every worker is told beside its pair."""
 
     plan: CampaignPlan
-    run: str
+    run: Run
     memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
     parent: int = 0  # process whose end ends its workers; 0: they belong to a cluster
 
@@ -168,7 +168,7 @@ def campaign(
                     f"{len(left)} of {len(pairs)} pairs are not done: workers were lost {ATTEMPTS} times; "
                     "run the same command again, with fewer workers if memory is short"
                 )
-            for index, entries in _hand_out(left, Order(plan, this.run, memory), workers, name):
+            for index, entries in _hand_out(left, Order(plan, this, memory), workers, name):
                 done[index], pair = entries, pairs[index]
                 _keep(kept, [*entries, Done(this.run, pair.case, pair.solver)])
                 if watch is not None:
@@ -338,36 +338,36 @@ def _end_with(parent: int) -> None:
         threading.Thread(target=watch, daemon=True).start()
 
 
+class _WithoutTimes(Runner):
+    """Pairs that end by iterations; the limit of a process is the only clock, for what other packages bring."""
+
+    def make(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
+        assert isinstance(self.plan, CampaignPlan)
+        if task.mode == "tol" and task.max_iter:
+            task = replace(task, max_iter=min(task.max_iter, self.plan.cap))
+        limit = self.plan.time_limit if is_foreign(spec) else math.inf
+        record, found = super().make(problem, replace(task, time_limit=limit), spec, impulse)
+        nan = math.nan
+        record = replace(
+            record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
+            pace=None, own_min=None, time_limit=self.plan.time_limit,
+        )  # fmt: skip
+        return record, found
+
+
 def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
-    plan, run = order.plan, order.run
+    global _worker
     try:
-        problem, info = _look(pair, run)
+        problem, info = _look(pair, order.run.run)
     except Exception as error:  # a file may make a reader raise anything
         item = Item(pair.case, str(pair.source), _missing, pair.reason)
-        return pair.index, [Skip(run, pair.case, "", not_loaded(item, error))]
-    spec = registry.get(pair.solver)
-    reason = spec.refuses(problem)
-    if reason:
-        return pair.index, [info, Skip(run, pair.case, pair.solver, reason)]
-    entries: list[Any] = [info]
-
-    def one(task: Task) -> Record:
-        global _worker
-        task = _by_iterations(task, plan.cap)
-        if is_foreign(spec):
-            if _worker is None:
-                shared = machine.memory_share(os.cpu_count() or 1)
-                _worker = Worker(shared if order.memory is None else order.memory)
-            record, impulse = _worker.measure_impulse(replace(problem, copy=False), task)
-        else:
-            record, impulse = measure_impulse(problem, replace(task, time_limit=math.inf))
-        record = _without_times(with_motion(record, problem, impulse) if plan.motion else record)
-        record = replace(record, time_limit=plan.time_limit)
-        entries.append(record)
-        return record
-
-    plan.carry_out(info, problem, spec, one)
-    return pair.index, entries
+        return pair.index, [Skip(order.run.run, pair.case, "", not_loaded(item, error))]
+    if _worker is None:
+        shared = machine.memory_share(os.cpu_count() or 1)
+        _worker = Worker(shared if order.memory is None else order.memory)
+    runner = _WithoutTimes(order.run, order.plan, [pair.solver], None, None, _worker)
+    runner.pair(info, problem, pair.solver)
+    return pair.index, [info, *runner.out.skips, *runner.out.records]
 
 
 _seen: tuple[Any, tuple[Problem, CaseInfo]] | None = None  # the case before: pairs of one case come together
@@ -391,15 +391,3 @@ def _look(pair: Pair, run: str) -> tuple[Problem, CaseInfo]:
 
 def _missing() -> Problem:
     raise InputError("the case is not known to the worker")
-
-
-def _by_iterations(task: Task, cap: int) -> Task:
-    return replace(task, max_iter=min(task.max_iter, cap)) if task.mode == "tol" and task.max_iter else task
-
-
-def _without_times(record: Record) -> Record:
-    nan = math.nan
-    return replace(
-        record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-        pace=None, own_min=None,
-    )  # fmt: skip

@@ -16,7 +16,7 @@ from typing import Any
 from lavender.bench.cases import Item, Source, resolve
 from lavender.bench.record import CaseInfo, Record
 from lavender.bench.running.plan import Plan
-from lavender.bench.running.runner import Watch, _Runner, is_foreign
+from lavender.bench.running.runner import Runner, Watch, is_foreign
 from lavender.bench.running.timing import Task, just_written, one_thread, outcome_of, pace, record_of
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
@@ -94,7 +94,7 @@ def finals(
     """
     names = list(dict.fromkeys(ask.solver for ask in asks))
     with opened(store) as kept, Worker(memory) as worker, one_thread():
-        runner = _Runner(list(known.runs.values())[-1], plan, names, kept, watch, worker if isolate else None)
+        runner = Runner(list(known.runs.values())[-1], plan, names, kept, watch, worker if isolate else None)
         runner.out = known
         if fresh:
             runner.known = {}
@@ -116,7 +116,7 @@ def finals(
 
 
 class _Stage:
-    def __init__(self, runner: _Runner, asks: Sequence[Ask], turns: str) -> None:
+    def __init__(self, runner: Runner, asks: Sequence[Ask], turns: str) -> None:
         self.runner, self.asks, self.turns = runner, asks, turns
         self.known = {r.key for r in runner.known.values() if r.turns == turns}
         for record in runner.known.values():

@@ -14,7 +14,7 @@ from lavender.ordering import ORDERS
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 
-__all__ = ["Plan"]
+__all__ = ["Plan", "passes"]
 
 # A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
 FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
@@ -181,6 +181,15 @@ class Plan:
                         return
                     tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * level / speed))
                 last = yield task("tol", tol, UNLIMITED if spec.resumable else 0, start)
+
+
+def passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, str, float, int]]:
+    """What is run over a sequence: (start, mode, tol, max_iter), each budget and level."""
+    starts = ["cold", "carried"] if spec.impulse and not spec.exact else ["cold"]
+    asked = plan.levels[-1:] if spec.exact else plan.levels
+    levels = [("tol", level, UNLIMITED if spec.resumable else 0) for level in asked]
+    budgets = [("budget", 0.0, n) for n in plan.budgets] if spec.resumable and not spec.exact else []
+    return [(start, *what) for start in starts for what in [*budgets, *levels]]
 
 
 def _hopeless(record: Record) -> bool:

@@ -10,14 +10,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from lavender import registry
+from lavender import motion, registry
 from lavender._arrays import FloatArray
 from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.record import CaseInfo, Record, Run, Skip, asked_of
-from lavender.bench.running.moved import with_motion
-from lavender.bench.running.plan import Plan
-from lavender.bench.running.sequences import carry, passes
+from lavender.bench.running.plan import Plan, passes
 from lavender.bench.running.timing import Task, measure_impulse, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
@@ -28,6 +26,7 @@ from lavender.registry import SolverSpec
 
 __all__ = ["Event", "run", "solver_names"]
 
+SEARCH = 6  # runs of the search for several motions, once for each Coulomb problem
 QUICK = 0.05  # of the time limit: after a step that took less, the next is solved without a guard
 SHORT_SEQUENCE = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
 
@@ -44,6 +43,27 @@ class Event:
     solver: str
     record: Record | None = None
     reused: bool = False
+
+
+def carry(before: Problem, impulse: FloatArray, problem: Problem) -> FloatArray:
+    """Start of `problem` (m,) [N s] from the impulses of the step before."""
+    return problem.carry((before, impulse))
+
+
+def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
+    """The record with `motion`, `motion_speed` and `bound` of the impulses (m,) [N s] that came out, None without any.
+
+    Outside every clock. The reference, and under Coulomb's law the motions that are found, are kept with `problem`.
+    """
+    if impulse is None:
+        return record
+    problem, impulse = problem.disk, problem.on_disk(impulse)
+    found = motion.motions_of(problem, SEARCH) if problem.law == "coulomb" else None
+    error = (
+        motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
+    )
+    speed = error.rows if error.speed is None else error.speed
+    return replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
 
 
 def is_foreign(spec: SolverSpec) -> bool:
@@ -111,7 +131,7 @@ def run(
     packages = {module for name in names for module in specs[name].requires}
     this = machine.describe(plan.as_dict(), packages)
     with opened(store) as kept, Worker(memory) as worker:
-        runner = _Runner(this, plan, names, kept, watch, worker if isolate else None)
+        runner = Runner(this, plan, names, kept, watch, worker if isolate else None)
         if fresh:
             runner.known = {}
         if into is not None:
@@ -120,7 +140,9 @@ def run(
             return runner.run(items)
 
 
-class _Runner:
+class Runner:
+    """Pairs of case and solver, one after the other: what is known is not made again, what is made is kept."""
+
     def __init__(
         self,
         this: Run,

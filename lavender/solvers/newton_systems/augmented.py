@@ -22,7 +22,6 @@ import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
 from lavender.lu import sparse_lu
-from lavender_ext.newton.panel import scaled_jacobian
 from lavender_ext.newton.solve import WHATS
 
 if TYPE_CHECKING:
@@ -41,16 +40,16 @@ class Augmented:
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Factor (1) for the P of the last natural map, eps added to theta, or (2); whether there is a factor."""
-        s, sc = self.system.solve, self.system.sc
+        s = self.system.solve
         if self.k is None:
             self._make()
         if what == WHATS["natural"]:
             p = self._small(s.p)
-            own = sp.eye_array(sc.m) - p + p @ sp.diags_array(sc.theta + eps)
+            own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
             return self._factor(p, None, own)
         right = None if s.bt is None else self._small(s.bt)
         left = s.v if s.bt is None else s.bt if what == WHATS["barrier"] else s.pair
-        return self._factor(self._small(left), right, sp.eye_array(sc.m))
+        return self._factor(self._small(left), right, sp.eye_array(s.m))
 
     def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
         """Dz or x for the right-hand side -F or Q r; not finite where there is no factor."""
@@ -63,18 +62,15 @@ class Augmented:
         return np.ascontiguousarray(x[n:])
 
     def _make(self) -> None:
-        sc, problem = self.system.sc, self.system.problem
-        rows = problem.rows
-        assert rows is not None
-        panel = np.zeros((problem.m, 12))
-        scaled_jacobian(problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), panel)
+        sc, n = self.system.solve, self.system.n
+        panel, _ = sc.jacobian()
         size, m = np.diff(sc.ptr), sc.m
         body = np.repeat(self.system.bodies, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)
         row = np.broadcast_to(np.arange(m)[:, None, None], values.shape)
         column = np.maximum(body, 0)[:, :, None] * 6 + np.arange(6)
         used = (values != 0.0) & (body >= 0)[:, :, None]
-        k = sp.csc_array((values[used], (row[used], column[used])), shape=(m, 6 * rows.n_bodies))
+        k = sp.csc_array((values[used], (row[used], column[used])), shape=(m, 6 * n))
         self.k = sp.csr_array(k[:, np.flatnonzero(np.diff(k.indptr))])
         square = np.repeat(size, size**2)
         inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
@@ -82,7 +78,7 @@ class Augmented:
         self.small = base + inner // square, base + inner % square
 
     def _small(self, values: FloatArray) -> Any:
-        return sp.csr_array((values, self.small), shape=(self.system.sc.m,) * 2)
+        return sp.csr_array((values, self.small), shape=(self.system.solve.m,) * 2)
 
     def _factor(self, left: Any, right: Any, own: Any) -> bool:
         upper = self.k if right is None else right @ self.k

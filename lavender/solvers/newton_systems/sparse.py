@@ -11,7 +11,7 @@ saved shows in what a solution x leaves of its right-hand side r, and is refined
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -21,8 +21,10 @@ from lavender.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
-from lavender_ext.newton.elements import Elements
-from lavender_ext.newton.solve import WHATS
+from lavender_ext.newton.solve import WHATS, Solve
+
+if TYPE_CHECKING:
+    from lavender.solvers.newton_systems.systems import MatrixSystem
 
 __all__ = ["Coupled", "Panelled", "SparseRows"]
 
@@ -69,17 +71,17 @@ class Panelled:
 class Coupled:
     """H on the pattern of its elements, and what Newton's method makes of it."""
 
-    def __init__(self, sc: Any, h: sp.csr_array, elements: Elements) -> None:
-        self.elements = elements
+    def __init__(self, solve: Solve, h: sp.csr_array) -> None:
+        self.elements = solve
         self.h: FloatArray = h.data
-        if len(sc.kind) == sc.m and is_mirrored(h.indptr, h.indices) and h.diagonal().all():
+        if not solve.has_friction and is_mirrored(h.indptr, h.indices) and h.diagonal().all():
             self.to, self.other = self.indptr, self.indices = (
                 h.indptr,
                 h.indices,
             )  # a pattern is its own graph
         else:
-            self.to, self.other = _graph(sc, h)
-            self.indptr, self.indices = coupled_rows(sc.ptr, self.to, self.other)
+            self.to, self.other = _graph(solve, h)
+            self.indptr, self.indices = coupled_rows(solve.ptr, self.to, self.other)
             self.h = coupled_entries(h.indptr, h.indices, h.data, self.indptr, self.indices)
         self.diagonal = _diagonal(self.indptr, self.indices)
         self.panels: dict[bool, SparsePanels] = {}
@@ -120,26 +122,23 @@ class Coupled:
 class SparseRows:
     """Who factors a sparse M for `Solve` and solves with it: panels; SuperLU where these lose a pivot or digits."""
 
-    def __init__(self, coupled: Coupled, symmetric: bool) -> None:
-        self.coupled, self.symmetric = coupled, symmetric
-        self.small: Any  # with the small matrices v, p, pair and bt of every element
+    def __init__(self, system: MatrixSystem) -> None:
+        self.system = system
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Whether there is a factor."""
-        s, own = self.small, eps - 1.0
-        lu = not self.symmetric
+        s, own, coupled = self.system.solve, eps - 1.0, self.system.sparse
+        lu = not self.system.symmetric
         if what == WHATS["natural"]:
             bounded = s.bt is None
-            made = self.coupled.small(s.p, s.p if bounded else None, own, lu or not bounded)
+            made = coupled.small(s.p, s.p if bounded else None, own, lu or not bounded)
         elif s.bt is None:
             with np.errstate(divide="ignore", over="ignore"):
-                made = self.coupled.barrier(
-                    1.0 / s.v, lu
-                )  # inf for a row that no longer moves: the step fails
+                made = coupled.barrier(1.0 / s.v, lu)  # inf for a row that no longer moves: the step fails
         elif what == WHATS["barrier"]:
-            made = self.coupled.small(s.bt, s.bt, 0.0, lu)
+            made = coupled.small(s.bt, s.bt, 0.0, lu)
         else:
-            made = self.coupled.small(s.pair, s.bt, 0.0, True)
+            made = coupled.small(s.pair, s.bt, 0.0, True)
         self.made: Panelled | None = made
         self.instead: Any = None
         if not np.isfinite(made.values).all():
@@ -168,7 +167,7 @@ class SparseRows:
             self.made = None
 
 
-def _graph(sc: Any, a: sp.csr_array) -> tuple[IntArray, IntArray]:
+def _graph(sc: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:
     """(indptr, indices) of the elements that A couples, either way, each with itself."""
     n = len(sc.kind)
     of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from lavender._arrays import FloatArray, IntArray
+from lavender._arrays import IntArray
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies
@@ -22,10 +22,6 @@ from lavender.solvers.newton_systems.pattern import block_pattern, dissected, po
 from lavender.solvers.newton_systems.sparse import Coupled, SparseRows
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
-from lavender_ext.newton.elements import Elements
-from lavender_ext.newton.normal_matrix import Factor
-from lavender_ext.newton.panel import narrow, scaled_jacobian
-from lavender_ext.newton.scaling import Scaled
 from lavender_ext.newton.solve import Solve
 
 DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
@@ -54,15 +50,14 @@ def factor_cost(lptr: IntArray, s: int) -> float:
 
 
 class System:
-    """H of a scaled problem; what factors it is made when it is first solved."""
+    """H of a scaled problem, and Newton's method on it."""
 
     form = ""
     cost = 0.0  # multiply-adds of one factorisation, roughly
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
-    elements: Any
 
-    def __init__(self, problem: Problem, sc: Any) -> None:
-        self.problem, self.sc = problem, sc
+    def __init__(self, problem: Problem, solve: Solve) -> None:
+        self.problem, self.solve = problem, solve
 
     @property
     def seconds(self) -> float:
@@ -71,26 +66,6 @@ class System:
 
     def took(self, seconds: float) -> None:
         """So long did the last factor take."""
-
-    def _elements(self, node: IntArray, slot: IntArray, panel: FloatArray, s: int) -> Any:
-        sc = self.sc
-        return Elements(
-            sc.ptr, sc.kind, sc.wptr, node, slot, panel, sc.theta, sc.g, sc.lower, sc.upper,
-            sc.a_t, sc.a_s, s, sc.a_r,
-        )  # fmt: skip
-
-    def new_solve(self, matrix: Any, symmetric: bool, cones: bool, others: Any = None) -> Solve:
-        sc = self.sc
-        reference(self.problem)
-        return Solve(
-            self.problem.metric, self.elements, matrix, symmetric, cones, sc.scale, sc.fixed,
-            None if sc.whole else sc.keep, sc.speed, others, WIDE,
-        )  # fmt: skip
-
-    @cached_property
-    def solve(self) -> Solve:
-        """Newton's method on it."""
-        raise NotImplementedError
 
 
 class VelocitySystem(System):
@@ -104,13 +79,11 @@ class VelocitySystem(System):
 
     def __init__(self, problem: Problem, like: System | None = None) -> None:
         """`like`: an earlier system, whose order of elimination and pattern serve again between the same bodies."""
-        sc = Scaled(problem.metric)
-        super().__init__(problem, sc)
-        rows = problem.rows
+        super().__init__(problem, Solve(problem.metric))
+        rows, solve = problem.rows, self.solve
         assert rows is not None
-        self.bodies = np.ascontiguousarray(block_bodies(problem)[sc.block], np.int32)
-        full = np.zeros((problem.m, 12)) if rows.n_bodies == 0 else np.empty((problem.m, 12))
-        used = scaled_jacobian(problem.data, rows.inv_inertia, np.sqrt(rows.inv_mass), full)
+        self.bodies = np.ascontiguousarray(block_bodies(problem)[solve.block], np.int32)
+        panel, used = solve.jacobian()
         columns = [c for c in range(6) if used >> c & 1]
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
         columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
@@ -120,10 +93,11 @@ class VelocitySystem(System):
             self.pattern, self.structure = like.pattern, like.structure
         else:
             self._analyse(rows.n_bodies, self.bodies)
-        _, node, slot, turned = self.pattern
-        halves = np.empty((sc.m, 2, s))
-        narrow(full, sc.keep, sc.ptr, turned, np.array(columns, np.int32), halves)
-        self.elements = self._elements(node, slot, halves, s)
+        lu = solve.has_friction and problem.law == "coulomb"
+        solve.over_bodies(
+            panel, np.array(columns, np.int32), self.pattern[1:], self.structure, lu, self.panels, WIDE
+        )
+        solve.ask(Augmented(self))
 
     def serves(self, s: int, n: int, bodies: IntArray) -> bool:
         """Whether the analysis of this system is that of n bodies of s unknowns with these elements (k, 2)."""
@@ -152,15 +126,6 @@ class VelocitySystem(System):
         self.structure = (nptr, nind, *structure)
         self.pattern = (bodies, node, slot, turned)
 
-    @cached_property
-    def solve(self) -> Solve:
-        """Newton's method on it, with the augmented system where that is asked for."""
-        sc = self.sc
-        cones = len(sc.kind) < sc.m
-        lu = cones and self.problem.law == "coulomb"
-        factor = Factor(*self.structure, self.s, lu, self.panels, WIDE)
-        return self.new_solve(factor, True, cones and not sc.theta.any(), Augmented(self))
-
 
 class MatrixSystem(System):
     """H as a matrix: dense, or sparse panels."""
@@ -168,34 +133,32 @@ class MatrixSystem(System):
     form = "impulse"
 
     def __init__(self, problem: Problem) -> None:
-        sc = Scaled(problem.metric, problem.csr_data)
-        super().__init__(problem, sc)
-        m = sc.m
-        a = problem.csr
-        if not sc.whole:
-            a = a[sc.keep][:, sc.keep]
+        super().__init__(problem, Solve(problem.metric, problem.csr_data))
+        solve = self.solve
+        m, a = solve.m, problem.csr
+        if not solve.whole:
+            a = a[solve.keep][:, solve.keep]
         self.symmetric = problem.is_symmetric
-        self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, len(sc.kind) == m) and m <= DENSE_LIMIT)
-        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `weights.py` has them.
+        self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, not solve.has_friction) and m <= DENSE_LIMIT)
+        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
         if self.dense:
             self.h = a.toarray()
-            self.h *= sc.scale[:, None]
-            self.h *= sc.scale
+            self.h *= solve.scale[:, None]
+            self.h *= solve.scale
+            solve.over_rows(self.h, self.symmetric, WIDE)
         else:
-            values = scaled_entries(a.indptr, a.indices, a.data, sc.scale)
+            values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
-        n = len(sc.kind)
-        self.elements = self._elements(
-            np.full((n, 2), -1, np.int32), np.zeros((n, 3), np.int32), np.zeros((m, 2)), 1
-        )
+            solve.over_entries(a.indptr, a.indices, values, self.symmetric)
+            solve.ask(SparseRows(self))
 
     @cached_property
     def sparse(self) -> Coupled:
         """The pattern of its factors, where there are few entries."""
-        return Coupled(self.sc, self.h, self.elements)
+        return Coupled(self.solve, self.h)
 
     @property
     def seconds(self) -> float:
@@ -209,18 +172,8 @@ class MatrixSystem(System):
         if self.cost > 0.0:
             self.pace = seconds / self.cost
 
-    @cached_property
-    def solve(self) -> Solve:
-        """Newton's method on it; of a sparse H others factor."""
-        cones = len(self.sc.kind) < self.sc.m
-        if self.dense:
-            return self.new_solve(self.h, self.symmetric, cones)
-        others = SparseRows(self.sparse, self.symmetric)
-        made = self.new_solve((self.h.indptr, self.h.indices, self.h.data), self.symmetric, cones, others)
-        others.small = made
-        return made
-
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:
     """The system of a problem; form "velocity" or "impulse". `like`: one of the same structure."""
+    reference(problem)
     return VelocitySystem(problem, like) if form == "velocity" else MatrixSystem(problem)

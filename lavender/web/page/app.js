@@ -1,6 +1,6 @@
 // The page: two simulations of one scene with settings of their own, stepped together, drawn and plotted.
 
-import { View, colors, rows } from "./draw.js";
+import { View, colors, fail, find, rows } from "./draw.js";
 import { Kernels, Newton, ORDERS, Simulation, SOLVER_FIELDS, TOL } from "./lavender.js";
 
 const KEPT = 720; // steps in the plots over time
@@ -13,8 +13,6 @@ const PULL = 200; // 1/s^2 and, as 2 sqrt of it, 1/s: the spring a held body han
 const PLAIN = ["scene", "a", "b", "speed", "play"];
 // Of joints, which the eight values of a step say nothing of: how far the worst is open, and its largest impulse.
 const OF_JOINTS = ["joints open", "joint impulse"];
-
-const find = (id) => document.getElementById(id);
 
 export function shown(field, value) {
   return WHOLE.has(field) || value === 0 ? String(value) : value.toExponential(5);
@@ -729,11 +727,6 @@ export function length(x) {
   }
   const [scale, unit] = x >= 0.9995 ? [1, "m"] : x >= 0.00995 ? [0.01, "cm"] : [0.001, "mm"];
   return `${x / scale >= 9.95 ? Math.round(x / scale) : (x / scale).toFixed(1)} ${unit}`;
-}
-
-function fail(text) {
-  find("failure").textContent = text;
-  find("failure").hidden = false;
 }
 
 async function start() {

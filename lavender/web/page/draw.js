@@ -62,6 +62,13 @@ const UNITS = {
   violation_final: "m/s",
 };
 
+export const find = (id) => document.getElementById(id);
+
+export function fail(text) {
+  find("failure").textContent = text;
+  find("failure").hidden = false;
+}
+
 // A row of a table for each field, with its unit; returns the cells of the values by field.
 export function rows(table, fields) {
   return Object.fromEntries(fields.map((field) => {

@@ -1,8 +1,7 @@
-// The kernels of lavender.wasm for JavaScript: memory, structs, and a simulation over three buffers; and newton.wasm,
-// exact solves for it.
+// The kernels of lavender.wasm for JavaScript: memory, and a simulation over three buffers; and newton.wasm, exact solves
+// for it.
 //
-// The module has no imports and no allocator: whatever it works on lies where this file puts it. Where the
-// fields of a struct lie it says itself.
+// The module has no imports and no allocator: whatever it works on lies where this file puts it.
 
 const SIZES = 10; // entries of size[], see lavender_ext/engine/arrays.pxd
 const MOST_SWEEPS = 64;
@@ -19,28 +18,12 @@ export const SOLVER_FIELDS = [
 export const ORDERS = ["given", "reverse", "symmetric", "random", "bottom_up", "top_down", "colored", "alternating"];
 
 export class Kernels {
-  // `module`: a WebAssembly.Module; `layout`: structs and arrays as lavender_ext.host lists them.
+  // `module`: a WebAssembly.Module; `layout`: arrays and places in them, as lavender.web.scenes lists them.
   constructor(module, layout) {
     this.functions = new WebAssembly.Instance(module, {}).exports;
     this.memory = this.functions.memory;
     this.layout = layout;
     this.top = this.functions.__heap_base.value;
-    this.structs = {};
-    this.#findFields();
-  }
-
-  #findFields() {
-    const structs = Object.entries(this.layout.structs).map(([name, fields]) => [name, Object.keys(fields)]);
-    const mark = this.top;
-    const place = this.alloc(4 * structs.reduce((count, [, fields]) => count + 1 + fields.length, 0));
-    this.functions.lav_layout(place);
-    let next = place;
-    const number = () => this.i32((next += 4) - 4, 1)[0];
-    for (const [name, fields] of structs) {
-      const size = number();
-      this.structs[name] = { size, offsets: Object.fromEntries(fields.map((field) => [field, number()])) };
-    }
-    this.top = mark;
   }
 
   // Zeroed bytes; they stay until `top` is set back.
@@ -72,56 +55,11 @@ export class Kernels {
     return new Uint8Array(this.memory.buffer, place, n);
   }
 
-  // Copies of arrays in the module's memory; returns where.
+  // A copy in the module's memory; returns where.
   putInts(values) {
     const place = this.alloc(4 * Math.max(values.length, 1));
     this.i32(place, values.length).set(values);
     return place;
-  }
-
-  putKeys(values) {
-    const place = this.alloc(8 * Math.max(values.length, 1));
-    this.u64(place, values.length).set(values);
-    return place;
-  }
-
-  // A struct with the given fields; pointers and int32 as numbers, doubles as numbers.
-  putStruct(name, values) {
-    const { size, offsets } = this.structs[name];
-    const place = this.alloc(size);
-    this.writeStruct(name, place, values);
-    if (Object.keys(values).some((field) => !(field in offsets))) {
-      throw new Error(`${name} has no field among ${Object.keys(values)}`);
-    }
-    return place;
-  }
-
-  writeStruct(name, place, values) {
-    const view = new DataView(this.memory.buffer);
-    const fields = this.layout.structs[name];
-    for (const [field, value] of Object.entries(values)) {
-      const at = place + this.structs[name].offsets[field];
-      if (fields[field].endsWith("f8")) {
-        [value].flat().forEach((x, k) => view.setFloat64(at + 8 * k, x, true));
-      } else {
-        view.setInt32(at, value, true);
-      }
-    }
-  }
-
-  readStruct(name, place) {
-    const view = new DataView(this.memory.buffer);
-    const out = {};
-    for (const [field, type] of Object.entries(this.layout.structs[name])) {
-      const at = place + this.structs[name].offsets[field];
-      const count = parseInt(type, 10);
-      if (type.length > 2) {
-        out[field] = Array.from({ length: count }, (_, k) => view.getFloat64(at + 8 * k, true));
-      } else {
-        out[field] = type === "f8" ? view.getFloat64(at, true) : view.getInt32(at, true);
-      }
-    }
-    return out;
   }
 }
 
@@ -155,9 +93,9 @@ export class Newton {
   // { met, sweeps, steps, relative, at, energy, normal }: whether the residual is within tol, the work, the relative
   // residual; and of each score on the way the work so far, E [sqrt J] and max |e_n| [N s].
   solve(buffers, tol) {
-    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers));
-    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, whole));
-    const how = this.f.lav_newton_substep(...buffers, tol, whole, real, this.trace, this.said);
+    const whole = this.#scratch(0, this.f.lav_newton_index_room(...buffers, 1));
+    const real = this.#scratch(1, this.f.lav_newton_plan(...buffers, 1, whole));
+    const how = this.f.lav_newton_substep(...buffers, tol, 1, whole, real, this.trace, this.said);
     const [sweeps, steps, relative, n] = this.k.f64(this.said, 4);
     const scores = this.k.f64(this.trace, 3 * n);
     const column = (c) => Array.from({ length: n }, (_, i) => scores[3 * i + c]);
@@ -183,9 +121,7 @@ export class Simulation {
     for (const [name, values] of Object.entries(scene.arrays)) {
       this.array(name).set(name === "key" || name === "cache_key" ? values.map(BigInt) : values);
     }
-    this.out = this.k.alloc(64);
     this.done = this.k.alloc(8);
-    this.settingsPlace = this.k.alloc(this.k.structs.settings_t.size);
     this.curve = this.k.alloc(16 * (MOST_SWEEPS + 1));
   }
 
@@ -254,29 +190,25 @@ export class Simulation {
     return Array.from(this.k.i32(this.size, SIZES));
   }
 
-  get settings() {
-    this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
-    return { ...this.k.readStruct("settings_t", this.settingsPlace), box: this.#head[this.k.layout.head.friction_shape] };
-  }
-
-  get #head() {
-    return this.array("head");
-  }
-
   // iterations, warm_start, order; box: 1 where friction bounds each tangent by itself, else 0
-  set({ box, ...changes }) {
-    if (box !== undefined) {
-      this.#head[this.k.layout.head.friction_shape] = box;
+  get settings() {
+    const [head, at] = [this.array("head"), this.k.layout.head];
+    return {
+      iterations: head[at.iterations], warm_start: head[at.warm_start], order: head[at.order], box: head[at.friction_shape],
+    };
+  }
+
+  set(changes) {
+    const [head, at] = [this.array("head"), this.k.layout.head];
+    for (const [name, value] of Object.entries(changes)) {
+      head[name === "box" ? at.friction_shape : at[name]] = value;
     }
-    this.k.functions.lav_engine_read_settings(...this.buffers, this.settingsPlace);
-    this.k.writeStruct("settings_t", this.settingsPlace, changes);
-    this.k.functions.lav_engine_write_settings(...this.buffers, this.settingsPlace);
   }
 
   // The eight values of SOLVER_FIELDS.
   get values() {
-    this.k.functions.lav_engine_values(...this.buffers, this.out);
-    return Array.from(this.k.f64(this.out, 8));
+    const { out } = this.k.layout.setting;
+    return Array.from(this.array("setting").subarray(out, out + 8));
   }
 
   #grow() {
@@ -298,7 +230,7 @@ export class Simulation {
       }
     }
     this.substeps = newton ? this.scene.newton_substeps : this.scene.substeps;
-    this.set({ h: this.scene.dt / this.substeps });
+    this.array("setting")[this.k.layout.setting.h] = this.scene.dt / this.substeps;
   }
 
   #stepNewton() {
@@ -373,21 +305,17 @@ export class Simulation {
 
   // Bytes of everything the simulation knows; `restore` continues from there to the last bit.
   snapshot() {
-    const copy = [8 * this.lengths[0], 4 * this.lengths[1], 8 * this.lengths[2]].map((n) => this.k.alloc(n));
-    this.k.functions.lav_engine_copy(...this.buffers, ...copy);
-    const snapshot = {
+    return {
       size: this.sizes,
       steps: this.steps,
       lost: this.lost,
       newton: this.newton,
       stepper: this.stepper,
       counts: [this.short, this.solved],
-      real: this.k.f64(copy[0], this.lengths[0]).slice(),
-      index: this.k.i32(copy[1], this.lengths[1]).slice(),
-      keys: this.k.u64(copy[2], this.lengths[2]).slice(),
+      real: this.k.f64(this.real, this.lengths[0]).slice(),
+      index: this.k.i32(this.index, this.lengths[1]).slice(),
+      keys: this.k.u64(this.keys, this.lengths[2]).slice(),
     };
-    this.k.top = copy[0];
-    return snapshot;
   }
 
   restore(snapshot) {

@@ -1,19 +1,12 @@
 // A film: poses of a run, frame by frame, live from the Python that steps it or out of a file.
 
-import { View, colors, rows } from "./draw.js";
+import { View, colors, fail, find, rows } from "./draw.js";
 import { SOLVER_FIELDS } from "./lavender.js";
 
 const [PLANE, SPHERE] = [1, 2];
 const LEAD = 9; // numbers of a frame before the poses: time, then the eight solver values
 const MAGIC = "LAVENDER-FILM\n";
 const POLL = 60; // ms between two questions for new frames
-
-const find = (id) => document.getElementById(id);
-
-function fail(text) {
-  find("failure").textContent = text;
-  find("failure").hidden = false;
-}
 
 // One frame as draw.js reads a simulation.
 class Frame {

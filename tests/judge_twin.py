@@ -10,7 +10,7 @@ operations of a row rounds by 2^-53, or by the smallest denormal.
 """
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -31,6 +31,27 @@ class Judgement:
     velocity: float
     nothing: bool  # doing nothing is near the line below which the norms of b stand in
     range: float  # largest |log10| of the numbers on the way
+
+
+def spec_of(problem):
+    """A problem of lavender as plain data."""
+    spec = {"operator": problem.operator, "friction": problem.friction, "b": problem.b.tolist()}
+    keys = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
+    spec["cones"] = {key: getattr(problem.cones, key).tolist() for key in keys}
+    if problem.operator == "matrix":
+        return spec | {"operator": "dense", "A": problem.dense().tolist()}
+    spec["compliance"] = problem.compliance.tolist()
+    if problem.operator == "generalized":
+        g = problem.generalized
+        given = {
+            "J": g.jac.toarray(),
+            "M": g.mass.toarray(),
+            "v_free": g.v_free,
+            "target": np.zeros(problem.m),
+        }
+        return spec | {"operator": "general"} | {key: x.tolist() for key, x in given.items()}
+    rows = {f.name: getattr(problem.rows, f.name) for f in fields(problem.rows)}
+    return spec | {"rows": {key: x.tolist() for key, x in rows.items() if isinstance(x, np.ndarray)}}
 
 
 class Problem:
@@ -141,6 +162,8 @@ class Problem:
         half_size = np.einsum("mni,nij->mnj", size, minv_size)
         self.A = half.reshape(m, 6 * n) @ jac.reshape(m, 6 * n).T + np.diag(soft)
         self.size = half_size.reshape(m, 6 * n) @ size.reshape(m, 6 * n).T + np.diag(soft)
+        self.A *= np.outer(self.stretch, self.stretch)
+        self.size *= np.outer(self.stretch, self.stretch)
         d = np.diag(self.A).copy()
         self.d = self._filled(d)
         self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))))
@@ -314,14 +337,17 @@ class Problem:
             e[1:] = np.where(scale > 0.5, step[1:] + loss * (lam[1:] - step[1:]), e[1:])
         return e
 
-    def norms(self, e):
-        """E and V."""
-        c, weight = self.cones, np.sqrt(self.nu * self.d)
+    def speeds(self, e):
+        """(m,) what each row moves wrong, those that count by their norm alike."""
         size = np.abs(e)
-        for k in range(len(c["kind"])):
+        for k in range(len(self.cones["kind"])):
             for at in self.pairs(k):
                 size[at] = np.sqrt((e[at] ** 2).sum())
-        return np.sqrt((self.d * e * e).sum()), (weight * size).max(initial=ZERO)
+        return np.sqrt(self.nu * self.d) * size
+
+    def norms(self, e):
+        """E and V."""
+        return np.sqrt((self.d * e * e).sum()), self.speeds(e).max(initial=ZERO)
 
     def judge(self, impulse):
         """Judgement of an impulse (m,) float64."""

@@ -1,0 +1,18 @@
+"""Room that grows, for one small problem after the other: fresh pages for each cost more than what is done in them."""
+from libc.stdint cimport int32_t, int64_t
+from libc.stdlib cimport free, malloc
+
+from lavender_ext.driver.driver cimport room_t
+
+
+cdef inline bint has_room(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Is there room for so many, made where there was none? What grows is empty."""
+    if n_index > r.n_index:
+        free(r.index)
+        r.index = <int32_t*>malloc(2 * n_index * sizeof(int32_t))
+        r.n_index = 2 * n_index if r.index != NULL else 0
+    if n_real > r.n_real:
+        free(r.real)
+        r.real = <double*>malloc(2 * n_real * sizeof(double))
+        r.n_real = 2 * n_real if r.real != NULL else 0
+    return n_index <= r.n_index and n_real <= r.n_real
