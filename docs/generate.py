@@ -16,6 +16,7 @@ import os
 import re
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
@@ -145,11 +146,15 @@ def law_figures(records):
     look = looks(r.solver for r in records)
     out = {}
     for law in LAWS:
-        some = [work_precision(records, c) for c, info in records.cases.items() if info.law == law]
+        drawn = (work_precision(records, c) for c, info in records.cases.items() if info.law == law)
+        some = [replace(figure, curves=tuple(curve.front for curve in figure.curves)) for figure in drawn]
         if some:
             text = io.StringIO()
             with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "lavender"}):
-                matplotlib_panels(some, look).savefig(text, format="svg", metadata={"Date": None})
+                canvas = matplotlib_panels(some, look)
+                for line in (line for axes in canvas.axes for line in axes.get_lines()):
+                    line.set_markeredgewidth(0.0)  # one colour, which `highlighted` can change
+                canvas.savefig(text, format="svg", metadata={"Date": None})
             out[law] = text.getvalue()
     return out
 

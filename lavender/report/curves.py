@@ -44,6 +44,16 @@ class Curve:
     low: tuple[float, ...] = ()  # of a band about the line, as `y`
     high: tuple[float, ...] = ()
 
+    @property
+    def front(self) -> Curve:
+        """What was reached by each x: points in its order, each lower than all before."""
+        kept: list[tuple[float, float]] = []
+        for x, y in sorted(zip(self.x, self.y, strict=True)):
+            if not kept or y < kept[-1][1]:
+                kept.append((x, y))
+        xs, ys = zip(*kept, strict=True) if kept else ((), ())
+        return replace(self, x=xs, y=ys, notes=())
+
 
 @dataclass(frozen=True)
 class Figure:

@@ -95,20 +95,9 @@ def _problem(problem: str, results: Sequence[Result]) -> Figure:
         shown += side[:most]
     curves = []
     for r in shown:
-        # The least time of each residual that something later did not beat in both.
-        runs: list[tuple[float, float]] = []
-        for time, relative in sorted(r.runs):
-            if not runs or relative < runs[-1][1]:
-                runs.append((time, relative))
-        curves.append(
-            Curve(
-                r.solver,
-                r.solver,
-                tuple(t for t, _ in runs),
-                tuple(max(x, TINY) for _, x in runs),
-                thin=r.peer,
-            )
-        )
+        times, residuals = zip(*r.runs, strict=True)
+        drawn = tuple(max(x, TINY) for x in residuals)
+        curves.append(Curve(r.solver, r.solver, times, drawn, thin=r.peer).front)
     return Figure(
         "peers " + problem, f"{problem} (thin: of others)", "time: set-up and solve [s]", "relative residual [-]",
         tuple(curves), levels=TARGETS,

@@ -168,15 +168,14 @@ class Newton:
             system = make_system(problem, "impulse")
             impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
-        cold = bool(np.array_equal(impulse, problem.start()))
         sweeps = worked = 0
-        if not cold and self.form == "auto" and problem.rows is not None:
+        if self.form == "auto" and problem.rows is not None:
             tried = warm_start(problem, impulse, tol, n, time_limit)
             claim, sweeps, worked = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         n -= worked
-        status, certificate = _turns(problem, system, impulse, n, tol, cold, time_limit)
+        status, certificate = _turns(problem, system, impulse, n, tol, time_limit)
         solve = system.solve
         factorisations = worked + solve.factorisations
         message = ", ".join(
@@ -192,14 +191,13 @@ def _turns(
     impulse: FloatArray,
     n: int,
     tol: float,
-    cold: bool,
     time_limit: float | None,
 ) -> tuple[Status, FloatArray | None]:
     """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between."""
     deadline = Deadline(time_limit)
     solve, certificate = system.solve, None
     late = interrupted = False
-    solve.start(impulse, tol, n, cold)
+    solve.start(impulse, tol, n)
     try:
         while True:
             before = solve.factorisations

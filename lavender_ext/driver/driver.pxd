@@ -33,7 +33,6 @@ cdef enum:                      # outcomes; the first six are those of newton/pl
 cdef struct asked_t:
     int32_t method
     int32_t budget              # factorisations
-    int32_t cold                # lambda is that of doing nothing
     int32_t proven              # the direction of a CERTIFICATE is a proof
     int32_t stop                # end with what is there
     int32_t wide                # four lanes are one instruction: the same bits, sooner

@@ -41,7 +41,7 @@ cdef inline double* begin(const view_t* v, const asked_t* o, room_t* r) noexcept
     cdef newton_t* n = &(<state_t*>r.real).n
     memset(r.real, 0, begun_room(v) * sizeof(double))
     aim(n, &v.p, v.a, v.r, v.g)
-    n.tol, n.budget, n.cold = o.tol, o.budget, o.cold
+    n.tol, n.budget = o.tol, o.budget
     lay_judge(n, r.real + sizeof(state_t) // sizeof(double) + 1)
     judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, False, begun)
     n.problem.e0, n.problem.v0 = begun[0], begun[1]
@@ -126,7 +126,7 @@ cdef inline int32_t step_general(const asked_t* o, state_t* s, int32_t work, dou
         return SPENT
     s.f.steps = work if work < left else left
     s.n.budget -= s.f.steps
-    end = descend_all(&s.f, lam, o.cold)
+    end = descend_all(&s.f, lam)
     if end == G_SPENT:
         return MORE if s.n.budget > 0 else SPENT
     return REACHED if end == G_DONE else STUCK
@@ -210,14 +210,13 @@ cdef class Driver:
             self.v.r = &data.rows
         else:
             self.v.a = &data.csr
-        self.o = asked_t(NEWTON, budget, 0, 0, 0, has_wide(), tol)
+        self.o = asked_t(NEWTON, budget, 0, 0, has_wide(), tol)
         self.keep = [data]
 
-    def start(self, const double[::1] impulse, bint cold):
+    def start(self, const double[::1] impulse):
         """Room, as often as it is asked for, and the start; False where the method does not take the problem."""
         cdef int32_t how = ROOM
         cdef int64_t n_index, n_real
-        self.o.cold = cold
         if not lav_room(&self.v, &self.o, &self.r):
             return False
         while how == ROOM:

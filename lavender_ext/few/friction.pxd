@@ -189,7 +189,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
         now = t.e0 / own if t.e0 / own < t.v0 / nothing.velocity else t.v0 / nothing.velocity
-        t.asked = asked_t(NEWTON, STEPS, 0, 0, 0, o.wide, o.tol * now)
+        t.asked = asked_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
         now = factor_in_turns(&t)
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]

@@ -75,17 +75,6 @@ cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) no
     return gate.entry * gate.read * sweep + count * (gate.step + gate.entry * sweep + gate.work * flops) <= most
 
 
-cdef inline bint is_nothing(const job_t* j, double* scratch) noexcept nogil:
-    """Is lam 0, or doing nothing? scratch (2 m)."""
-    cdef int32_t i, m = j.p.n_rows
-    cdef bint zero = True, same = True
-    do_nothing(&j.p, scratch, scratch + m)
-    for i in range(m):
-        zero &= j.lam[i] == 0.0
-        same &= j.lam[i] == scratch[i]
-    return zero or same
-
-
 cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
@@ -107,7 +96,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double to
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    if descend_all(&f, j.lam, j.cold or is_nothing(j, j.both)) != DONE:
+    if descend_all(&f, j.lam) != DONE:
         return
     j.counts[0], j.counts[1], j.counts[2] = steps - f.steps, f.factorisations, f.updates
     j.counts[3], j.counts[4] = f.rounds, f.evaluations

@@ -18,9 +18,9 @@ cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
     return i
 
 
-cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
-    """up (n): the root of each column's tree, and roots of trees that a panel joins; how many panels have no column."""
-    cdef int32_t b, q, r, k, i, end, n = g.n, empty = 0, trees = 0
+cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:
+    """up (n): the root of each column's tree, and roots of trees that a panel joins."""
+    cdef int32_t b, q, r, k, i, end, n = g.n, trees = 0
     cdef const int32_t* parent = g.parent
     cdef const int32_t* cols = g.cols
     for i in range(n):
@@ -32,9 +32,7 @@ cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nog
             up[i] = up[k]                               # which stands before it
     for b in range(g.n_panels):
         end = g.pcol[b + 1]
-        if end == g.pcol[b]:
-            empty += 1
-        elif trees > 1:
+        if end > g.pcol[b] and trees > 1:
             r = root_of(up, cols[g.pcol[b]])
             for q in range(g.pcol[b] + 1, end):
                 if parent[cols[q]] >= 0:                # its root is in the panel as well
@@ -45,7 +43,6 @@ cdef inline int32_t join_trees(const generalized_t* g, int32_t* up) noexcept nog
                 elif k < r:
                     up[r] = k
                     r = k
-    return empty
 
 
 cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int32_t* up, int32_t* label, int32_t* iptr,
@@ -57,10 +54,10 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     with room for n_panels + 1). most (4): columns of the largest island, of the widest panel, rows x columns of the
     largest panel, and its rows. A panel without columns is an island of its own.
     """
-    cdef int32_t b, q, r, i, k, n = 0, size, nc, rows, end, panels = g.n_panels, at, one
+    cdef int32_t b, q, r, i, n = 0, size, nc, rows, end, panels = g.n_panels, at
     cdef const int32_t* cols = g.cols
     cdef const int32_t* ptr = p.ptr
-    one = join_trees(g, up) == 0 and panels > 0
+    join_trees(g, up)
     i = 0
     most[0] = most[1] = most[2] = most[3] = 0
     for b in range(panels):
@@ -95,25 +92,6 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
             local[r] = n
             n += 1
         label[b] = local[r]
-    if one and n == 1:
-        iptr[0] = 0
-        iptr[1] = 1
-        run[0] = 0
-        run[1] = panels
-        for b in range(panels):
-            end = g.pcol[b + 1]
-            for q in range(g.pcol[b], end):
-                local[cols[q]] = 0
-        k = 0
-        for i in range(g.n):
-            if local[i] == 0:
-                local[i] = k
-                icols[k] = i
-                k += 1
-        cptr[0] = 0
-        cptr[1] = k
-        most[0] = k
-        return 1
     for i in range(n + 1):
         iptr[i] = 0
         cptr[i] = 0

@@ -26,6 +26,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
 from lavender_ext.core.contact_map cimport length
 from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, newton_step
@@ -476,12 +477,12 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
     return end
 
 
-cdef inline int32_t descend_all(flow_t* f, double* impulse, int32_t cold) noexcept nogil:
+cdef inline int32_t descend_all(flow_t* f, double* impulse) noexcept nogil:
     """All islands from `impulse` (m), or from the one that waits on, into it: DONE, or how the worst of them ended."""
     cdef int32_t i, end, first = f.wait.island
     if first < 0:
         first = 0
-        f.wait.worst, f.wait.cold = DONE, cold
+        f.wait.worst, f.wait.cold = DONE, is_nothing(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
         if end == SPENT:                                # N is of this one

@@ -51,7 +51,7 @@ cdef class Newton:
         """Problems that share no velocity."""
         return self.f.n_islands
 
-    def run(self, double[::1] impulse, double tol, int steps, bint cold, bint again=False):
+    def run(self, double[::1] impulse, double tol, int steps, bint again=False):
         """At most `steps` Newton steps on impulse (m,), in place; the judge's start must be known to the data.
 
         again: on from where the run before, to the same tol, has used up its steps. Under Coulomb's law the best at a
@@ -63,5 +63,5 @@ cdef class Newton:
             aim_at(&self.f, tol, steps, self.data.start_energy, self.data.start_velocity)
             self.f.wait.island = waits
             with nogil:
-                end = descend_all(&self.f, &impulse[0], cold)
+                end = descend_all(&self.f, &impulse[0])
         return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)

@@ -12,6 +12,7 @@ from libc.stdint cimport int32_t
 from libc.string cimport memset
 
 from lavender_ext.core.block cimport CONE, COULOMB, ROW
+from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchanges, begin_rounds, begin_steps,
@@ -320,6 +321,7 @@ cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     n.best = 1.0 / 0.0
     n.floor = 0.0
     n.loops = n.s.form == BODIES and n.s.others != NULL and n.s.e.m <= LARGEST_AUGMENTED
+    n.cold = is_nothing(&n.problem.p, lam)
     unknown_of(n, lam, n.trial)
     take(n, n.best_z, n.trial)
     score(n, n.trial)

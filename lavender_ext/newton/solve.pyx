@@ -233,10 +233,10 @@ cdef class Solve:
 
     # -- turns -------------------------------------------------------------------------------------
 
-    def start(self, const double[::1] impulse, double tol, int budget, bint cold):
-        """From impulse (rows,), to a relative residual of tol, with so many factorisations; `cold`: that is doing nothing."""
+    def start(self, const double[::1] impulse, double tol, int budget):
+        """From impulse (rows,), to a relative residual of tol, with so many factorisations."""
         cdef newton_t* n = &self.n
-        n.tol, n.budget, n.cold = tol, budget, cold
+        n.tol, n.budget = tol, budget
         self.raised = None
         with nogil:
             newton_start(n, &impulse[0])

@@ -14,6 +14,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, row_error
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport rows_slack
@@ -253,15 +254,6 @@ cdef inline int32_t sweep_contacts(const blocks_t* p, const rows_t* r, warm_t* s
     return UNDECIDED
 
 
-cdef inline bint is_cold(const blocks_t* p, const double* lam) noexcept nogil:
-    """lam = 0."""
-    cdef int32_t j
-    for j in range(p.n_rows):
-        if lam[j] != 0.0:
-            return False
-    return True
-
-
 cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, double tol, double* lam, double* v,
                                int32_t has_velocity) noexcept nogil:
     """lam (m), not all zero, to tol; v (n_bodies, 6) is left M^-1 J^T lam, given so with `has_velocity`."""
@@ -270,7 +262,7 @@ cdef inline int32_t warm_solve(const blocks_t* p, const rows_t* r, warm_t* s, do
     s.sweeps = 0
     s.factorisations = 0
     s.traced = 0
-    if is_cold(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
+    if is_nothing(p, lam) or p.n_rows > MOST_ROWS or p.law != COULOMB or not start_errors(p, &e0, &v0):
         return UNDECIDED
     if not has_velocity:
         rows_velocity(p, r, lam, v)

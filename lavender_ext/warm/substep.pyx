@@ -22,7 +22,7 @@ from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, l
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, newton_start, newton_step
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.run cimport aim, impulse_of, judge_room, lay_judge, newton_t
-from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, is_cold, judged, lay_out,
+from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
 
@@ -73,7 +73,7 @@ cdef inline int32_t solve_in_turns(const blocks_t* p, const rows_t* r, warm_t* s
                                    double* v) noexcept nogil:
     """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
     cdef int32_t how = MORE
-    n.tol, n.budget, n.cold = tol, BUDGET, is_cold(p, lam)
+    n.tol, n.budget = tol, BUDGET
     newton_start(n, lam)
     while how == MORE or how == CERTIFICATE:
         how = newton_step(n, 1)

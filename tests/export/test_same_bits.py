@@ -76,7 +76,7 @@ def driven(given, tol, budget):
     """Impulse and factorisations of `newton` by the package's own compiled driver."""
     lv.residual(given, given.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
     driver, impulse, how = Driver(given.metric, tol, budget), given.start().copy(), MORE
-    assert driver.start(impulse, True)
+    assert driver.start(impulse)
     while how in (MORE, CERTIFICATE):
         how, done, _, _ = driver.step(10**6, impulse)
     return impulse.tobytes(), done

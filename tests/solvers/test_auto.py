@@ -145,7 +145,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
     class Kernel:
         islands, largest, ends = 1, general.prepare(problem).largest, general.ENDS["spent"]
 
-        def run(self, impulse, tol, steps, cold, again):
+        def run(self, impulse, tol, steps, again):
             asked.append(steps)
             clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
             return self.ends, np.array([steps, 0, 0, 0, 0])

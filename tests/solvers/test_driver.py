@@ -12,7 +12,6 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import suite
 from lavender.certificates import check_certificate
-from lavender.web import compile as wasm
 from lavender_ext.driver.driver import Driver
 
 MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
@@ -23,7 +22,7 @@ def driven(problem, tol=1e-9, budget=1500, work=10**6):
     """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
     driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
-    if not driver.start(impulse, True):
+    if not driver.start(impulse):
         return None
     how = MORE
     while how in (MORE, CERTIFICATE):
@@ -129,74 +128,3 @@ def test_what_the_method_does_not_take_is_said_at_once():
     assert driven(wild(seed=44017).problem) is not None
     cone = lv.Problem(np.ones(5), lv.Cones.contacts([0.5], 4), np.eye(5), friction="cone")
     assert driven(cone) is None
-
-
-# -- without Python --------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
-def test_webassembly_gives_the_same_bits(tmp_path):
-    wasmtime = pytest.importorskip("wasmtime", reason="wasmtime is not installed (extra: wasm)")
-    out = tmp_path / "driver.wasm"
-    built = wasm.build(out, ROOT, ("driver.driver",), largest=250_000)
-    assert set(built.functions) == {"lav_room", "lav_start", "lav_step"}
-    engine = wasmtime.Engine()
-    store = wasmtime.Store(engine)
-    exports = wasmtime.Instance(store, wasmtime.Module(engine, out.read_bytes()), []).exports(store)
-    memory, top = exports["memory"], exports["__heap_base"].value(store)
-
-    def room(size):
-        nonlocal top
-        place = -(-top // 16) * 16
-        top = place + size
-        if top > memory.data_len(store):
-            memory.grow(store, -(-(top - memory.data_len(store)) // 65536))
-        return place
-
-    def put(values):
-        data = np.ascontiguousarray(values).tobytes()
-        place = room(len(data) + 8)
-        memory.write(store, data, place)
-        return place
-
-    def words(*numbers):
-        return np.array(numbers, np.int32).tobytes()
-
-    for seed in range(3):
-        problem = as_matrix(random_contact_problem(seed, friction="cone", bodies=4, contacts=5))
-        expected = driven(problem)
-        c, a, m = problem.cones, problem.csr, problem.m
-        nu = (problem.metric.weight**2 / problem.d).astype(float)
-        matrix = put(
-            np.frombuffer(
-                words(put(a.indptr.astype(np.int32)), put(a.indices.astype(np.int32)), put(a.data)), np.int32
-            )
-        )
-        law = 1
-        pointers = [put(c.ptr.astype(np.int32)), put(c.kind.astype(np.int32))] + [
-            put(x)
-            for x in (
-                c.lower,
-                c.upper,
-                c.mu,
-                c.patch_radius,
-                problem.b,
-                problem.d,
-                nu,
-                1.0 / problem.d,
-                c.rolling,
-            )
-        ]
-        view = put(np.frombuffer(words(problem.n_blocks, m, law, *pointers, matrix, 0, 0), np.int32))
-        asked = put(np.frombuffer(words(0, 1500, 1, 0, 0, 0) + np.array([1e-9]).tobytes(), np.uint8))
-        given, said, impulse = room(24), room(24), put(problem.start())
-        assert exports["lav_room"](store, view, asked, given) == 1
-        n_index, n_real = np.frombuffer(memory.read(store, given, given + 16), np.int64).tolist()
-        arrays = words(room(4 * n_index), room(8 * n_real))
-        memory.write(store, arrays, given + 16)
-        assert exports["lav_start"](store, view, asked, given, impulse) == MORE
-        assert exports["lav_step"](store, view, asked, given, 10**6, impulse, said) == expected[0]
-        found = np.frombuffer(memory.read(store, impulse, impulse + 8 * m), float)
-        np.testing.assert_allclose(found, expected[3], rtol=1e-12, atol=1e-300)
-        assert found.tobytes() == expected[3].tobytes()

@@ -592,9 +592,9 @@ def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
     problem = sparse_rows(2)
     expected = lv.solve(problem, "newton", tol=1e-10)
     assert expected.success
-    for name, worse in (("factor", lambda *_: False), ("solve", lambda *_: None)):
+    for name, worse in (("factor_panels", lambda *_: False), ("solve_panels", lambda *_: None)):
         with monkeypatch.context() as patch:
-            patch.setattr(sparse.Panelled, name, worse)
+            patch.setattr(sparse.SparseRows, name, worse)
             solution = lv.solve(problem, "newton", tol=1e-10)
         assert solution.success
         np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
@@ -605,7 +605,7 @@ def test_where_superlu_takes_over_that_is_one_factorisation(monkeypatch, most):
     problem = sparse_rows(1)
     cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
     problem = lv.Problem(problem.b, cones, problem.csr, friction="cone")
-    monkeypatch.setattr(sparse.Panelled, "solve", lambda *_: None)
+    monkeypatch.setattr(sparse.SparseRows, "solve_panels", lambda *_: None)
     solution = lv.solve(problem, "newton", tol=1e-12, max_iter=most)
     assert solution.iterations <= most
 
@@ -614,13 +614,14 @@ def test_pivots_inside_panels_are_refined_or_given_up():
     """[[e, 1], [1, e]] of two panels has no stable LU without an exchange between them."""
     problem = sparse_rows(3, even=False)
     system = system_in(problem, "sparse")
-    made = system.sparse.barrier(np.zeros(500), True)
-    assert made.factor()
+    system.solve.v[:] = np.inf
+    made = system.sparse
+    assert system.solve.factor("barrier") and made.lu
     r = np.random.default_rng(0).normal(size=500)
-    x = made.solve(r)
+    x = made.solve_panels(r)
     np.testing.assert_allclose(dense_h(problem) @ x, r, rtol=0, atol=1e-11)
-    made.values[made.diagonal] = 1e-12
-    assert not made.factor() or made.solve(r) is None
+    made.rows.data[made.diagonal] = 1e-12
+    assert not made.factor_panels() or made.solve_panels(r) is None
 
 
 def test_a_factor_that_fills_is_not_begun_where_time_is_short():

@@ -110,15 +110,8 @@ static const double CLOSEST = 1e-2;
 
 /* On the impulse as it stands; rows of a formed A where it does not go over bodies. */
 static int32_t start_newton(lav_solver *s, double tol, int32_t budget) {
-  int32_t i, cold = 1, same = 1;
-  judge_measure_do_nothing(&s->p, s->watch.e, s->watch.w);
-  for (i = 0; i < s->p.n_rows; i++) {
-    if (s->impulse[i] != 0.0) cold = 0;
-    if (s->impulse[i] != s->watch.e[i]) same = 0;
-  }
   s->asked.tol = tol;
   s->asked.budget = budget;
-  s->asked.cold = cold || same;
   return k_start(&s->view, &s->asked, &s->drive, s->impulse);
 }
 

@@ -66,7 +66,6 @@ def run(
     `again`: on from where a run before, to the same tol, has used up its steps.
     """
     deadline, watch = Deadline(time_limit), Stopwatch()
-    cold = _is_cold(problem, impulse)
     counts = np.zeros(5, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
     now = 0.0
@@ -80,14 +79,14 @@ def run(
         if deadline.passed(min(step, 1e6) - LATE):
             status = Status.TIME_LIMIT
             break
-        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), cold, again)
+        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), again)
         counts += done
         status = _STATUS[end]
         if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
             # Its sums are rounded in another order, and vanish where squares do.
             status = Status.MAX_ITERATIONS if closer > CLOSEST else Status.STALLED
             closer *= 0.25
-            again = cold = False
+            again = False
         elif status is Status.MAX_ITERATIONS:
             again = True
             if done[0] <= 0:
@@ -127,7 +126,3 @@ def named(claim: Claim, solver: str) -> Claim:
     if not done and claim.status is Status.CONVERGED:
         return Claim(claim.status, claim.iterations, {}, "the start is a solution")
     return Claim(claim.status, claim.iterations, claim.work, f"newton {done or 'gave up at once'}")
-
-
-def _is_cold(problem: Problem, impulse: FloatArray) -> bool:
-    return not impulse.any() or bool(np.array_equal(impulse, problem._start))

@@ -10,8 +10,7 @@ saved shows in what a solution x leaves of its right-hand side r, and is refined
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -23,56 +22,19 @@ from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.solve import WHATS, Solve
 
-if TYPE_CHECKING:
-    from lavender.solvers.newton_systems.systems import MatrixSystem
-
-__all__ = ["Coupled", "Panelled", "SparseRows"]
+__all__ = ["SparseRows"]
 
 BACKWARD = 1e-12  # (1): thousands of roundings
 
 
-@dataclass
-class Panelled:
-    """M in compressed rows, and the panels that factor it."""
+class SparseRows:
+    """H on the pattern of its elements; who factors for `Solve` what Newton's method makes of it, and solves with that.
 
-    panels: SparsePanels
-    lu: bool
-    rows: sp.csr_array  # shared with the others of its pattern
-    values: FloatArray
-    diagonal: IntArray  # (n,) where its entries are
+    By panels; by SuperLU where these lose a pivot or digits.
+    """
 
-    def factor(self) -> bool:
-        """Whether no pivot is lost."""
-        d = np.ones(len(self.diagonal)) if self.lu else self.values[self.diagonal]
-        self.size = float(np.abs(self.values).max()) if self.lu else 0.0
-        self.rows.data = self.values
-        return bool((d > 0.0).all()) and self.panels.factor(self.values, d, 0.0, TINY) == 0
-
-    def solve(self, r: FloatArray) -> FloatArray | None:
-        """M^-1 r with the last factor, None where that is not (1)."""
-        x: FloatArray = self.panels.solve(r)
-        if not self.lu:
-            return x
-        most = float(np.abs(r).max())
-        for _ in range(2):
-            left = r - self.rows @ x
-            if float(np.abs(left).max()) <= BACKWARD * (self.size * float(np.abs(x).max()) + most):
-                return x
-            x = x + self.panels.solve(left)
-        return None
-
-    def matrix(self) -> sp.csr_array:
-        """Without entries that are nought."""
-        found = sp.csr_array((self.values, self.rows.indices, self.rows.indptr), copy=True)
-        found.eliminate_zeros()
-        return found
-
-
-class Coupled:
-    """H on the pattern of its elements, and what Newton's method makes of it."""
-
-    def __init__(self, solve: Solve, h: sp.csr_array) -> None:
-        self.elements = solve
+    def __init__(self, solve: Solve, h: sp.csr_array, symmetric: bool) -> None:
+        self.small, self.symmetric = solve, symmetric
         self.h: FloatArray = h.data
         if not solve.has_friction and is_mirrored(h.indptr, h.indices) and h.diagonal().all():
             self.to, self.other = self.indptr, self.indices = (
@@ -83,9 +45,13 @@ class Coupled:
             self.to, self.other = _graph(solve, h)
             self.indptr, self.indices = coupled_rows(solve.ptr, self.to, self.other)
             self.h = coupled_entries(h.indptr, h.indices, h.data, self.indptr, self.indices)
-        self.diagonal = _diagonal(self.indptr, self.indices)
+        row = np.repeat(np.arange(solve.m, dtype=np.int32), np.diff(self.indptr))
+        self.diagonal = np.flatnonzero(row == self.indices).astype(np.int32)
         self.panels: dict[bool, SparsePanels] = {}
         self.rows = sp.csr_array((self.h, self.indices, self.indptr))
+        self.lu = self.made = False
+        self.size = 0.0
+        self.instead: Any = None
 
     def analysed(self, lu: bool) -> SparsePanels:
         """The panels of all rows; no number is looked at."""
@@ -103,68 +69,73 @@ class Coupled:
         except OverflowError:
             return np.inf
 
-    def _whole(self, values: FloatArray, lu: bool) -> Panelled:
-        return Panelled(self.analysed(lu), lu, self.rows, values, self.diagonal)
-
-    def barrier(self, w: FloatArray, lu: bool) -> Panelled:
-        """H + W of bounded rows."""
-        values = self.h.copy()
-        values[self.diagonal] += w
-        return self._whole(values, lu)
-
-    def small(self, left: FloatArray, right: FloatArray | None, own: float, lu: bool) -> Panelled:
-        """L H R^T + own L + I of small matrices for each element; None is I."""
-        values = np.empty_like(self.h)
-        coupled(self.elements, self.to, self.other, self.indptr, self.h, left, right, own, values)
-        return self._whole(values, lu)
-
-
-class SparseRows:
-    """Who factors a sparse M for `Solve` and solves with it: panels; SuperLU where these lose a pivot or digits."""
-
-    def __init__(self, system: MatrixSystem) -> None:
-        self.system = system
-
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Whether there is a factor."""
-        s, own, coupled = self.system.solve, eps - 1.0, self.system.sparse
-        lu = not self.system.symmetric
+        s, bounded = self.small, self.small.bt is None
+        self.lu = not self.symmetric or what == WHATS["pair"]
         if what == WHATS["natural"]:
-            bounded = s.bt is None
-            made = coupled.small(s.p, s.p if bounded else None, own, lu or not bounded)
-        elif s.bt is None:
-            with np.errstate(divide="ignore", over="ignore"):
-                made = coupled.barrier(1.0 / s.v, lu)  # inf for a row that no longer moves: the step fails
-        elif what == WHATS["barrier"]:
-            made = coupled.small(s.bt, s.bt, 0.0, lu)
+            self.lu = self.lu or not bounded
+            self.rows.data = self._coupled(s.p, s.p if bounded else None, eps - 1.0)
+        elif not bounded:
+            self.rows.data = self._coupled(s.bt if what == WHATS["barrier"] else s.pair, s.bt, 0.0)
         else:
-            made = coupled.small(s.pair, s.bt, 0.0, True)
-        self.made: Panelled | None = made
-        self.instead: Any = None
-        if not np.isfinite(made.values).all():
-            self.made = None
-        elif not made.factor():
+            self.rows.data = self.h.copy()
+            with np.errstate(divide="ignore", over="ignore"):
+                self.rows.data[self.diagonal] += (
+                    1.0 / s.v
+                )  # inf for a row that no longer moves: the step fails
+        self.instead = None
+        self.made = bool(np.isfinite(self.rows.data).all())
+        if self.made and not self.factor_panels():
             self._superlu()
-        return self.made is not None
+        return self.made
+
+    def _coupled(self, left: FloatArray, right: FloatArray | None, own: float) -> FloatArray:
+        """L H R^T + own L + I of small matrices for each element; None is I."""
+        values = np.empty_like(self.h)
+        coupled(self.small, self.to, self.other, self.indptr, self.h, left, right, own, values)
+        return values
+
+    def factor_panels(self) -> bool:
+        """Whether panels lose no pivot of M."""
+        values = self.rows.data
+        d = np.ones(len(self.diagonal)) if self.lu else values[self.diagonal]
+        self.size = float(np.abs(values).max()) if self.lu else 0.0
+        return bool((d > 0.0).all()) and self.analysed(self.lu).factor(values, d, 0.0, TINY) == 0
+
+    def solve_panels(self, r: FloatArray) -> FloatArray | None:
+        """M^-1 r with the last factor, None where that is not (1)."""
+        panels = self.analysed(self.lu)
+        x: FloatArray = panels.solve(r)
+        if not self.lu:
+            return x
+        most = float(np.abs(r).max())
+        for _ in range(2):
+            left = r - self.rows @ x
+            if float(np.abs(left).max()) <= BACKWARD * (self.size * float(np.abs(x).max()) + most):
+                return x
+            x = x + panels.solve(left)
+        return None
 
     def solve(self, _augmented: int, r: FloatArray) -> FloatArray:
         """M^-1 r; not finite where there is none."""
-        if self.made is not None and self.instead is None:
-            x = self.made.solve(r)
+        if self.made and self.instead is None:
+            x = self.solve_panels(r)
             if x is not None:
                 return x
             self._superlu()
-        if self.made is None:
+        if not self.made:
             return np.full_like(r, np.nan)
         found: FloatArray = self.instead(r)
         return found
 
     def _superlu(self) -> None:
-        assert self.made is not None
+        matrix = self.rows.copy()
+        matrix.eliminate_zeros()
         try:
-            self.instead = sparse_lu(self.made.matrix(), permc_spec="COLAMD").solve
+            self.instead = sparse_lu(matrix, permc_spec="COLAMD").solve
         except RuntimeError:
-            self.made = None
+            self.made = False
 
 
 def _graph(sc: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:
@@ -178,8 +149,3 @@ def _graph(sc: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:
         graph = sp.csr_array(graph + graph.T + sp.eye_array(n, dtype=bool))
         graph.sort_indices()
     return graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
-
-
-def _diagonal(indptr: IntArray, indices: IntArray) -> IntArray:
-    row = np.repeat(np.arange(len(indptr) - 1, dtype=np.int32), np.diff(indptr))
-    return np.flatnonzero(row == indices).astype(np.int32)

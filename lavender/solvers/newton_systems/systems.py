@@ -7,7 +7,6 @@ or sparse panels). The equations, and all that is solved with them, are in `lave
 from __future__ import annotations
 
 import os
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.pattern import block_pattern, dissected, postordered
-from lavender.solvers.newton_systems.sparse import Coupled, SparseRows
+from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Solve
@@ -131,6 +130,7 @@ class MatrixSystem(System):
     """H as a matrix: dense, or sparse panels."""
 
     form = "impulse"
+    sparse: SparseRows  # who factors an H of few entries
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem, Solve(problem.metric, problem.csr_data))
@@ -153,12 +153,8 @@ class MatrixSystem(System):
             values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
             solve.over_entries(a.indptr, a.indices, values, self.symmetric)
-            solve.ask(SparseRows(self))
-
-    @cached_property
-    def sparse(self) -> Coupled:
-        """The pattern of its factors, where there are few entries."""
-        return Coupled(self.solve, self.h)
+            self.sparse = SparseRows(solve, self.h, self.symmetric)
+            solve.ask(self.sparse)
 
     @property
     def seconds(self) -> float:
