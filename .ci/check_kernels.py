@@ -50,8 +50,8 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: sleeps by the system's calls; `looks` calls the Python faces of kernels one after the other, `many` and `small` the
 #: kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python, `newton`
 #: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
-#: check sees, but for the logarithms by which `looks` guesses about sweeps; that of `direct`, `principal` and `watch` is
-#: cut out for the C library, which refuses what needs Python.
+#: check sees, but for the logarithms by which `looks` guesses about sweeps; that of `direct`, `principal` and `watch`
+#: is cut out for the C library, which refuses what needs Python.
 EXEMPT = {
     "threaded": "threads",
     "looks": "calls kernels, guesses how long they will take",
