@@ -296,6 +296,21 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
         np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
 
 
+def test_what_a_stopped_step_puts_back_holds_the_impulses_of_rolling():
+    scene = lv.Scene(rolling_radius=0.02, substeps=2)
+    scene.add_plane()
+    scene.add_sphere(0.5, position=(0.0, 0.0, 0.5), velocity=(1.0, 0.0, 0.0))
+    sim = lv.Simulation(scene)
+    trajectory(sim, 3)
+    kernel, rolling = sim.state.kernel, sim.state.a["cache_roll"]
+    before = rolling[0].copy()  # of the one contact
+    assert before.any()
+    kernel.keep()
+    rolling[0] = 7.0  # as a substep writes its own
+    kernel.put_back()
+    np.testing.assert_array_equal(rolling[0], before)
+
+
 def sim_solver(scene):
     return specs()[scene.parameters.solver].load()
 
