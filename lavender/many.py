@@ -18,7 +18,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Solution
-from lavender.solve import check_budget, of_batch, solve, solve_small
+from lavender.solve import check_budget, of_batch, solve
 from lavender_ext.few.many import Batch
 
 __all__ = ["solve_many"]
@@ -69,10 +69,9 @@ def solve_many(
     spec = get(solver)
     check_budget(spec, tol, max_iter, options.get("time_limit"))
     more = {"tol": tol, "max_iter": max_iter, **options}
-    plain = not options and max_iter is None
-    together = (
-        plain and spec.own and solver in ("auto", "newton") and isinstance(tol, float) and 0.0 < tol < np.inf
-    )
+    # What `solve` would ask of one compiled call.
+    together = spec.few is not None and spec.few.gate is not None and spec.own and not options
+    together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     at = [
         i
         for i, p in enumerate(given)
@@ -82,12 +81,8 @@ def solve_many(
     def batch(part: list[int]) -> None:
         _batch(given, starts, part, tol, spec, made)
 
-    short = spec.few is not None and spec.own and plain
-
     def alone(i: int) -> None:
-        made[i] = solve_small(given[i], spec, starts[i], tol) if short else None
-        if made[i] is None:
-            made[i] = solve(given[i], solver, impulse=starts[i], **more)
+        made[i] = solve(given[i], solver, impulse=starts[i], **more)
 
     parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []
     if threads == 1:

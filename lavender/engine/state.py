@@ -27,6 +27,7 @@ from lavender_ext.engine.arrays import (
     TOO_MANY,
     lengths,
 )
+from lavender_ext.host import memory
 from lavender_ext.warm.substep import Substep
 
 __all__ = ["State"]
@@ -134,23 +135,14 @@ class State:
 
     def grown(self) -> State:
         """A copy with room for what the last substep found missing."""
-        size = self.size.copy()
         if self.head[HEAD["need_pairs"]] == TOO_MANY:
             raise InputError(
-                f"more than {MOST_PAIRS} pairs of bodies are close together ({size[SIZE['bodies']]} bodies): "
+                f"more than {MOST_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
                 "move them apart"
             )
-        for cap, need in ((CAP_PAIR, HEAD["need_pairs"]), (CAP_CONTACT, HEAD["need_contacts"])):
-            if self.head[need] > size[cap]:
-                size[cap] = min(int(self.head[need] * 1.25) + 16, 2**31 - 1)
-        other = State(size)
-        for name in KEPT:
-            source, goal = self.a[name], other.a[name]
-            if source.shape == goal.shape:
-                goal[...] = source
-            else:
-                goal[: len(source)] = source
-        other.head[HEAD["pairs_valid"]] = 0
+        own = (self.size, self.real, self.index, self.keys)
+        other = State(memory.more_room(*own))
+        memory.move(*own, other.size, other.real, other.index, other.keys)
         return other
 
     @classmethod

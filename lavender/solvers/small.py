@@ -31,7 +31,6 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # which under the cone law are few.
 ISLAND = {"coulomb": 150, "cone": 12}
 SWEPT = 32  # sweeps of a part at most, before its factors
-IN_ALL = 5  # times as long, as sweeps and factors of all parts mostly take
 FACTORED = 0.05  # ns of a multiply-add of factors of parts
 # ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
 # Coulomb's law sooner; and up to which nobody looks at the clock in between.
@@ -61,7 +60,7 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
     if problem.generalized is not None:
         cost = velocities_cost(problem, problem.generalized.nv)
     else:
-        cost = IN_ALL * SWEPT * sweep_cost(problem)
+        cost = SWEPT * sweep_cost(problem)
         if 4e-9 * cost <= time_limit:
             parts = prepared(problem)
             cost += FACTORED * (0.0 if parts is None else parts.most_factored)
@@ -124,8 +123,10 @@ class Few:
                 return None
             found = solve_first(kept.view, impulse, tol, self.gate)
         else:
-            small = prepared(problem) if problem.m <= SMALL_ROWS or self.hands_over else None
-            if small is None or not (self.pivots if small.pivots else self.hands_over):
+            small = kept.small
+            if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
+                small = prepared(problem)
+            if not small or not (self.pivots if small.pivots else self.hands_over):
                 return None
             found = small.run(impulse, tol, self.hands_over, WARM)
         if found is None:  # the steps of who solves it the long way need not come twice before

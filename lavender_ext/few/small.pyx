@@ -148,16 +148,17 @@ cdef class Bounded(Small):
     cdef solve(self, own, double tol, bint follow):
         cdef double[::1] start = own
         cdef view_t v = self.data.view()
-        cdef Room real = room_for(direct_real(&v, self.band) * sizeof(double))
-        cdef Room index = room_for(direct_index(&v) * sizeof(int32_t))
+        cdef int64_t n = direct_real(&v, self.band)
+        cdef Room room = room_for(n * sizeof(double) + direct_index(&v) * sizeof(int32_t))
+        cdef double* real = <double*>room.at
         cdef direct_t t
         cdef int32_t path = 0
         cdef bint ended
         t.e0, t.v0, t.least = self.data.start_energy, self.data.start_velocity, 1e-13
         t.linear, t.symmetric = self.linear, self.symmetric
         with nogil:
-            direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, <double*>real.at,
-                       <int32_t*>index.at)
+            direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, real,
+                       <int32_t*>(real + n))
             ended = pivot(&t, &start[0], tol, follow)
         if not ended:
             if not follow or t.linear or t.solved:

@@ -15,7 +15,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID,
                                          N_CACHE_IMPULSE, N_JOINT, N_SIZES, S_OUT, bind, engine_t)
-from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals
+from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals, rolling_reals
 from lavender_ext.judge.score cimport score_t
 
 
@@ -120,6 +120,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     copy_reals(a.joint_impulse, b.joint_impulse, a.v_free - a.joint_impulse)
     copy_reals(a.cache_impulse, b.cache_impulse, N_CACHE_IMPULSE * c)
     copy_reals(a.cache_local, b.cache_local, 6 * c)
+    copy_reals(a.cache_roll, b.cache_roll, rolling_reals(size) * c)
     copy_ints(a.head, b.head, a.pair - a.head)
     copy_ints(a.joint_body, b.joint_body, 2 * kj)
     copy_ints(a.ptr, b.ptr, kj + c + 1)

@@ -5,7 +5,8 @@ A spec names where its problem comes from (a seed says the rest), so that it sta
 
 import hypothesis.strategies as st
 import numpy as np
-from strategies import generators, numbers, plain, positive
+from random_problems import nearly_singular
+from strategies import plain
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -43,10 +44,8 @@ def promise_specs():
         )
 
     nothing, text = st.just({}), st.fixed_dictionaries({"text": pick(hard.SET)})
-    parts = (of("scene", scenes()), of("scene", scenes()), of("wild", nothing), of("warm", nothing))
-    return st.one_of(*parts, of("singular", singular()), of("singular", singular()), of("hard", text)).map(
-        plain
-    )
+    drawn = [of(source, nothing) for source in ("wild", "warm", "singular", "singular")]
+    return st.one_of(of("scene", scenes()), of("scene", scenes()), *drawn, of("hard", text)).map(plain)
 
 
 @st.composite
@@ -56,20 +55,6 @@ def scenes(draw):
     parameters = {key: draw(st.sampled_from(values)) for key, values in choices.items()}
     parameters["solver_iterations"] = draw(st.sampled_from((4, 8, 16, 32)))
     return {"scene": name, "parameters": parameters, "steps": draw(st.integers(1, 120))}
-
-
-@st.composite
-def singular(draw):
-    """J of a few velocities, and M whose eigenvalues lie up to 1e17 apart."""
-    nv, rows = draw(st.integers(1, 10)), draw(st.integers(1, 12))
-    q = np.linalg.qr(draw(numbers(nv * nv, "tame")).reshape(nv, nv) + 3.0 * np.eye(nv))[0]
-    eigenvalues = draw(positive(nv, "tame")) * 10.0 ** -draw(generators()).integers(0, 18, nv).astype(float)
-    mass = (q * eigenvalues) @ q.T
-    mass = 0.5 * (mass + mass.T) * 10.0 ** draw(st.integers(-6, 6))
-    law = draw(st.sampled_from(("linear", "lcp", "coulomb", "cone")))
-    rows = 3 * (1 + rows // 3) if law in ("coulomb", "cone") else rows
-    jac = draw(numbers(rows * nv, draw(st.sampled_from(("tame", "tame", "whole"))))).reshape(rows, nv)
-    return {"law": law, "J": jac, "M": mass, "v_free": draw(numbers(nv, "tame"))}
 
 
 def build(spec):
@@ -83,16 +68,7 @@ def build(spec):
     if source == "hard":
         return suite.case(spec["text"]).problem
     if source == "singular":
-        jac = np.array(spec["J"], float).reshape(-1, len(spec["v_free"]))
-        m, law = len(jac), spec["law"]
-        if law in ("coulomb", "cone"):
-            cones = lv.Cones.contacts(0.5, count=m // 3)
-        else:
-            cones = lv.Cones.bounded(np.full(m, 0.0 if law == "lcp" else -np.inf), np.full(m, np.inf))
-        friction = "cone" if law == "cone" else "coulomb"
-        return lv.Problem.from_jacobian(
-            jac, np.array(spec["M"]), spec["v_free"], cones=cones, friction=friction
-        )
+        return nearly_singular(spec["seed"])
     problem = wild(seed=spec["seed"], rows=200).problem
     if source == "wild":
         return problem

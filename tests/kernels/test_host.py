@@ -55,22 +55,9 @@ def test_arrays_lie_where_the_engine_has_them(name):
     assert set(state.a) <= named
 
 
-def test_room_is_made_as_the_simulation_makes_it():
-    simulation = running("pyramid", steps=0, base=8)
-    state = simulation.state
-    assert state.kernel.prepare() == 1  # the first pair list does not fit
-    expected = state.grown()
-    size = memory.more_room(*buffers(state))
-    assert size.tolist() == expected.size.tolist() != state.size.tolist()
-    moved = State(size)
-    memory.move(*buffers(state), *buffers(moved))
-    assert moved.real.tobytes() == expected.real.tobytes()
-    assert moved.index.tobytes() == expected.index.tobytes()
-    assert moved.keys.tobytes() == expected.keys.tobytes()
-
-
-def test_moving_while_running_keeps_the_motion():
-    simulation, twin = (running("pile", n=40, kind="mixed") for _ in range(2))
+@pytest.mark.parametrize("more", [{}, {"rolling_radius": 0.01}], ids=["slides", "rolls"])
+def test_moving_while_running_keeps_the_motion(more):
+    simulation, twin = (running("pile", n=40, kind="mixed", steps=60, **more) for _ in range(2))
     state = simulation.state
     size = state.size.copy()
     size[8:] += 100

@@ -35,14 +35,17 @@ def several(count, seed=0, friction="coulomb"):
 @given(seed=seeds)
 @settings(max_examples=25)
 def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
-    problem = FORMS[form](random_contact_problem(seed, bodies=9, joints=2, contacts=6))
+    rolls = bool(seed % 2)
+    problem = FORMS[form](
+        random_contact_problem(seed, spin=not rolls, rolling=rolls, bodies=9, joints=2, contacts=6)
+    )
     count, label = islands(problem)
     # Blocks that share a body may still not touch in A, where rows happen to be orthogonal; not at random.
     count_of_matrix, label_of_matrix = islands(as_matrix(problem))
     assert count == count_of_matrix
     assert np.array_equal(label, label_of_matrix)
     assert np.array_equal(np.unique(label), np.arange(count))
-    a = problem.dense()
+    a, lam = problem.dense(), np.random.default_rng(seed).normal(size=problem.m)
     for i in range(count):
         blocks = np.flatnonzero(label == i)
         rows = rows_of(problem, blocks)
@@ -51,6 +54,8 @@ def test_islands_are_those_of_the_matrix_and_each_can_stand_alone(form, seed):
         # Sums over one body in another order: a few roundings.
         np.testing.assert_allclose(part.dense(), a[np.ix_(rows, rows)], rtol=0, atol=1e-13 * np.abs(a).max())
         np.testing.assert_array_equal(part.b, problem.b[rows])
+        alone, whole = lv.residual(part, lam[rows]).error, lv.residual(problem, lam).error[rows]
+        np.testing.assert_allclose(alone, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
         others = np.setdiff1d(np.arange(problem.m), rows)
         assert not a[np.ix_(rows, others)].any()
 
@@ -238,10 +243,9 @@ def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):
     assert solution.residual.relative <= min(looks)
 
 
-@pytest.mark.parametrize("seed", [8, 9])
-def test_a_looser_tolerance_costs_no_more(seed):
+def test_a_looser_tolerance_costs_no_more():
     # Whether the relaxation was left for good hung on where a check of its own fell: 50 times the sweeps.
-    problem = suite.granular(n=7, friction="coulomb", seed=seed).problem
+    problem = suite.granular(n=7, friction="coulomb", seed=8).problem
     found = [lv.solve(problem, tol=tol) for tol in (1e-3, 1e-4, 1e-6)]
     assert all(solution.success for solution in found), found
     sweeps = [solution.work["sweeps"] for solution in found]

@@ -116,13 +116,3 @@ def claim(status: Status, counts: Any) -> Claim:
     done, *parts = (int(c) for c in counts)
     work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
     return Claim(status, done, work, form=FORM)
-
-
-def named(claim: Claim, solver: str) -> Claim:
-    """The claim as `newton` or `auto` makes it."""
-    if solver == "newton":
-        return claim
-    done = ", ".join(f"{count} {kind}" for kind, count in claim.work.items() if count)
-    if not done and claim.status is Status.CONVERGED:
-        return Claim(claim.status, claim.iterations, {}, "the start is a solution")
-    return Claim(claim.status, claim.iterations, claim.work, f"newton {done or 'gave up at once'}")
