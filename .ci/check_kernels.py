@@ -47,18 +47,21 @@ PLAIN = ["-DLAVENDER_ONE_LANE"]
 CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer type"
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
-#: sleeps by the system's calls; `chain` and `looks` call the Python faces of kernels one after the other, `many` and
-#: `islands` the kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python,
-#: `newton` and `solve` are the driver's newton for Python. The arithmetic of all is that of
-#: other modules, which this check sees, but for the logarithms by which `looks` guesses about sweeps.
+#: sleeps by the system's calls; `looks` calls the Python faces of kernels one after the other, `many` and `small` the
+#: kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python, `newton`
+#: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
+#: check sees, but for the logarithms by which `looks` guesses about sweeps; that of `direct`, `principal` and `watch`
+#: is cut out for the C library, which refuses what needs Python.
 EXEMPT = {
     "threaded": "threads",
-    "chain": "calls kernels, computes nothing",
     "looks": "calls kernels, guesses how long they will take",
     "gate": "reads arrays of Python, computes nothing",
     "blocks": "reads and fills arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
-    "islands": "allocates, copies islands out and calls kernels, computes nothing",
+    "small": "allocates, copies islands out and calls kernels, computes nothing",
+    "direct": "calls rounds of pivots by pointer; the C library has it whole",
+    "principal": "called by direct; the C library has it whole",
+    "watch": "the loop of sweeps and checks for Python; the C library has it whole",
     "newton": "makes room for Python; its arithmetic is in the driver's core",
     "start": "makes room for Python; its arithmetic is in the substep's core",
     "solve": "calls the turns that the driver calls, in arrays of Python",

@@ -219,11 +219,8 @@ def quick(
 ) -> tuple[float, float]:
     """(relative, floor) with w, e as scratch (m,): the solvers' own stopping test, the judge's arithmetic."""
     reference(problem)
-    data = problem.metric
-    energy, velocity, _, floor_energy, floor_velocity, finite = measure.judge(data, impulse, w, e, floor)
-    if not finite:
-        return np.inf, 0.0
-    return relative_of(data, energy, velocity), relative_of(data, floor_energy, floor_velocity)
+    _, _, relative, left = measure.judge(problem.metric, impulse, w, e, floor)
+    return relative, left
 
 
 def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None) -> Residual:

@@ -444,20 +444,7 @@ class Scene:
         if kind not in (DISTANCE, BALL, HINGE):
             raise UnknownName("joint", kind, (DISTANCE, BALL, HINGE))
         label = name or f"{kind} {len(self.joints)}"
-        for body in (a, b):
-            if (
-                isinstance(body, bool)
-                or not isinstance(body, (int, np.integer))
-                or not -1 <= body < self.n_bodies
-            ):
-                raise InputError(
-                    f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
-                )
-        a, b = int(a), int(b)
-        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
-            raise InputError(
-                f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
-            )
+        a, b = self._joined(label, a, b)
         ends = (anchor, anchor_a, anchor_b, length)
         pa, pb, length = (
             self._distance_ends(label, (a, b), *ends, axis)
@@ -489,6 +476,20 @@ class Scene:
         )
         self.joints.append(joint)
         return len(self.joints) - 1
+
+    def _joined(self, label: str, a: Any, b: Any) -> tuple[int, int]:
+        """The numbers of two bodies that a joint may have."""
+        for body in (a, b):
+            whole = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
+            if not whole or not -1 <= body < self.n_bodies:
+                raise InputError(
+                    f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
+                )
+        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
+            raise InputError(
+                f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
+            )
+        return int(a), int(b)
 
     def _distance_ends(
         self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any

@@ -34,4 +34,4 @@ cdef struct sweep_data_t:
     int32_t backwards           # the order is turned round since they were packed
 
 
-cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

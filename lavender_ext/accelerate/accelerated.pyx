@@ -168,8 +168,9 @@ cdef inline void follow(double* y, double* x, double* p, double beta, int32_t n)
         x[i] = q
 
 
-cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (1)."""
+    cdef sweep_data_t* c = <sweep_data_t*>context
     cdef int32_t m = c.blocks.n_rows, i, s
     cdef double* x = c.work                             # x, then g; behind lam's part that of v
     cdef double* q = c.work + m + c.nv                  # beta p, to be added
@@ -211,8 +212,9 @@ cdef public void lav_nncg(sweep_data_t* c, double* lam, int32_t first_sweep, int
             p[i] = q[i] - x[i]
 
 
-cdef public void lav_anderson(sweep_data_t* c, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (2)."""
+    cdef sweep_data_t* c = <sweep_data_t*>context
     cdef int32_t m = c.blocks.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
     cdef const double* d = c.blocks.d
@@ -260,14 +262,6 @@ cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
             if i != UNDONE:
                 c.control[i] = 0.0
     form_velocity(c, lam)
-
-
-cdef void nncg_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    lav_nncg(<sweep_data_t*>context, lam, first_sweep, n)
-
-
-cdef void anderson_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    lav_anderson(<sweep_data_t*>context, lam, first_sweep, n)
 
 
 cdef enum:
@@ -362,10 +356,10 @@ def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, pre
     c.gram = &gram[0]
     c.work = &work[0]
     with nogil:
-        status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n, tol, &done)
+        status = watch.run(lav_nncg if memory == 0 else lav_anderson, &c, &lam[0], n, tol, &done)
         while status == STALLED and begins_again(&watch.state, AGAIN):
             forget_all(&c, &lam[0])
-            status = watch.run(nncg_step if memory == 0 else anderson_step, &c, &lam[0], n - done, tol, &more)
+            status = watch.run(lav_nncg if memory == 0 else lav_anderson, &c, &lam[0], n - done, tol, &more)
             done += more
     pairs.backwards = c.backwards
     return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])

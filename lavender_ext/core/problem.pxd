@@ -5,6 +5,7 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 
 
 cdef class Room:
@@ -48,5 +49,6 @@ cdef class Data:
     cdef object _weight
     cdef list keep
 
+    cdef view_t view(self) noexcept nogil
     cdef void adopt(self, made_t* made)
     cdef object part(self, int which)

@@ -23,6 +23,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
+from lavender_ext.core.view cimport view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
 
@@ -361,6 +362,17 @@ cdef class Data:
     def __dealloc__(self):
         free(self.made.marks)
         free(self.made.numbers)
+
+    cdef view_t view(self) noexcept nogil:
+        # Pointers into this object, which must outlive them.
+        cdef view_t v = view_t(self.blocks, NULL, NULL, NULL)
+        if self.is_general:
+            v.g = &self.general
+        elif self.factored:
+            v.r = &self.rows
+        else:
+            v.a = &self.csr
+        return v
 
     def prepare(self):
         """d, nu, step and Y of a problem in generalised coordinates, where they are not known yet."""

@@ -16,8 +16,7 @@ from lavender_ext.generalized.newton cimport DONE as G_DONE
 from lavender_ext.generalized.newton cimport SPENT as G_SPENT
 from lavender_ext.generalized.newton cimport descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_into, reference_of
-from lavender_ext.judge.score cimport are_numbers, score_rows, score_t
+from lavender_ext.judge.measure cimport judge_nothing
 from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
 from lavender_ext.newton.run cimport (aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t, own_index,
@@ -38,23 +37,13 @@ cdef inline int64_t begun_room(const view_t* v) noexcept nogil:
 
 cdef inline double* begin(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
     """The problem, what is asked, and errors of doing nothing as the judge has them; what is behind (`begun_room`)."""
-    cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef double begun[3]
     cdef newton_t* n = &(<state_t*>r.real).n
-    cdef bint moves
     memset(r.real, 0, begun_room(v) * sizeof(double))
     aim(n, &v.p, v.a, v.r, v.g)
     n.tol, n.budget = o.tol, o.budget
     lay_judge(n, r.real + sizeof(state_t) // sizeof(double) + 1)
-    moves = do_nothing(&v.p, n.lam, n.problem.w)
-    if not moves:
-        score_rows(&v.p, n.lam, n.problem.w, n.problem.error, &found)
-    elif v.g != NULL:
-        general_judge(&v.p, v.g, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
-    else:
-        judge_into(&v.p, v.a, v.r, v.r != NULL, n.lam, n.problem.w, n.problem.error, n.problem.x, False, &found)
-    found.finite = found.finite and are_numbers(n.problem.w, v.p.n_rows)
-    reference_of(&v.p, &found, moves, False, begun)
+    judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, False, begun)
     n.problem.e0, n.problem.v0 = begun[0], begun[1]
     return r.real + begun_room(v)
 

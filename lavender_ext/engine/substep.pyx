@@ -262,16 +262,6 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     return OK if e.head[H_LOST] < 0 else NOT_FINITE
 
 
-cdef public int32_t lav_engine_pairs(const int32_t* size, double* real, int32_t* index,
-                                     uint64_t* keys) noexcept nogil:
-    """The first two stages alone; returns the number of pairs needed."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    bind(size, real, index, keys, &e, n)
-    start_bodies(&e)
-    return update_pairs(&e)
-
-
 cdef public int32_t lav_engine_prepare(const int32_t* size, double* real, int32_t* index,
                                        uint64_t* keys) noexcept nogil:
     """The coming substep's velocity problem; changes no state. Returns OK or NEED_ROOM."""
@@ -300,19 +290,6 @@ cdef public void lav_engine_solve_watched(const int32_t* size, double* real, int
     solve(&e, 1, NULL, curve, scratch)
 
 
-cdef public void lav_engine_apply(const int32_t* size, double* real, int32_t* index,
-                                  uint64_t* keys) noexcept nogil:
-    """dv and the final measures of impulses that another solver has written."""
-    cdef engine_t e
-    cdef int64_t n[3]
-    cdef blocks_t p
-    cdef rows_t r
-    bind(size, real, index, keys, &e, n)
-    view(&e, &p, &r)
-    rows_velocity(&p, &r, e.impulse, e.dv)
-    measure(&e, e.setting + S_OUT + 5, e.setting + S_OUT + 7)
-
-
 cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t* index,
                                       uint64_t* keys) noexcept nogil:
     """Positions, velocities and cache after the solve. Returns OK or NOT_FINITE."""
@@ -322,19 +299,16 @@ cdef public int32_t lav_engine_finish(const int32_t* size, double* real, int32_t
     return finish(&e)
 
 
-cdef inline int32_t substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                             int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
-    cdef engine_t e
-    cdef int64_t n[3]
+cdef inline int32_t substeps(engine_t* e, int32_t n, double* room, int32_t* done) noexcept nogil:
+    # room: of packed blocks, `room_for` the capacities, or NULL: the same bits in more time
     cdef int32_t status
-    bind(size, real, index, keys, &e, n)
     done[0] = 0
-    while done[0] < n_substeps:
-        status = prepare(&e)
+    while done[0] < n:
+        status = prepare(e)
         if status != OK:
             return status
-        solve(&e, 1, room, NULL, NULL)
-        status = finish(&e)
+        solve(e, 1, room, NULL, NULL)
+        status = finish(e)
         done[0] += 1
         if status != OK:
             return status
@@ -344,13 +318,10 @@ cdef inline int32_t substeps(const int32_t* size, double* real, int32_t* index, 
 cdef public int32_t lav_engine_substeps(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                         int32_t n_substeps, int32_t* done) noexcept nogil:
     """Whole substeps with sequential impulses; done: how many were completed before the status."""
-    return substeps(size, real, index, keys, n_substeps, NULL, done)
-
-
-cdef public int32_t lav_engine_substeps_packed(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
-                                               int32_t n_substeps, double* room, int32_t* done) noexcept nogil:
-    """The same bits in less time, with room for packed blocks, `room_for` the capacities."""
-    return substeps(size, real, index, keys, n_substeps, room, done)
+    cdef engine_t e
+    cdef int64_t n[3]
+    bind(size, real, index, keys, &e, n)
+    return substeps(&e, n_substeps, NULL, done)
 
 
 cdef class Buffers:
@@ -358,6 +329,7 @@ cdef class Buffers:
 
     The caller passes buffers of at least `lengths(size)` entries.
     """
+    cdef engine_t e
     cdef const int32_t[::1] size
     cdef double[::1] real
     cdef int32_t[::1] index
@@ -372,6 +344,8 @@ cdef class Buffers:
         self.real = real
         self.index = index
         self.keys = keys
+        cdef int64_t used[3]
+        bind(&size[0], &real[0], &index[0], &keys[0], &self.e, used)
         cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
         self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MOST else 1)
@@ -381,62 +355,60 @@ cdef class Buffers:
         """Run the broad phase; returns the number of pairs needed."""
         cdef int32_t n
         with nogil:
-            n = lav_engine_pairs(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+            start_bodies(&self.e)
+            n = update_pairs(&self.e)
         return n
 
     def prepare(self):
         cdef int32_t status
         with nogil:
-            status = lav_engine_prepare(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+            status = prepare(&self.e)
         return status
 
     def solve(self, bint sweeps=True):
         with nogil:
-            lav_engine_solve(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], sweeps)
+            solve(&self.e, sweeps, NULL, NULL, NULL)
 
     def solve_watched(self, double[:, ::1] curve):
         """All sweeps; curve (iterations + 1, 2) takes max |e_n| [N s] and E [sqrt J] along the way."""
         rows = self.size[N_JOINT_ROW] + self.size[CAP_CONTACT] * self.size[ROWS_PER_CONTACT]
         cdef double[::1] scratch = np.empty(2 * rows + 1)
         with nogil:
-            lav_engine_solve_watched(&self.size[0], &self.real[0], &self.index[0], &self.keys[0],
-                                     &curve[0, 0], &scratch[0])
+            solve(&self.e, 1, NULL, &curve[0, 0], &scratch[0])
 
     def apply(self):
+        """dv and the final measures of impulses that another solver has written."""
+        cdef blocks_t p
+        cdef rows_t r
         with nogil:
-            lav_engine_apply(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+            view(&self.e, &p, &r)
+            rows_velocity(&p, &r, self.e.impulse, self.e.dv)
+            measure(&self.e, self.e.setting + S_OUT + 5, self.e.setting + S_OUT + 7)
 
     def finish(self):
         cdef int32_t status
         with nogil:
-            status = lav_engine_finish(&self.size[0], &self.real[0], &self.index[0], &self.keys[0])
+            status = finish(&self.e)
         return status
 
     def substeps(self, int32_t n):
         """Run n substeps; returns (status, how many were completed)."""
         cdef int32_t status, done = 0
         with nogil:
-            status = lav_engine_substeps_packed(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], n,
-                                                &self.room[0], &done)
+            status = substeps(&self.e, n, &self.room[0], &done)
         return status, done
 
     def keep(self):
         """Copy what the next substep starts from; `put_back` returns to it."""
-        cdef engine_t e
-        cdef int64_t used[3]
-        bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
-        cdef int64_t c = e.head[H_CACHED], n = kept_reals(e.size, c)
+        cdef int64_t c = self.e.head[H_CACHED], n = kept_reals(self.e.size, c)
         if n > self.kept_real.shape[0] or c > self.kept_keys.shape[0]:
             self.kept_real = np.empty(n + n // 4)
             self.kept_keys = np.empty(c + c // 4 + 1, np.uint64)
-        keep(&e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
+        keep(&self.e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
 
     def put_back(self):
         """The state that `keep` has copied."""
-        cdef engine_t e
-        cdef int64_t used[3]
-        bind(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], &e, used)
-        put_back(&e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
+        put_back(&self.e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
 
     def arrays(self):
         """Name -> writable view of one of the buffers, with the shape that engine/arrays.pyx gives."""

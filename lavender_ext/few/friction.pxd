@@ -6,7 +6,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.accelerate.accelerated cimport anderson_step, sweep_data_t
+from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
@@ -14,7 +14,7 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.few.room cimport has_room
-from lavender_ext.judge.measure cimport do_nothing, judge_into, relative_of
+from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE
 
@@ -95,7 +95,7 @@ cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* r
 cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
     cdef const view_t* v = &t.s.v
     cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    judge_into(&v.p, v.a, v.r, v.r != NULL, lam, t.w, t.error, t.scratch, False, &found)
+    judge_view(v, lam, t.w, t.error, t.scratch, False, &found)
     return relative_of(&found, t.w, v.p.n_rows, t.e0, t.v0)
 
 
@@ -116,7 +116,7 @@ cdef inline double sweep_on(turns_t* t, int32_t most, bint hoping) noexcept nogi
     cdef int32_t step = FIRST
     while now > tol and t.c.turn < most:
         before = now
-        anderson_step(&t.c, t.swept, t.c.turn == 0, step)
+        lav_anderson(&t.c, t.swept, t.c.turn == 0, step)
         now = found_at(t, t.swept)
         step = t.c.turn // 2 if t.c.turn // 2 > FIRST else FIRST
         if hoping and not promises(before, now, tol, HOPED * (most - t.c.turn) // step):
@@ -172,7 +172,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
     do_nothing(p, s.answer, t.w)
-    judge_into(p, s.v.a, s.v.r, s.v.r != NULL, s.answer, t.w, t.error, t.scratch, False, &nothing)
+    judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
     own = nothing.energy
     if own == 0.0 and nothing.velocity == 0.0:
         return True     # doing nothing is right

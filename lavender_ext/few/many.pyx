@@ -14,14 +14,15 @@ import numpy as np
 from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.few.room cimport has_room
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all
 from lavender_ext.generalized.sparse cimport PER_COLUMN
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judged_from, reference_of, relative_of
-from lavender_ext.judge.score cimport are_numbers, relative, score_rows, score_t
+from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
+from lavender_ext.judge.score cimport relative, score_t
 
 
 cdef enum:
@@ -59,16 +60,9 @@ cdef struct job_t:
 
 cdef inline void begin(job_t* j, double* w) noexcept nogil:
     """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    cdef int32_t m = j.p.n_rows
-    cdef double* x = w + 2 * <ssize_t>m
-    cdef bint moves = do_nothing(&j.p, x, w)
-    if not moves:
-        score_rows(&j.p, x, w, w + m, &s)
-    else:
-        general_judge(&j.p, &j.g, x, w, w + m, x + m, False, &s)
-        s.finite = s.finite and are_numbers(w, m)
-    reference_of(&j.p, &s, moves, False, j.begin)
+    cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
+    cdef ssize_t m = j.p.n_rows
+    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
 
 
 cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) noexcept nogil:

@@ -47,15 +47,6 @@ cdef enum:
     LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
 
 
-cdef view_t view_of(Data data):
-    cdef view_t v = view_t(data.blocks, NULL, NULL, NULL)
-    if data.factored:
-        v.r = &data.rows
-    else:
-        v.a = &data.csr
-    return v
-
-
 cdef class Small:
     """One problem, its error of doing nothing known to `data`; `run` only reads it.
 
@@ -156,7 +147,7 @@ cdef class Bounded(Small):
 
     cdef solve(self, own, double tol, bint follow):
         cdef double[::1] start = own
-        cdef view_t v = view_of(self.data)
+        cdef view_t v = self.data.view()
         cdef int64_t n = direct_real(&v, self.band)
         cdef Room room = room_for(n * sizeof(double) + direct_index(&v) * sizeof(int32_t))
         cdef double* real = <double*>room.at
@@ -337,7 +328,7 @@ cdef class Friction(Small):
         cdef const int32_t[::1] at
         cdef const double[::1] prepared
         cdef bint good
-        s.v = view_of(self.matrix)
+        s.v = self.matrix.view()
         s.lam, s.answer, s.split = &own[0], x, self.split
         s.at, s.prepared = NULL, NULL
         if self.prepared is not None:

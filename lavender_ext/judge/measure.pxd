@@ -3,14 +3,13 @@
     F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|
     floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
 
-A row's products serve w and F, and its error and sums follow while they are at hand: A is read once. Factored,
-core/velocity.pxd forms M^-1 J^T lam, and a second loop reads J v.
+A row's products serve w and F: A is read once. Factored, core/velocity.pxd forms M^-1 J^T lam, and a second loop reads
+J v.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport (CONTACT_BOX, ROW, block_error, blocks_t, contact_error, mu_r, n_directions, n_turns,
-                                      row_error)
+from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
@@ -18,9 +17,8 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.score cimport (add_floor, are_numbers, is_plain, norms_of_rhs, nothing, relative, root,
-                                       score_from, score_rows, score_t, sum_t, tally_block, tally_contact,
-                                       tally_floor, tally_row, tally_t)
+from lavender_ext.judge.score cimport (add_floor, are_numbers, floor_ends, floor_t, no_floor, norms_of_rhs, relative,
+                                       score_rows, score_t)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -32,49 +30,22 @@ cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam,
         w[i] = csr_dot(a, i, lam) - p.b[i]
 
 
-cdef inline tally_t csr_pass(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e) noexcept nogil:
-    # All in one loop; without F two loops are the quicker ones.
-    cdef int32_t i = 0, j, k, n
-    cdef double size, low, high, inf = 1.0 / 0.0
-    cdef tally_t s = nothing()
-    for k in range(p.n_rows):
-        w[k] = csr_dot_size(a, k, lam, &size) - p.b[k]
-        tally_floor(p, k, size, &s)
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        if n == 1:                                      # a row, or a normal alone: the same formula under both laws
-            low = p.lower[k] if p.kind[i] == ROW else 0.0
-            high = p.upper[k] if p.kind[i] == ROW else inf
-            e[k] = row_error(lam[k], w[k], p.d[k], low, high)
-            tally_row(p, k, e[k], &s)
-            i += 1
-        elif k == j + n - 1:                            # the last row of a block
-            block_error(p, i, lam, w, e)
-            tally_block(p, i, e, &s)
-            i += 1
-    return s
-
-
 cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
-    cdef int32_t i
-    cdef tally_t s
-    cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
+    cdef int32_t k
+    cdef double size
+    cdef floor_t f = no_floor()
     if not floor:
         csr_slack(p, a, lam, w)
-        score_rows(p, lam, w, e, out)
-        return
-    s = csr_pass(p, a, lam, w, e)
-    score_from(p, e, &s, out)
-    if is_plain(s.floor_energy, s.floor_fast):
-        out.floor_energy = sqrt(s.floor_energy)
-        out.floor_velocity = sqrt(s.floor_fast)
-        return
-    for i in range(p.n_rows):
-        add_floor(p, i, csr_abs_dot(a, i, lam), &total, &big)
-    out.floor_energy = root(&total)
-    out.floor_velocity = big
+    else:
+        for k in range(p.n_rows):
+            w[k] = csr_dot_size(a, k, lam, &size) - p.b[k]
+            add_floor(p, k, size, 0, &f)
+        if not floor_ends(&f, 0, out):
+            for k in range(p.n_rows):
+                add_floor(p, k, csr_abs_dot(a, k, lam), 1, &f)
+            floor_ends(&f, 1, out)
+    score_rows(p, lam, w, e, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
@@ -249,98 +220,46 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
 
 
-cdef inline void judge_contact(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, int32_t turns,
-                               bint box, const double* lam, double* w, double* e, const double* v,
-                               tally_t* s) noexcept nogil:
-    cdef int32_t k, i = r.n_joints + c, together = 1 if box else nt, apart = 1 if box else turns
+cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* sizes,
+                            const bint scaled, floor_t* f) noexcept nogil:
+    # (|J| |M^-1| |J|^T |lam| + c |lam|) of every row; sizes of `velocity_size`
+    cdef int32_t i, j, c, n, nt, turns, a, b
     cdef double size[6]
-    contact_slack(r, c, nt, turns, v, w + j)
-    for k in range(j, j + 1 + nt + turns):
-        w[k] += r.compliance[k] * lam[k] - p.b[k]
-    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), together, apart, e + j)
-    tally_contact(p, j, together, apart, e, s)
-    contact_sizes(r, c, nt, turns, v + 6 * <ssize_t>r.n_bodies, size)
-    for k in range(1 + nt + turns):
-        tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)
-
-
-cdef inline void judge_plain(const blocks_t* p, const rows_t* r, int32_t c, int32_t j, int32_t nt, const double* lam,
-                             double* w, double* e, const double* v, tally_t* s) noexcept nogil:
-    # A normal, or a normal and a disk: small enough for a compiler to write out with nt known.
-    cdef int32_t k, i = r.n_joints + c
-    cdef double size[3]
-    contact_slack(r, c, nt, 0, v, w + j)
-    for k in range(j, j + 1 + nt):
-        w[k] += r.compliance[k] * lam[k] - p.b[k]
-    contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], 0.0, 0.0, nt, 0, e + j)
-    tally_contact(p, j, nt, 0, e, s)
-    contact_sizes(r, c, nt, 0, v + 6 * <ssize_t>r.n_bodies, size)
-    for k in range(1 + nt):
-        tally_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], s)
-
-
-cdef inline tally_t rows_pass(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e,
-                              const double* v) noexcept nogil:
-    # With the floor; without it two loops are the quicker ones.
-    cdef int32_t i, j, c, a, b, nt, turns
-    cdef tally_t s = nothing()
-    cdef const double* size = v + 6 * <ssize_t>r.n_bodies
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            w[j] = joint_velocity(r.jac + 12 * j, v, a, b) + (r.compliance[j] * lam[j] - p.b[j])
-            e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
-            tally_row(p, j, e[j], &s)
-            tally_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, size, a, b), &s)
+            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), scaled, f)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
-        if turns or nt == 1 or p.kind[i] == CONTACT_BOX:
-            judge_contact(p, r, c, j, nt, turns, p.kind[i] == CONTACT_BOX, lam, w, e, v, &s)
+        n = p.ptr[i + 1] - j
+        nt = n_directions(p.kind[i], n)
+        turns = n_turns(p.kind[i], n)
+        if turns or nt == 1:                            # the two common kinds with their sizes as constants
+            contact_sizes(r, c, nt, turns, sizes, size)
         elif nt == 2:
-            judge_plain(p, r, c, j, 2, lam, w, e, v, &s)
+            contact_sizes(r, c, 2, 0, sizes, size)
         else:
-            judge_plain(p, r, c, j, 0, lam, w, e, v, &s)
-    return s
+            contact_sizes(r, c, 0, 0, sizes, size)
+        for i in range(n):
+            add_floor(p, j + i, r.compliance[j + i] * fabs(lam[j + i]) + size[i], scaled, f)
 
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                             bint floor, score_t* out) noexcept nogil:
-    cdef int32_t i, j, c, k, nt
-    cdef double size[6]
     cdef double* sizes = v + 6 * <ssize_t>r.n_bodies
-    cdef tally_t s
-    cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
+    cdef floor_t f = no_floor()
     rows_velocity(p, r, lam, v)
+    rows_slack(p, r, lam, v, w)
+    score_rows(p, lam, w, e, out)
     if not floor:
-        rows_slack(p, r, lam, v, w)
-        score_rows(p, lam, w, e, out)
         return
     velocity_size(p, r, lam, sizes)
-    s = rows_pass(p, r, lam, w, e, v)
-    score_from(p, e, &s, out)
-    if is_plain(s.floor_energy, s.floor_fast):
-        out.floor_energy = sqrt(s.floor_energy)
-        out.floor_velocity = sqrt(s.floor_fast)
-        return
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        c = i - r.n_joints
-        if c < 0:
-            for k in range(j, p.ptr[i + 1]):
-                add_floor(p, k, r.compliance[k] * fabs(lam[k])
-                          + joint_size(r.jac + 12 * k, sizes, r.joint_body[2 * i], r.joint_body[2 * i + 1]), &total, &big)
-            continue
-        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        contact_sizes(r, c, nt, n_turns(p.kind[i], p.ptr[i + 1] - j), sizes, size)
-        for k in range(p.ptr[i + 1] - j):
-            add_floor(p, j + k, r.compliance[j + k] * fabs(lam[j + k]) + size[k], &total, &big)
-    out.floor_energy = root(&total)
-    out.floor_velocity = big
+    rows_floor(p, r, lam, sizes, 0, &f)
+    if not floor_ends(&f, 0, out):
+        rows_floor(p, r, lam, sizes, 1, &f)
+        floor_ends(&f, 1, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
@@ -360,9 +279,7 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
                                double* x, bint floor, score_t* out) noexcept nogil:
     """The pass over J and M; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n) is scratch, with the floor (n + m)."""
     cdef int32_t i
-    cdef tally_t s
-    cdef sum_t total = sum_t(0.0, 0.0)
-    cdef double big = 0.0
+    cdef floor_t f = no_floor()
     cdef double* size = x + g.n
     general_slack(p, g, lam, x, w)
     score_rows(p, lam, w, e, out)
@@ -374,30 +291,16 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
         panel_push_size(g, i, lam, x)
     for i in range(g.n_panels):
         panel_size(g, i, x, size)
-    s = nothing()
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
-        tally_floor(p, i, size[i], &s)
-    if is_plain(s.floor_energy, s.floor_fast):
-        out.floor_energy = sqrt(s.floor_energy)
-        out.floor_velocity = sqrt(s.floor_fast)
-        return
-    for i in range(p.n_rows):
-        add_floor(p, i, size[i], &total, &big)
-    out.floor_energy = root(&total)
-    out.floor_velocity = big
+        add_floor(p, i, size[i], 0, &f)
+    if not floor_ends(&f, 0, out):
+        for i in range(p.n_rows):
+            add_floor(p, i, size[i], 1, &f)
+        floor_ends(&f, 1, out)
 
 
-cdef inline void judge_into(const blocks_t* p, const csr_t* a, const rows_t* r, bint factored, const double* lam, double* w,
-                     double* e, double* v, bint floor, score_t* out) noexcept nogil:
-    """Slack into w (m), error into e (m), the sums into out; v (n_bodies, 12) is scratch, read where factored.
-
-    Without the floor (n_bodies, 6) of v suffice.
-    """
-    if factored:
-        rows_judge(p, r, lam, w, e, v, floor, out)
-    else:
-        csr_judge(p, a, lam, w, e, floor, out)
+# -- any form ------------------------------------------------------------------------------------------
 
 
 cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
@@ -407,7 +310,7 @@ cdef inline int64_t scratch_of(const view_t* v) noexcept nogil:
 
 cdef inline void judge_view(const view_t* v, const double* lam, double* w, double* e, double* scratch, bint floor,
                             score_t* out) noexcept nogil:
-    """Slack into w (m), error into e (m), the sums into out, whatever the form; scratch: `scratch_of`."""
+    """Slack into w (m), error into e (m), the sums into out; scratch: `scratch_of`, half of it over bodies without floor."""
     if v.g != NULL:
         general_judge(&v.p, v.g, lam, w, e, scratch, floor, out)
     elif v.r != NULL:
@@ -448,6 +351,19 @@ cdef inline void reference_of(const blocks_t* p, const score_t* s, bint moves, b
     out[0] = energy if energy < 1.0 / 0.0 else 0.0
     out[1] = velocity if velocity < 1.0 / 0.0 else 0.0
     out[2] = relative(s.energy, s.velocity, out[0], out[1]) if s.finite else 1.0 / 0.0
+
+
+cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e, double* scratch, bint vanished,
+                               double* out) noexcept nogil:
+    """Doing nothing into x (m), and of it (3) of `reference_of`; w, e (m) and scratch as `judge_view`, without floor."""
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef bint moves = do_nothing(&v.p, x, w)
+    if not moves:
+        score_rows(&v.p, x, w, e, &s)
+    else:
+        judge_view(v, x, w, e, scratch, False, &s)
+        s.finite = s.finite and are_numbers(w, v.p.n_rows)
+    reference_of(&v.p, &s, moves, vanished, out)
 
 
 cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,

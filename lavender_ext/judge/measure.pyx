@@ -6,31 +6,26 @@ import numpy as np
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t, whitened_gather
+from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.judge.measure cimport (csr_slack, do_nothing, general_judge, general_slack, judge_into,
-                                         reference_of, relative_of, rows_slack)
+from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.measure cimport (csr_judge, csr_slack, general_slack, judge_nothing, judge_view, relative_of,
+                                         rows_judge, rows_slack, scratch_of)
 from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
 
 
 cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
                                int32_t floor, score_t* out) noexcept nogil:
     """Slack w (m), error e (m) and the sums of lam (m) for a problem given by A."""
-    judge_into(p, a, NULL, 0, lam, w, e, NULL, floor, out)
+    csr_judge(p, a, lam, w, e, floor, out)
 
 
 cdef public void lav_judge_rows(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
                                 int32_t floor, score_t* out) noexcept nogil:
     """The same for a factored problem; v (n_bodies, 6), with the floor (n_bodies, 12), is scratch."""
-    judge_into(p, NULL, r, 1, lam, w, e, v, floor, out)
-
-
-cdef public void lav_judge_general(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
-                                   double* x, int32_t floor, score_t* out) noexcept nogil:
-    """The same in generalised coordinates; x (n), with the floor (n + m), is scratch."""
-    general_judge(p, g, lam, w, e, x, floor, out)
+    rows_judge(p, r, lam, w, e, v, floor, out)
 
 
 cdef public void lav_rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
@@ -58,25 +53,19 @@ def slack(Data p, const double[::1] lam, double[::1] w):
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):
-    """Slack into w, error into e, and (energy, velocity, worst row, floor energy, floor velocity, w, e finite)."""
+    """Slack into w, error into e, and (energy, velocity, relative residual, its floor); inf, inf, inf, 0 where not finite."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    cdef double[::1] bodies
-    cdef double* v = NULL
+    cdef view_t v = p.view()
+    cdef double[::1] scratch
     if p.blocks.n_rows == 0:
-        return 0.0, 0.0, -1, 0.0, 0.0, True
-    if p.is_general:
-        bodies = np.empty(p.general.n + p.blocks.n_rows)
-        with nogil:
-            general_judge(&p.blocks, &p.general, &lam[0], &w[0], &e[0], &bodies[0], floor, &s)
-        return (s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity,
-                s.finite and are_numbers(&w[0], p.blocks.n_rows))
-    if p.factored:
-        bodies = np.empty((12 if floor else 6) * p.rows.n_bodies + 1)
-        v = &bodies[0]
+        return 0.0, 0.0, 0.0, 0.0
+    scratch = np.empty(scratch_of(&v) + 1)
     with nogil:
-        judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], &w[0], &e[0], v, floor, &s)
-    return (s.energy, s.velocity, s.worst, s.floor_energy, s.floor_velocity,
-            s.finite and are_numbers(&w[0], p.blocks.n_rows))
+        judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
+    if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
+        return np.inf, np.inf, np.inf, 0.0
+    return (s.energy, s.velocity, relative(s.energy, s.velocity, p.start_energy, p.start_velocity),
+            relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity))
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):
@@ -103,24 +92,17 @@ cdef class Judged:
         cdef double* w
         cdef double* e
         cdef Room room
-        cdef double* x = NULL
+        cdef view_t v = p.view()
         cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
         self.data = p
         self.impulse = impulse
         self.both = both = np.empty(2 * m + 1)
         w = &both[0]
         e = w + m
-        if p.blocks.n_rows > 0 and p.is_general:
-            room = room_for((<Py_ssize_t>p.general.n + m) * sizeof(double))
-            x = <double*>room.at
+        if m > 0:
+            room = room_for(scratch_of(&v) * sizeof(double))
             with nogil:
-                general_judge(&p.blocks, &p.general, &lam[0], w, e, x, True, &s)
-        elif p.blocks.n_rows > 0:
-            if p.factored:
-                room = room_for(12 * <Py_ssize_t>p.rows.n_bodies * sizeof(double))
-                x = <double*>room.at
-            with nogil:
-                judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &lam[0], w, e, x, True, &s)
+                judge_view(&v, &lam[0], w, e, <double*>room.at, True, &s)
         self.energy = s.energy if s.finite else 1.0 / 0.0
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
@@ -190,28 +172,15 @@ def begin(Data p, bint vanished):
     Both are 0 where `vanished`: d of a row is a stand-in for products that are not zero, and nothing can be measured.
     """
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef bint moves = False
-    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    cdef view_t v = p.view()
     cdef double[::1] x
     cdef double out[3]
-    cdef Room room
-    cdef double* w
+    cdef Room room = room_for((2 * m + scratch_of(&v)) * sizeof(double))
+    cdef double* w = <double*>room.at
     start = np.zeros(m)
-    if m > 0:
-        x = start
-        room = room_for((3 * m + (p.general.n if p.is_general else 6 * <Py_ssize_t>p.rows.n_bodies)) * sizeof(double))
-        w = <double*>room.at
-        moves = do_nothing(&p.blocks, &x[0], w)
-        if not moves:
-            score_rows(&p.blocks, &x[0], w, w + m, &s)
-        elif p.is_general:
-            general_judge(&p.blocks, &p.general, &x[0], w, w + m, w + 2 * m, False, &s)
-        else:
-            judge_into(&p.blocks, &p.csr, &p.rows, p.factored, &x[0], w, w + m, w + 2 * m, False, &s)
-        if moves:
-            s.finite = s.finite and are_numbers(w, p.blocks.n_rows)
+    x = start
+    judge_nothing(&v, &x[0] if m else NULL, w, w + m, w + 2 * m, vanished, out)
     start.setflags(write=False)
-    reference_of(&p.blocks, &s, moves, vanished, out)
     p.set_start(out[0], out[1])
     p.start_relative = out[2]
     return start

@@ -26,14 +26,19 @@ cdef struct score_t:
 cdef struct tally_t:            # plain sums and squares: kept where they can neither have over- nor underflown
     double energy               # sum (d e) e, for e^2 alone may vanish beside a d of 1e160
     double fast                 # max (d e) (nu e)
-    double floor_energy         # sum (F / d) F
-    double floor_fast           # max nu (F / d) F
     int32_t worst
 
 
 cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
     double scale
     double ssq
+
+
+cdef struct floor_t:            # of F, what rounding leaves of a slack
+    double energy               # sum (F / d) F
+    double fast                 # max nu (F / d) F
+    sum_t total                 # sum F^2 / d, scaled: neither over- nor underflows
+    double big                  # max F sqrt(nu / d)
 
 
 cdef inline double unit_roundoff() noexcept nogil:
@@ -83,8 +88,6 @@ cdef inline tally_t nothing() noexcept nogil:
     cdef tally_t s
     s.energy = 0.0
     s.fast = -1.0
-    s.floor_energy = 0.0
-    s.floor_fast = 0.0
     s.worst = -1
     return s
 
@@ -147,15 +150,6 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
         tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
     else:
         tally_contact(p, j, n_tangents(p.kind[i], end - j), n_apart(p.kind[i], end - j), e, s)
-
-
-cdef inline void tally_floor(const blocks_t* p, int32_t k, double size, tally_t* s) noexcept nogil:
-    # size = (|A| |lam|)_k
-    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t = f / p.d[k]
-    s.floor_energy += t * f
-    t = p.nu[k] * t * f
-    if t > s.floor_fast:
-        s.floor_fast = t
 
 
 cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
@@ -244,9 +238,30 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
     velocity[0] = big
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t i, double size, sum_t* total, double* big) noexcept nogil:
-    cdef double f = unit_roundoff() * (size + fabs(p.b[i])), v
-    add_square(total, f / sqrt(p.d[i]))
-    v = f * (sqrt(p.nu[i]) / sqrt(p.d[i]))
-    if v > big[0]:
-        big[0] = v
+cdef inline floor_t no_floor() noexcept nogil:
+    return floor_t(0.0, 0.0, sum_t(0.0, 0.0), 0.0)
+
+
+cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint scaled, floor_t* s) noexcept nogil:
+    """What rounding leaves of row k, size = (|A| |lam|)_k; all rows, and once more, scaled, where `floor_ends` says no."""
+    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t
+    if scaled:
+        add_square(&s.total, f / sqrt(p.d[k]))
+        t = f * (sqrt(p.nu[k]) / sqrt(p.d[k]))
+        if t > s.big:
+            s.big = t
+        return
+    t = f / p.d[k]
+    s.energy += t * f
+    t = p.nu[k] * t * f
+    if t > s.fast:
+        s.fast = t
+
+
+cdef inline bint floor_ends(const floor_t* s, const bint scaled, score_t* out) noexcept nogil:
+    """The floor entries of out; False where plain sums have left the range of squares."""
+    if not scaled and not is_plain(s.energy, s.fast):
+        return False
+    out.floor_energy = root(&s.total) if scaled else sqrt(s.energy)
+    out.floor_velocity = s.big if scaled else sqrt(s.fast)
+    return True

@@ -17,11 +17,8 @@ On the last three the best iterate is put back. A check costs about one sweep.
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport blocks_t
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport rows_t
-from lavender_ext.judge.measure cimport general_judge, judge_into
+from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.measure cimport judge_view
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
 from lavender_ext.judge.score cimport are_numbers, relative, score_t
 
@@ -49,7 +46,7 @@ cdef struct watch_t:
     double* best                # (m) N s
     double* w                   # (m) scratch
     double* e                   # (m) scratch
-    double* v                   # (n_bodies, 12) scratch, of J and M (nv + m)
+    double* v                   # `scratch_of`
     progress_t progress
 
 
@@ -98,21 +95,12 @@ cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcep
     return <int32_t>(n if n < most else most)
 
 
-cdef inline void look(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g,
-                      int32_t factored, const double* lam, int32_t floor, score_t* out) noexcept nogil:
-    """The judge's pass, over J and M where g is given."""
-    if g != NULL:
-        general_judge(p, g, lam, s.w, s.e, s.v, floor, out)
-    else:
-        judge_into(p, a, r, factored, lam, s.w, s.e, s.v, floor, out)
-
-
-cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* g,
-                          int32_t factored, double* lam, double tol) noexcept nogil:
+cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) noexcept nogil:
     """One check; sets the sweeps of the next."""
     cdef score_t x
+    cdef const blocks_t* p = &v.p
     cdef double now, floor, inf = 1.0 / 0.0
-    look(s, p, a, r, g, factored, lam, 0, &x)
+    judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else inf
     if now <= tol and not are_numbers(s.w, p.n_rows):
         now = inf
@@ -135,7 +123,7 @@ cdef inline int32_t check(watch_t* s, const blocks_t* p, const csr_t* a, const r
             copy(s.best, lam, p.n_rows)
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
-        look(s, p, a, r, g, factored, s.best, 1, &x)
+        judge_view(v, s.best, s.w, s.e, s.v, True, &x)
         floor = against_start(s, x.floor_energy, x.floor_velocity)
         if s.best_relative <= 2.0 * floor and floor < inf:
             copy(s.best, lam, p.n_rows)
@@ -159,13 +147,11 @@ cdef inline bint begins_again(watch_t* s, int32_t patience) noexcept nogil:
     return True
 
 
-cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* a, const rows_t* r,
-                              const generalized_t* g, int32_t factored, const double* lam, double tol,
-                              int32_t status) noexcept nogil:
+cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* lam, double tol, int32_t status) noexcept nogil:
     """The claim `status`, judged in another form: what does not hold there goes on, or has stalled."""
     cdef score_t x
     cdef double now, floor
-    look(s, p, a, r, g, factored, lam, status == AT_FLOOR, &x)
+    judge_view(v, lam, s.w, s.e, s.v, status == AT_FLOOR, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else 1.0 / 0.0
     if now <= tol:
         return CONVERGED
@@ -175,10 +161,43 @@ cdef inline int32_t confirmed(const watch_t* s, const blocks_t* p, const csr_t* 
     return AT_FLOOR if now <= 2.0 * floor and floor < 1.0 / 0.0 else STALLED
 
 
+cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, double* lam, double tol, int32_t* step) noexcept nogil:
+    """A check, where one is due; the sweeps until the next into step, where these are fewer. tol = 0 checks nothing.
+
+    confirm: the same problem in another form, which a claim must hold in too, or NULL.
+    """
+    cdef int32_t status = RUNNING
+    if not tol > 0.0:
+        return RUNNING
+    if s.total == s.check_at:
+        status = check(s, v, lam, tol)
+        if confirm != NULL and (status == CONVERGED or status == AT_FLOOR):
+            status = confirmed(s, confirm, lam, tol, status)
+    if s.check_at - s.total < step[0]:
+        step[0] = s.check_at - s.total
+    return status
+
+
+cdef inline int32_t watched(watch_t* s, const view_t* v, const view_t* confirm, sweep_t sweep, void* context, double* lam,
+                            int32_t n, double tol, int32_t* done) noexcept nogil:
+    """n sweeps, fewer where a check ends them; counts them in `done`."""
+    cdef int32_t step, status
+    done[0] = 0
+    while done[0] < n:
+        step = n - done[0]
+        status = due(s, v, confirm, lam, tol, &step)
+        if status != RUNNING:
+            return status
+        sweep(context, lam, s.total == 0, step)
+        done[0] += step
+        s.total += step
+    return RUNNING
+
+
 cdef class Watch:
-    cdef Data data
-    cdef Data confirm           # or None
-    cdef watch_t state
     cdef object keep
-    cdef int32_t check_now(self, double* lam, double tol) noexcept nogil
+    cdef view_t view
+    cdef view_t other
+    cdef const view_t* confirm  # the other, or NULL
+    cdef watch_t state
     cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil

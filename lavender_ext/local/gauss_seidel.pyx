@@ -109,51 +109,6 @@ cdef public void lav_prepare_general(const blocks_t* p, const generalized_t* o, 
         prepare_block(p, i, W, 0, g + start[i])
 
 
-cdef public double lav_block_sweeps_general(const blocks_t* p, const generalized_t* o, const int32_t* start,
-                                            const double* g, double* lam, double* u, int32_t* order, int32_t split,
-                                            int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps over (3), u (nv) = Y^T lam."""
-    cdef int32_t s, q, i
-    cdef double fallbacks = 0
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_general_block(p, o, i, g + start[i], lam, u)
-    return fallbacks
-
-
-cdef public double lav_block_sweeps_csr(const blocks_t* p, const csr_t* a, const int32_t* start, const double* g,
-                                        double* lam, int32_t* order, int32_t split, int32_t mode, uint64_t* rng,
-                                        int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps over (1), order as in lav_pgs_sweeps; returns how often a block fell back."""
-    cdef int32_t s, q, i
-    cdef double fallbacks = 0
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_csr_block(p, a, i, g + start[i], lam)
-    return fallbacks
-
-
-cdef public double lav_block_sweeps_rows(const blocks_t* p, const rows_t* r, const int32_t* start, const double* g,
-                                         double* lam, double* v, int32_t* order, int32_t split, int32_t mode,
-                                         uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps over (2), v (n_bodies, 6) = M^-1 J^T lam."""
-    cdef int32_t s, q, i
-    cdef double fallbacks = 0
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for q in range(p.n_blocks):
-            i = order[q]
-            fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
-    return fallbacks
-
-
 def prepare(Data p):
     """(start (k,) int32, numbers) of every block, for the sweeps."""
     cdef int32_t[::1] start = np.zeros(p.blocks.n_blocks + 1, np.int32)
@@ -178,7 +133,7 @@ cdef struct context_t:          # what a sweep needs besides lam
     const generalized_t* general        # NULL but for J and M
     const int32_t* start
     const double* g
-    double* velocity            # (n_bodies, 6) where factored
+    double* velocity            # v (n_bodies, 6) of (2), u (nv) of (3)
     int32_t* order
     int32_t split
     int32_t mode
@@ -187,16 +142,21 @@ cdef struct context_t:          # what a sweep needs besides lam
 
 
 cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps, order as in lav_pgs_sweeps; counts how often a block fell back."""
     cdef context_t* c = <context_t*>context
-    if c.general != NULL:
-        c.fallbacks += lav_block_sweeps_general(c.blocks, c.general, c.start, c.g, lam, c.velocity, c.order, c.split,
-                                                c.mode, c.rng, first_sweep, n)
-    elif c.csr == NULL:
-        c.fallbacks += lav_block_sweeps_rows(c.blocks, c.rows, c.start, c.g, lam, c.velocity, c.order, c.split, c.mode,
-                                             c.rng, first_sweep, n)
-    else:
-        c.fallbacks += lav_block_sweeps_csr(c.blocks, c.csr, c.start, c.g, lam, c.order, c.split, c.mode, c.rng,
-                                            first_sweep, n)
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t s, q, i
+    for s in range(n):
+        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
+        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, p.n_blocks, c.rng)
+        for q in range(p.n_blocks):
+            i = c.order[q]
+            if c.general != NULL:
+                c.fallbacks += solve_general_block(p, c.general, i, c.g + c.start[i], lam, c.velocity)
+            elif c.csr == NULL:
+                c.fallbacks += solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.velocity)
+            else:
+                c.fallbacks += solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
 
 
 def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[::1] start, const double[::1] g,

@@ -10,8 +10,9 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t
-from lavender_ext.judge.measure cimport general_judge, judge_into, relative_of
+from lavender_ext.judge.measure cimport judge_view, relative_of
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
@@ -325,12 +326,10 @@ cdef inline double judged(newton_t* n, const double* z, bint floor) noexcept nog
     """The judge's relative residual of z; what rounding leaves into n.floor."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef const problem_t* o = &n.problem
+    cdef view_t v = view_t(o.p, o.a, o.r, o.g)
     cdef double found
     impulse_of(n, z, n.lam)
-    if o.g != NULL:
-        general_judge(&o.p, o.g, n.lam, o.w, o.error, o.x, floor, &s)
-    else:
-        judge_into(&o.p, o.a, o.r, o.r != NULL, n.lam, o.w, o.error, o.x, floor, &s)
+    judge_view(&v, n.lam, o.w, o.error, o.x, floor, &s)
     found = relative_of(&s, o.w, o.p.n_rows, o.e0, o.v0)
     n.floor = relative(s.floor_energy, s.floor_velocity, o.e0, o.v0) if floor and s.finite else 0.0
     return found

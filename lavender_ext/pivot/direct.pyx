@@ -25,9 +25,9 @@ from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
 from lavender_ext.pivot.direct cimport HALVED, PASSED, SPENT, direct_t
-from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivoting_t,
-                                           pivots_correct, pivots_exchange, pivots_factor_all, pivots_on, pivots_renew,
-                                           pivots_restart, pivots_rounds, pivots_slack, pivots_solve, pivots_solve_free,
+from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivots_solve,
+                                           pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
+                                           pivots_renew, pivots_restart, pivots_rounds, pivots_slack, pivots_solve_free,
                                            pivots_start)
 
 
@@ -418,13 +418,7 @@ cdef class Pivoting:
                 raise ValueError("order must name every row once")
             if m:
                 first = &given[0]
-        v = view_t(self.judged.blocks, NULL, NULL, NULL)
-        if self.judged.is_general:
-            v.g = &self.judged.general
-        elif self.judged.factored:
-            v.r = &self.judged.rows
-        else:
-            v.a = &self.judged.csr
+        v = self.judged.view()
         # One block for the vectors and the factor: two allocations in all.
         self.reals = np.zeros(direct_real(&v, band))
         self.ints = np.zeros(direct_index(&v), np.int32)

@@ -346,8 +346,7 @@ cdef int32_t pivots_rounds(pivoting_t* s, int32_t rounds) noexcept nogil:
     return ROUNDS
 
 
-cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n,
-                                    int32_t* swept) noexcept nogil:
+cdef int32_t pivots_solve(pivoting_t* s, const double* start, int32_t sweeps, int32_t n, int32_t* swept) noexcept nogil:
     """A boxed problem: where that costs less than the sweeps all rows free first, which may be the end of it.
 
     Else `sweeps` symmetric sweeps from `start` (m), the rows free that they leave free, and at most n rounds.

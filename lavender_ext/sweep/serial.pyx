@@ -36,64 +36,12 @@ cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, 
             relax_csr_block(p, a, order[i], lam)
 
 
-cdef public void lav_pgs_general(const blocks_t* p, const generalized_t* g, double* lam, double* u, int32_t* order,
-                                 int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (1) over J and M, u (nv) = Y^T lam."""
-    cdef int32_t s, i
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for i in range(p.n_blocks):
-            relax_general_block(p, g, order[i], lam, u)
-
-
 cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
     """(1) where every block is one row and the order is as given: the same bits, without the look-ups."""
     cdef int32_t _s, i
     for _s in range(n):
         for i in range(p.n_rows):
             lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
-
-
-cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, int32_t* order,
-                                int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (4) over free rows."""
-    cdef int32_t s, i, q
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for i in range(p.n_blocks):
-            for q in range(p.ptr[order[i]], p.ptr[order[i] + 1]):
-                lam[q] = lam[q] - omega * p.step[q] * (csr_dot(a, q, lam) - p.b[q])
-
-
-cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
-                                   int32_t n) noexcept nogil:
-    """n sweeps of (3); w (m) is scratch."""
-    cdef int32_t _s, i, j, q, nt, end
-    cdef double bound
-    for _s in range(n):
-        for i in range(p.n_rows):
-            w[i] = csr_dot(a, i, lam) - p.b[i]
-        for i in range(p.n_blocks):
-            j = p.ptr[i]
-            end = p.ptr[i + 1]
-            if p.kind[i] == ROW:
-                for q in range(j, end):
-                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
-                continue
-            nt = n_tangents(p.kind[i], end - j)
-            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
-            bound = p.mu[i] * lam[j]
-            if nt > 0:
-                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
-            if n_apart(p.kind[i], end - j) & 1:
-                q = j + 1 + nt
-                bound = p.patch_radius[i] * bound
-                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
-            if p.kind[i] == CONTACT_ROLLING:
-                q = end - 2
-                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
 
 
 cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,
@@ -156,23 +104,64 @@ cdef struct context_t:          # what a sweep needs besides lam
 
 
 cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1); over J and M u (nv) = Y^T lam is in scratch."""
     cdef context_t* c = <context_t*>context
-    if c.general != NULL:
-        lav_pgs_general(c.blocks, c.general, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
-    elif c.order == NULL:
+    cdef int32_t s, i
+    if c.general == NULL and c.order == NULL:
         lav_pgs_rows_in_order(c.blocks, c.csr, lam, n)
-    else:
+        return
+    if c.general == NULL:
         lav_pgs_sweeps(c.blocks, c.csr, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+        return
+    for s in range(n):
+        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
+        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, c.blocks.n_blocks, c.rng)
+        for i in range(c.blocks.n_blocks):
+            relax_general_block(c.blocks, c.general, c.order[i], lam, c.scratch)
 
 
 cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (4) over free rows."""
     cdef context_t* c = <context_t*>context
-    lav_sor_sweeps(c.blocks, c.csr, c.omega, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t s, i, q
+    for s in range(n):
+        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
+        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, p.n_blocks, c.rng)
+        for i in range(p.n_blocks):
+            for q in range(p.ptr[c.order[i]], p.ptr[c.order[i] + 1]):
+                lam[q] = lam[q] - c.omega * p.step[q] * (csr_dot(c.csr, q, lam) - p.b[q])
 
 
 cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (3); scratch (m)."""
     cdef context_t* c = <context_t*>context
-    lav_jacobi_sweeps(c.blocks, c.csr, c.omega, lam, c.scratch, n)
+    cdef const blocks_t* p = c.blocks
+    cdef double* w = c.scratch
+    cdef int32_t _s, i, j, q, nt, end
+    cdef double bound, omega = c.omega
+    for _s in range(n):
+        for i in range(p.n_rows):
+            w[i] = csr_dot(c.csr, i, lam) - p.b[i]
+        for i in range(p.n_blocks):
+            j = p.ptr[i]
+            end = p.ptr[i + 1]
+            if p.kind[i] == ROW:
+                for q in range(j, end):
+                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
+                continue
+            nt = n_tangents(p.kind[i], end - j)
+            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
+            bound = p.mu[i] * lam[j]
+            if nt > 0:
+                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
+            if n_apart(p.kind[i], end - j) & 1:
+                q = j + 1 + nt
+                bound = p.patch_radius[i] * bound
+                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
+            if p.kind[i] == CONTACT_ROLLING:
+                q = end - 2
+                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
 
 
 cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:

@@ -163,28 +163,34 @@ cdef class Substep:
         self.size, self.real, self.index, self.keys, self.turns = size, real, index, keys, turns
         self.scratch, self.room = np.empty(1), np.empty(1)
         self.noted = np.zeros((MOST_TRACED if turns else 0, 3))
+        self._make_scratch()
+
+    cdef int _make_scratch(self) except -1:
+        # Of the first phase alone it is the same for every substep.
+        cdef int32_t n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
+        if n < 0:
+            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
+        if 2 * self.scratch.shape[0] < n:
+            self.scratch = np.empty(n)
+        return 0
 
     def solve(self, double tol):
         """After `prepare` and `solve(False)`: (how it ended, sweeps, factorisations, relative residual)."""
         cdef int32_t how, n
         cdef double* trace = NULL
-        n = lav_newton_index_room(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns)
-        self.scratch = self._grown(self.scratch, n, 2)
-        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns,
-                            <int32_t*>&self.scratch[0])
-        self.room = self._grown(self.room, n, 1)
         if self.turns:
             trace = &self.noted[0, 0]
+            self._make_scratch()
+        n = lav_newton_plan(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], self.turns,
+                            <int32_t*>&self.scratch[0])
+        if n < 0:
+            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
+        if self.room.shape[0] < n:
+            self.room = np.empty(n + n // 4)
         with nogil:
             how = lav_newton_substep(&self.size[0], &self.real[0], &self.index[0], &self.keys[0], tol, self.turns,
                                      <int32_t*>&self.scratch[0], &self.room[0], trace, self.said)
         return how, <int>self.said[0], <int>self.said[1], self.said[2]
-
-    cdef double[::1] _grown(self, double[::1] room, Py_ssize_t n, int each):
-        """`room` where it holds n numbers, `each` of them in a double, else a larger one."""
-        if n < 0:
-            raise MemoryError("the substep needs more than 2^31 numbers of scratch")
-        return room if each * room.shape[0] >= n else np.empty((n + n // 4) // each + 1)
 
     @property
     def trace(self):

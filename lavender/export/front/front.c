@@ -38,6 +38,7 @@ struct lav_solver {
   int32_t *order, *empty, *marks;
   int32_t split, mode;
   uint64_t rng;
+  struct core_view_view_t read; /* as the judge reads it */
   struct judge_watch_watch_t watch;
   sweep_t step;
   void *context;
@@ -52,7 +53,7 @@ struct lav_solver {
   struct sweep_packed_packed_t pairs;
   double *pair_room;
   int32_t pairs_asked;
-  struct core_view_view_t view;
+  struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
   struct driver_driver_asked_t asked;
   struct driver_driver_room_t drive;
   int32_t driven;              /* Newton's method has begun, as `asked` says */

@@ -9,28 +9,12 @@ static const general_t *general_of(const lav_solver *s) { return (void)s, (const
 
 static void judge(lav_solver *s, const double *impulse, int32_t floor, lav_verdict *out) {
   score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
-  if (s->p.n_rows > 0)
-    judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, impulse, floor, &t);
+  if (s->p.n_rows > 0) judge_measure_judge_view(&s->read, impulse, s->watch.w, s->watch.e, s->watch.v, floor, &t);
   out->worst = t.worst;
   out->energy = t.finite ? t.energy : INFINITY;
   out->velocity = t.finite ? t.velocity : INFINITY;
   out->relative = judge_measure_relative_of(&t, s->watch.w, s->p.n_rows, s->start[0], s->start[1]);
   out->floor = floor ? judge_score_relative(t.floor_energy, t.floor_velocity, s->start[0], s->start[1]) : 0.0;
-}
-
-/* E0, V0 of doing nothing, which is left in x (m). */
-static void do_nothing(lav_solver *s, double *x) {
-  score_t t = {0.0, 0.0, 0.0, 0.0, -1, 1};
-  int32_t moves = 0;
-  if (s->p.n_rows > 0) {
-    moves = judge_measure_do_nothing(&s->p, x, s->watch.w);
-    if (!moves) judge_score_score_rows(&s->p, x, s->watch.w, s->watch.e, &t);
-    else {
-      judge_watch_look(&s->watch, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, x, 0, &t);
-      t.finite = t.finite && judge_score_are_numbers(s->watch.w, s->p.n_rows);
-    }
-  }
-  judge_measure_reference_of(&s->p, &t, moves, 0, s->start);
 }
 
 static int32_t enter(lav_solver *s) {

@@ -42,7 +42,7 @@ static int32_t prepare_accelerated(lav_solver *s) {
   s->fast.v = s->v;
   s->fast.nv = s->n_v;
   s->context = &s->fast;
-  s->step = memory == 0 ? accelerate_accelerated_nncg_step : accelerate_accelerated_anderson_step;
+  s->step = memory == 0 ? k_nncg : k_anderson;
   return LAV_OK;
 }
 
@@ -115,20 +115,12 @@ static int32_t start_newton(lav_solver *s, double tol, int32_t budget) {
   return k_start(&s->view, &s->asked, &s->drive, s->impulse);
 }
 
-static void view_of(lav_solver *s) {
-  memset(&s->view, 0, sizeof s->view);
-  s->view.p = s->p;
-  if (s->form == LAV_MATRIX) s->view.a = &s->a;
-  else if (s->form == LAV_BODIES) s->view.r = &s->r;
-  else s->view.g = &s->g;
-}
-
 static int32_t prepare_newton(lav_solver *s) {
   uint64_t from = s->used;
   int32_t how = driver_driver_ROOM;
   s->asked.method = driver_driver_NEWTON;
   s->asked.wide = LAVENDER_HAS_WIDE();
-  view_of(s);
+  s->view = s->read;
   s->driven = 0;
   if (s->p.n_rows == 0) return LAV_OK;
   if (!k_room(&s->view, &s->asked, &s->drive)) {

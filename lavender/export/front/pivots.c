@@ -22,9 +22,8 @@ static int32_t prepare_pivots(lav_solver *s) {
   }
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) t->linear = 0;
-  view_of(s);
-  real = TAKE(s, double, pivot_direct_direct_real(&s->view, band));
-  index = TAKE(s, int32_t, pivot_direct_direct_index(&s->view));
+  real = TAKE(s, double, pivot_direct_direct_real(&s->read, band));
+  index = TAKE(s, int32_t, pivot_direct_direct_index(&s->read));
   if (s->options.method == LAV_LEMKE) {
     s->table = TAKE(s, double, n * (n + 2));
     s->whole = TAKE(s, int32_t, 13 * m + 2);
@@ -33,7 +32,7 @@ static int32_t prepare_pivots(lav_solver *s) {
   t->e0 = s->start[0];
   t->v0 = s->start[1];
   t->least = 1e-13;
-  pivot_direct_direct_lay(t, &s->view, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
+  pivot_direct_direct_lay(t, &s->read, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
   return LAV_OK;
 }
 

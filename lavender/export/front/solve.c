@@ -177,27 +177,6 @@ static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
   return is_timed(budget) && !(budget->clock(budget->clock_data) < s->deadline);
 }
 
-/* n sweeps, fewer where a check ends them; tol = 0 checks nothing. */
-static int32_t watched(lav_solver *s, int32_t n, double tol, int32_t *done) {
-  struct judge_watch_watch_t *w = &s->watch;
-  int32_t step, status;
-  *done = 0;
-  while (*done < n) {
-    step = n - *done;
-    if (tol > 0.0) {
-      if (w->total == w->check_at) {
-        status = judge_watch_check(w, &s->p, &s->a, &s->r, general_of(s), s->form == LAV_BODIES, s->impulse, tol);
-        if (status != judge_watch_RUNNING) return status;
-      }
-      if (w->check_at - w->total < step) step = w->check_at - w->total;
-    }
-    s->step(s->context, s->impulse, w->total == 0, step);
-    *done += step;
-    w->total += step;
-  }
-  return judge_watch_RUNNING;
-}
-
 /* Sweeps until a check, the budget or the clock ends them. */
 static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
   const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
@@ -212,7 +191,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
 #ifndef LAV_SWEEPS_ONLY
     pack_pairs(s, n);
 #endif
-    status = watched(s, n, budget->tol, &done);
+    status = judge_watch_watched(&s->watch, &s->read, NULL, s->step, s->context, s->impulse, n, budget->tol, &done);
     out->iterations += done;
 #ifndef LAV_SWEEPS_ONLY
     if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
@@ -409,7 +388,12 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else code = fill_velocities(s, q);
 #endif
   if (code != LAV_OK) return code;
-  do_nothing(s, s->impulse);
+  memset(&s->read, 0, sizeof s->read);
+  s->read.p = s->p;
+  if (q->form == LAV_MATRIX) s->read.a = &s->a;
+  else if (q->form == LAV_BODIES) s->read.r = &s->r;
+  else s->read.g = general_of(s);
+  judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, 0, s->start);
   if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);
   else carry(s);
 #ifndef LAV_SWEEPS_ONLY
