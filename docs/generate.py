@@ -190,7 +190,7 @@ def abilities(spec):
     }
     yes = {
         "impulse": "starts from `impulse=`",
-        "order": "`order=`",
+        "order": "`order=`, `ground=`",
         "seed": "`seed=`",
         "threads": '`threads=` (with `order="colored"`)',
         "callback": "`callback=`",

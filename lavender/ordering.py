@@ -60,44 +60,52 @@ class Order:
         return replace(self, blocks=self.blocks.copy(), rng=self.rng.copy())
 
 
-def block_order(problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0) -> Order:
+def block_order(
+    problem: Problem, order: str | Sequence[int] | Any = "given", *, seed: int = 0, ground: Any = None
+) -> Order:
     """Order of a problem's blocks.
 
     Parameters
     ----------
     order : str or int array (k,)
     seed : int, only with "random"
+    ground : int array, only with "bottom_up" / "top_down" on a matrix
+        Blocks that touch the ground; with rows the static bodies are known.
 
     Raises
     ------
     UnknownName
         No such order.
     InputError
-        Not a permutation; a seed that nothing draws with.
+        Not a permutation; ground given where it is not used, or out of range.
     CapabilityError
-        Levels of a problem without bodies.
+        Levels of a matrix without `ground`.
     """
     k = problem.n_blocks
     split = 0 if problem.rows is None else problem.rows.n_joints
-    if type(order) is str and order == "given" and type(seed) is int and seed == 0:
+    if type(order) is str and order == "given" and ground is None and type(seed) is int and seed == 0:
         return Order(np.arange(k, dtype=np.int32), split, GIVEN, np.zeros(1, np.uint64), is_given=True)
     rng = np.array([whole_number("seed", seed, high=None) % 2**64], np.uint64)
     if seed and not (isinstance(order, str) and order == "random"):
         raise InputError(f"seed={seed} goes with order='random'; no other order draws lots")
     if not isinstance(order, str):
+        if ground is not None:
+            raise InputError("ground= goes with bottom_up and top_down, not with an array of blocks")
         blocks = as_array("order", order, (k,), dtype=np.int32).copy()
         if not np.array_equal(np.sort(blocks), np.arange(k)):
             raise InputError(f"order must hold every block from 0 to {k - 1} once")
         return Order(blocks, k, GIVEN, rng)
     if order not in ORDERS:
         raise UnknownName("order", order, ORDERS)
+    if ground is not None and order not in ("bottom_up", "top_down"):
+        raise InputError(f"ground= goes with bottom_up and top_down, not with {order!r}")
     blocks = np.arange(k, dtype=np.int32)
     if order == "given":
         return Order(blocks, split, GIVEN, rng, is_given=True)
     if order == "reverse":
         blocks = np.concatenate([blocks[:split][::-1], blocks[split:][::-1]])
     elif order in ("bottom_up", "top_down"):
-        level = levels(problem)
+        level = levels(problem, ground)
         if order == "top_down":
             level = level.max(initial=0) - level
         blocks = _by_key(level, split)[0]
@@ -128,13 +136,33 @@ def _block_bodies(problem: Problem) -> IntArray:
     return np.ascontiguousarray(np.concatenate([rows.joint_body, rows.contact_body]), np.int32)
 
 
-def levels(problem: Problem) -> IntArray:
-    """Level (k,) of each block: its distance from the static bodies."""
-    if problem.rows is None:
+def levels(problem: Problem, ground: Any = None) -> IntArray:
+    """Level (k,) of each block: distance from the static bodies, or from the blocks `ground` through A."""
+    k = problem.n_blocks
+    if problem.rows is not None:
+        if ground is not None:
+            raise InputError(
+                "ground= is for problems given as a matrix; with rows the static bodies are known"
+            )
+        return body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
+    if ground is None:
         raise CapabilityError(
-            "levels from the ground up need bodies (Problem.from_rows); give an order as an array of blocks"
+            "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
         )
-    return body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
+    ground = as_array("ground", ground, (None,), dtype=np.int32)
+    if ground.size and (ground.min() < 0 or ground.max() >= k):
+        raise InputError(f"ground names block {ground.max()}; there are {k} blocks")
+    graph = _block_graph(problem)
+    level = np.full(k, -1, np.int32)
+    front = np.unique(ground)
+    depth = 0
+    while len(front):
+        level[front] = depth
+        depth += 1
+        reached = np.unique(graph[front].indices)
+        front = reached[level[reached] < 0]
+    level[level < 0] = depth
+    return level
 
 
 # Mean difference of two body numbers up to which numbers count as near: velocities of 48 bytes each, so that those

@@ -107,7 +107,7 @@ class SolverSpec:
     exact: bool = False  # finite or to rounding, not to tol
     resumable: bool = True
     impulse: bool = True  # a warm start changes what it does
-    order: bool = False  # takes order=
+    order: bool = False  # takes order= and ground=
     seed: bool = False  # takes seed=
     threads: bool = False  # takes threads=
     callback: bool = True  # takes callback=; needs resumable
@@ -153,7 +153,10 @@ class SolverSpec:
     @property
     def accepts(self) -> frozenset[str]:
         """Options beyond those of the front door."""
-        return frozenset(self.options) | {o for o in ("order", "seed", "threads") if getattr(self, o)}
+        shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
+        return frozenset(self.options) | {
+            o for flag, names in shared.items() if getattr(self, flag) for o in names
+        }
 
     def missing(self) -> str | None:
         """None when the solver can run here, else what to install."""

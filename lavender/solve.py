@@ -159,7 +159,7 @@ class Prepared:
         self._given, problem = problem, problem.disk
         for name in options:
             if name not in spec.accepts:
-                if name in ("order", "seed", "threads") or name in FRONT_DOOR:
+                if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
                     raise CapabilityError(
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"

@@ -19,7 +19,7 @@ from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_O
 
 @dataclass(frozen=True)
 class Anderson(Accelerated):
-    """Anderson-accelerated sweeps; `order`, `seed` as in `lavender.ordering`."""
+    """Anderson-accelerated sweeps; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
     memory: int = 5
 

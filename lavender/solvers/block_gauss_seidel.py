@@ -38,7 +38,7 @@ class BlockState(SweepState):
 
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
-    """Block Gauss-Seidel; `order`, `seed` as in `lavender.ordering`."""
+    """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
     def _state(self, problem: Problem, order: Order, before: BlockState | None) -> BlockState:
         return BlockState(problem, swept(problem), order)

@@ -10,7 +10,7 @@ from lavender.solvers.sor import SOR
 
 @dataclass(frozen=True)
 class GaussSeidel(SOR):
-    """Gauss-Seidel; `order`, `seed` as in `lavender.ordering`."""
+    """Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
     omega: float = field(default=1.0, init=False)
 

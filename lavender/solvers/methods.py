@@ -375,7 +375,7 @@ def make(
 
 
 def first_turn(found: list[Candidate], planned: tuple[str, int] | None = None) -> None:
-    """What the compiled call for few rows does, which another thread has in hand or did not end it, or what is planned.
+    """Settle who goes first, whatever it costs: what is planned, or Newton's method on few rows over velocities.
 
     `planned`: who has the first turn, and for how many iterations.
     """

@@ -26,7 +26,7 @@ RESTARTS = ("growth", "against")
 
 @dataclass(frozen=True)
 class NNCG(Accelerated):
-    """Nonsmooth nonlinear conjugate gradients; `order`, `seed` as in `lavender.ordering`."""
+    """Nonsmooth nonlinear conjugate gradients; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
     restart: str = "growth"
 

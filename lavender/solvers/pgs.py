@@ -35,7 +35,7 @@ class PGSState(SweepState):
 
 @dataclass(frozen=True)
 class PGS(Threaded):
-    """Projected Gauss-Seidel; `order`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
+    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
 
     def run(
         self, state: PGSState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None

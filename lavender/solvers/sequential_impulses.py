@@ -63,7 +63,7 @@ class ImpulseState(SweepState):
 
 @dataclass(frozen=True)
 class SequentialImpulses(Threaded):
-    """Matrix-free projected Gauss-Seidel; `order`, `seed` as in `lavender.ordering`;
+    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`;
     `threads` with "colored".
     """
 

@@ -148,11 +148,12 @@ class Sweeping:
     """Options and life cycle of a sweep solver over A in compressed rows."""
 
     order: Any = "given"
+    ground: Any = None
     seed: int = 0
 
     def prepare(self, problem: Problem) -> Any:
         """The state at the first sweep; its order is found anew."""
-        order = block_order(problem, self.order, seed=self.seed)
+        order = block_order(problem, self.order, seed=self.seed, ground=self.ground)
         return self._state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:

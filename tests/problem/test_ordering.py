@@ -72,8 +72,11 @@ def test_levels_count_from_the_ground():
     np.testing.assert_array_equal(levels(problem), shuffled)
     np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
     np.testing.assert_array_equal(shuffled[block_order(problem, "top_down").blocks], np.arange(n)[::-1])
-    with pytest.raises(lv.CapabilityError, match="need bodies"):
-        block_order(as_matrix(problem), "bottom_up")
+    matrix = as_matrix(problem)
+    ground = np.flatnonzero(shuffled == 0)
+    np.testing.assert_array_equal(levels(matrix, ground), shuffled)
+    with pytest.raises(lv.CapabilityError, match="ground"):
+        block_order(matrix, "bottom_up")
 
 
 def test_symmetric_is_forwards_then_backwards():
@@ -118,6 +121,9 @@ REFUSED = {
     "too few": ({"order": [0, 1]}, lv.InputError, "shape"),
     "negative seed": ({"order": "random", "seed": -1}, lv.InputError, "seed"),
     "a seed that nothing draws": ({"order": "reverse", "seed": 3}, lv.InputError, "random"),
+    "ground that nothing uses": ({"order": "reverse", "ground": [0]}, lv.InputError, "ground"),
+    "ground of an array": ({"order": [2, 1, 0], "ground": [0]}, lv.InputError, "ground"),
+    "ground out of range": ({"order": "bottom_up", "ground": [3]}, lv.InputError, "3 blocks"),
 }
 
 

@@ -129,6 +129,16 @@ def test_the_chapter_names_examples_tests_and_functions_that_exist():
         assert file in text
 
 
+def test_every_test_that_a_page_names_exists():
+    sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
+    known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(
+        re.findall(r"def (test_\w+)", sources)
+    )
+    for page in PAGES:
+        named = set(re.findall(r"\btest_\w+", page.read_text(encoding="utf-8")))
+        assert named <= known, f"{page.name} names {sorted(named - known)}"
+
+
 def test_the_readme_lists_every_example():
     listed = set(re.findall(r"`examples/(\w+\.py)`", (ROOT / "README.md").read_text(encoding="utf-8")))
     assert listed == {path.name for path in (ROOT / "examples").glob("*.py")}

@@ -11,7 +11,7 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender.certificates import check_certificate
 from lavender.lu import sparse_lu
-from lavender.solvers.pivoting import PivotState
+from lavender.solvers.pivoting import DenseFactor, PivotState
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import direct, principal
 from lavender_ext.pivot.principal import SMALL
@@ -421,6 +421,25 @@ def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
     solution = lv.solve(problem, "direct", tol=1e-9)
     assert solution.success, solution
     assert solution.work["factorisations"] <= 2
+
+
+def test_ctrl_c_between_two_rounds_gives_the_best_of_them(monkeypatch):
+    rng, m = np.random.default_rng(1), 150
+    g = rng.normal(size=(m, m // 2))
+    b, low, high = rng.normal(size=m), -np.abs(rng.normal(size=m)), np.abs(rng.normal(size=m))
+    problem = lv.Problem.lcp(g @ g.T, b, low, high)
+    factor, calls = DenseFactor.factor, []
+
+    def interrupted(self, *given):
+        calls.append(self)
+        if len(calls) == 90:
+            raise KeyboardInterrupt
+        return factor(self, *given)
+
+    monkeypatch.setattr(DenseFactor, "factor", interrupted)
+    solution = lv.solve(problem, "direct", tol=1e-14, impulse=10.0 * np.ones(m))
+    assert solution.status is lv.Status.INTERRUPTED and len(calls) == 90
+    assert solution.residual.relative < 0.01  # of the start 885
 
 
 def test_a_panel_that_lost_a_pivot_is_counted_and_named():

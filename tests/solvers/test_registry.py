@@ -45,7 +45,7 @@ def test_what_cannot_be_resumed_has_no_callback_and_no_history():
 def test_accepted_options_are_its_own_and_those_of_its_capabilities():
     plain = dataclasses.replace(SPEC, order=False, seed=False, threads=False, options={"omega": "damping"})
     assert plain.accepts == {"omega"}
-    assert dataclasses.replace(plain, order=True).accepts == {"omega", "order"}
+    assert dataclasses.replace(plain, order=True).accepts == {"omega", "order", "ground"}
     assert dataclasses.replace(plain, seed=True, threads=True).accepts == {"omega", "seed", "threads"}
 
 

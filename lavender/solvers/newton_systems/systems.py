@@ -140,7 +140,7 @@ class MatrixSystem(System):
             a = a[solve.keep][:, solve.keep]
         self.symmetric = problem.is_symmetric
         self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, not solve.has_friction) and m <= DENSE_LIMIT)
-        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `_rates.py` has them.
+        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `weights.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
