@@ -70,7 +70,7 @@ def solve_many(
     check_budget(spec, tol, max_iter, options.get("time_limit"))
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
-    together = spec.few is not None and spec.few.gate is not None and spec.own and not options
+    together = spec.own and spec.few is not None and spec.few.gate is not None and not options
     together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     at = [
         i

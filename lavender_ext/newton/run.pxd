@@ -274,7 +274,8 @@ cdef inline double* furnish(newton_t* n, const csr_t* a, const rows_t* r, double
             n.s.bt = NULL
     if n.sc.e.n == n.sc.e.m:
         n.s.bt = NULL
-    n.s.e, n.s.f, n.s.others = &n.sc.e, &n.blocks, NULL
+    n.s.e, n.s.f = &n.sc.e, &n.blocks
+    n.s.others = NULL
     n.s.wide = n.s.augmented = n.s.factorisations = n.without = 0
     return x + 5 * small
 
