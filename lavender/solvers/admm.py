@@ -295,7 +295,12 @@ class ADMM:
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: AdmmState | str, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: AdmmState | str,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         """n iterations, or fewer where a check ends them."""
         if isinstance(state, str):
@@ -324,7 +329,7 @@ class ADMM:
                     state.factor = state._factor()
 
         try:
-            result = claim(*state.watch.run_python(iterate, impulse, n, tol))
+            result = claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
         except _Failed as failure:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
         except _TooLate:

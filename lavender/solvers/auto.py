@@ -76,31 +76,31 @@ class Auto:
             state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
 
     def run(
-        self, state: State, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem = state.problem
         deadline = Deadline(time_limit)
-        if n >= ONE_CALL and state.call:
+        if max_iter >= ONE_CALL and state.call:
             made = AUTO.solve(problem, impulse, tol)
             claim = None if made is None else AUTO.claim(problem, made[1], impulse, made[0].relative)
-            if made is not None and claim is not None and claim.iterations <= n:
+            if made is not None and claim is not None and claim.iterations <= max_iter:
                 impulse[:] = made[0].impulse
                 return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        log = SolveLog(problem, tol, n, deadline)
+        log = SolveLog(problem, tol, max_iter, deadline)
         log.offer(impulse)
         if log.best > 1.0:
             log.given = impulse.copy() if log.best < STALE else None
             log.offer(problem.start())  # doing nothing is better
         interrupted = False
         try:
-            if n > 0 and log.best > tol:
+            if max_iter > 0 and log.best > tol:
                 solve(log, self.plan, state.sweeps)
         except KeyboardInterrupt:
             interrupted = True  # the best impulse goes back all the same
         impulse[:] = log.impulse
-        nothing = "no time for anything" if n > 0 else "no iterations were asked for"
+        nothing = "no time for anything" if max_iter > 0 else "no iterations were asked for"
         if log.best <= tol:
             nothing = "the start is a solution"
         return Claim(

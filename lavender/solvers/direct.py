@@ -90,12 +90,17 @@ class Direct:
         return self.prepare(problem, state.pivot)
 
     def run(
-        self, state: DirectState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: DirectState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
-        run = _Run(state, impulse, n, tol, Deadline(time_limit), self)
+        run = _Run(state, impulse, max_iter, tol, Deadline(time_limit), self)
         if state.problem.m == 0:
             return run.claim(Status.CONVERGED)
-        if n == 0:
+        if max_iter == 0:
             return run.claim(Status.MAX_ITERATIONS)
         try:
             if state.general is not None:
@@ -148,7 +153,7 @@ class _Run:
         self,
         state: DirectState,
         impulse: FloatArray,
-        n: int,
+        max_iter: int,
         tol: float,
         deadline: Deadline,
         solver: Direct,
@@ -156,7 +161,8 @@ class _Run:
         self.patient = solver.patience
         # Relative residual that is good whatever the floor.
         self.least = GOOD if solver.exact else max(GOOD, tol)
-        self.state, self.problem, self.impulse, self.budget, self.tol = state, state.problem, impulse, n, tol
+        self.state, self.problem, self.impulse = state, state.problem, impulse
+        self.max_iter, self.tol = max_iter, tol
         self.deadline = deadline
         self.kept: measure.Judged | None = None
         self.iterations = 0
@@ -202,7 +208,7 @@ class _Run:
     def left(self) -> int:
         """Rounds left in this call of the kernel."""
         assert self.state.pivot is not None
-        return min(BATCH, self.budget - int(self.state.pivot.rows.n_rounds))
+        return min(BATCH, self.max_iter - int(self.state.pivot.rows.n_rounds))
 
     @property
     def spent(self) -> bool:
@@ -310,7 +316,7 @@ class _Run:
         return self.after_passes(pivot, ended)
 
     def rounds(self, pivot: PivotState) -> int:
-        """All rows free, or those that sweeps leave free, then exchanges; within the budget and the time."""
+        """All rows free, or those that sweeps leave free, then exchanges; within max_iter and the time."""
         rows = pivot.rows
         code: int = self.state.outcome
         if self.problem.law == "linear":
@@ -368,7 +374,7 @@ class _Run:
     def out_of_budget(self) -> Claim:
         if not self.best <= 1.0:
             self.judge(self.problem.start())
-        return self.claim(Status.TIME_LIMIT if self.iterations < self.budget else Status.MAX_ITERATIONS)
+        return self.claim(Status.TIME_LIMIT if self.iterations < self.max_iter else Status.MAX_ITERATIONS)
 
     def indefinite(self, symmetric: bool = True) -> Claim:
         why = "A is indefinite" if symmetric else "A is not symmetric, and singular under every shift,"

@@ -220,13 +220,18 @@ class Lemke:
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: LemkeState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: LemkeState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         deadline = Deadline(time_limit)
         form = state.formed(time_limit)
         if form is None:
             return _too_late()
-        return Walk(form, impulse).go(impulse, n, tol, Deadline(deadline.left(STEP)))
+        return Walk(form, impulse).go(impulse, max_iter, tol, Deadline(deadline.left(STEP)))
 
     @np.errstate(all="ignore")  # what overflows is judged
     def resume(

@@ -117,21 +117,26 @@ class Newton:
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
-        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: NewtonState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         problem, system = state.problem, state.system
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0)
         if state.general is not None:
-            return self._run_general(state, impulse, n, tol, time_limit)
-        return self._run_system(problem, system, impulse, n, tol, time_limit)
+            return self._run_general(state, impulse, max_iter, tol, time_limit)
+        return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
 
     def _run_general(
-        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None
+        self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
         problem, deadline = state.problem, Deadline(time_limit)
-        claim = general.run(problem, state.general, impulse, n, tol, time_limit)
-        left = n - claim.iterations
+        claim = general.run(problem, state.general, impulse, max_iter, tol, time_limit)
+        left = max_iter - claim.iterations
         ended = claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED)
         if ended or self.form == "velocity" or left <= 0 or problem.m > ROWS or problem.cones.has_round:
             return claim
@@ -160,7 +165,7 @@ class Newton:
         problem: Problem,
         system: System | None,
         impulse: FloatArray,
-        n: int,
+        max_iter: int,
         tol: float,
         time_limit: float | None,
     ) -> Claim:
@@ -170,12 +175,12 @@ class Newton:
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = worked = 0
         if self.form == "auto" and problem.rows is not None:
-            tried = warm_start(problem, impulse, tol, n, time_limit)
+            tried = warm_start(problem, impulse, tol, max_iter, time_limit)
             claim, sweeps, worked = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
-        n -= worked
-        status, certificate = _turns(problem, system, impulse, n, tol, time_limit)
+        max_iter -= worked
+        status, certificate = _turns(problem, system, impulse, max_iter, tol, time_limit)
         solve = system.solve
         factorisations = worked + solve.factorisations
         message = ", ".join(
@@ -189,7 +194,7 @@ def _turns(
     problem: Problem,
     system: System,
     impulse: FloatArray,
-    n: int,
+    max_iter: int,
     tol: float,
     time_limit: float | None,
 ) -> tuple[Status, FloatArray | None]:
@@ -197,7 +202,7 @@ def _turns(
     deadline = Deadline(time_limit)
     solve, certificate = system.solve, None
     late = interrupted = False
-    solve.start(impulse, tol, n)
+    solve.start(impulse, tol, max_iter)
     try:
         while True:
             before = solve.factorisations
@@ -229,7 +234,9 @@ def _turns(
     if certificate is not None:
         return Status.INFEASIBLE, certificate
     if end == OUTCOMES["spent"]:
-        return (Status.TIME_LIMIT if late and solve.factorisations < n else Status.MAX_ITERATIONS), None
+        return (
+            Status.TIME_LIMIT if late and solve.factorisations < max_iter else Status.MAX_ITERATIONS
+        ), None
     return _ENDS[end], None
 
 

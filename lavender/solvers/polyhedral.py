@@ -168,14 +168,14 @@ class ThroughRows:
         return self.prepare(problem) if isinstance(held, Held) else self.solver.update(held, problem)
 
     def run(
-        self, held: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self, held: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         """At most n iterations; the claim is of the problem itself."""
         if not isinstance(held, Held):
-            return self.solver.run(held, impulse, n, tol, time_limit)
+            return self.solver.run(held, impulse, max_iter, tol, time_limit)
         form = held.form
         z, deadline = form.start(impulse), Deadline(time_limit)
-        claim: Claim = self.solver.run(held.state, z, n, tol, time_limit)
+        claim: Claim = self.solver.run(held.state, z, max_iter, tol, time_limit)
         claim = self._judged(form, claim, z, impulse, tol)
         other = getattr(self.solver, "otherwise", None)
         if other is None or claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
@@ -183,7 +183,7 @@ class ThroughRows:
         z = form.start(impulse)
         path = other()
         more = self._judged(
-            form, path.run(path.prepare(form.rows), z, n, tol, deadline.left(1e-3)), z, impulse, tol
+            form, path.run(path.prepare(form.rows), z, max_iter, tol, deadline.left(1e-3)), z, impulse, tol
         )
         work = {k: claim.work.get(k, 0) + more.work.get(k, 0) for k in {**claim.work, **more.work}}
         words = f"{claim.message or 'no exchange helped'}, then complementary pivots"

@@ -56,7 +56,7 @@ def run(
     problem: Problem,
     kernel: Newton,
     impulse: FloatArray,
-    n: int,
+    max_iter: int,
     tol: float,
     time_limit: float | None,
     again: bool = False,
@@ -75,11 +75,11 @@ def run(
     steps = clock = max(1, int(islands * min(CLOCK, WATCHED / slow)))  # a step is one of an island
     if time_limit is not None:
         steps = max(1, int(min(TIME_SHARE * time_limit / slow, clock)))
-    while counts[0] < n:
+    while counts[0] < max_iter:
         if deadline.passed(min(step, 1e6) - LATE):
             status = Status.TIME_LIMIT
             break
-        end, done = kernel.run(impulse, closer * tol, min(steps, n - int(counts[0])), again)
+        end, done = kernel.run(impulse, closer * tol, min(steps, max_iter - int(counts[0])), again)
         counts += done
         status = _STATUS[end]
         if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
