@@ -238,13 +238,22 @@ def test_floor_bounds_the_rounded_exact_solution(seed):
     assert judged.floor <= 1e-6
 
 
+def arms_along_axes(problem):
+    """Its contacts with arms along one axis each: |arm x n| has one product a component, as the floor counts them."""
+    rows, keep = problem.rows, np.eye(3)[np.arange(problem.rows.n_contacts) % 3]
+    return dataclasses.replace(
+        problem, rows=dataclasses.replace(rows, arm_a=rows.arm_a * keep, arm_b=rows.arm_b * keep)
+    )
+
+
+@pytest.mark.parametrize("scale", [0, 520, -520])
 @pytest.mark.parametrize(
-    "problem", [suite.case("four_bar(tilt=0.3)").problem, suite.case("ring(n=8)").problem]
+    "kind", ["four_bar(tilt=0.3)", "ring(n=8)", *(k for k in CONTACTS if k != "ellipses")]
 )
-def test_floor_of_joints_is_that_of_the_formula(problem):
-    """F = 2^-53 (|J| |M^-1| |J|^T |lam| + c |lam| + |b|), by dense matrices."""
+def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
+    """F = 2^-53 (|J| |M^-1| |J|^T |lam| + c |lam| + |b|), by dense matrices; squares of e beyond float64, too."""
+    problem = arms_along_axes(CONTACTS[kind](3)) if kind in CONTACTS else suite.case(kind).problem
     rows = problem.rows
-    assert rows.n_joints == problem.n_blocks
     lam = np.random.default_rng(0).normal(size=problem.m)
     inv_mass = block_diag(
         *(w for i in range(rows.n_bodies) for w in (rows.inv_mass[i] * np.eye(3), rows.inv_inertia[i]))
@@ -255,6 +264,11 @@ def test_floor_of_joints_is_that_of_the_formula(problem):
     found = lv.residual(problem, lam)
     energy = np.sqrt(np.sum(f**2 / problem.d)) / found.energy_start
     velocity = np.max(f * problem.metric.weight / problem.d) / found.velocity_start
+    if scale:
+        moved = dataclasses.replace(rows, v_free=rows.v_free * 2.0**scale)
+        found = lv.residual(
+            dataclasses.replace(problem, b=problem.b * 2.0**scale, rows=moved), lam * 2.0**scale
+        )
     assert found.floor == pytest.approx(max(energy, velocity), rel=1e-12)  # sums in another order
 
 
