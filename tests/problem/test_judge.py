@@ -254,22 +254,22 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
     """F = 2^-53 (|J| |M^-1| |J|^T |lam| + c |lam| + |b|), by dense matrices; squares of e beyond float64, too."""
     problem = arms_along_axes(CONTACTS[kind](3)) if kind in CONTACTS else suite.case(kind).problem
     rows = problem.rows
-    lam = np.random.default_rng(0).normal(size=problem.m)
     inv_mass = block_diag(
         *(w for i in range(rows.n_bodies) for w in (rows.inv_mass[i] * np.eye(3), rows.inv_inertia[i]))
     )
     jac = np.abs(rows.jacobian(problem.cones).toarray())
-    size = jac @ (np.abs(inv_mass) @ (jac.T @ np.abs(lam)))
-    f = 2.0**-53 * (size + problem.compliance * np.abs(lam) + np.abs(problem.b))
-    found = lv.residual(problem, lam)
-    energy = np.sqrt(np.sum(f**2 / problem.d)) / found.energy_start
-    velocity = np.max(f * problem.metric.weight / problem.d) / found.velocity_start
-    if scale:
-        moved = dataclasses.replace(rows, v_free=rows.v_free * 2.0**scale)
-        found = lv.residual(
-            dataclasses.replace(problem, b=problem.b * 2.0**scale, rows=moved), lam * 2.0**scale
-        )
-    assert found.floor == pytest.approx(max(energy, velocity), rel=1e-12)  # sums in another order
+    moved = dataclasses.replace(rows, v_free=rows.v_free * 2.0**scale)
+    c = problem.cones
+    cones = dataclasses.replace(c, lower=c.lower * 2.0**scale, upper=c.upper * 2.0**scale)
+    scaled = dataclasses.replace(problem, b=problem.b * 2.0**scale, rows=moved, cones=cones)
+    for lam in np.diag(100.0 * np.abs(problem.b).max() / problem.d):  # each row once is the one that counts
+        size = jac @ (np.abs(inv_mass) @ (jac.T @ lam))
+        f = 2.0**-53 * (size + problem.compliance * lam + np.abs(problem.b))
+        start = lv.residual(problem, lam)
+        energy = np.sqrt(np.sum(f**2 / problem.d)) / start.energy_start
+        velocity = np.max(f * problem.metric.weight / problem.d) / start.velocity_start
+        found = lv.residual(scaled, lam * 2.0**scale)
+        assert found.floor == pytest.approx(max(energy, velocity), rel=1e-12, abs=0.0)  # sums in another order
 
 
 # -- other measures --------------------------------------------------------------------------------------
