@@ -540,5 +540,5 @@ def test_what_float64_cannot_hold_is_told():
 def test_bounds_of_tiny_impulses_do_not_vanish():
     problem = lv.Problem.lcp(np.eye(2), [1e-170, 1e-170])
     error = lv.motion_error(problem, [2e-170, 1e-170])
-    assert error.energy == pytest.approx(np.sqrt(0.5) * 1e-170, rel=1e-12)
+    assert error.energy == pytest.approx(np.sqrt(0.5) * 1e-170, rel=1e-12, abs=0.0)
     assert error.bound >= error.energy
