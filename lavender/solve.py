@@ -170,15 +170,26 @@ class Prepared:
         self.problem = problem
         self._lock = Lock()
         self._fresh = True
-        if (
-            options or not spec.delegates
-        ):  # which prepares nothing: its own call for small problems comes first
+        self.setup_time = 0.0
+        # `auto` prepares nothing before its compiled call for small problems was made.
+        if options or not spec.delegates:
             self._begin()
         self.setup_time = perf_counter() - start
 
     def _begin(self) -> None:
+        start = perf_counter()
         self.solver = _make(self.spec, self.options)
-        self._set_up(self.problem, anew=True)
+        try:
+            self._set_up(self.problem, anew=True)
+        except BaseException:
+            self.solver = None  # the next call begins again
+            raise
+        self._fresh = True
+        self.setup_time += perf_counter() - start
+
+    def _replace(self, problem: Problem) -> None:
+        """Another problem in the place of the prepared one; nothing is set up for it yet."""
+        self._given, self.problem, self.solver = problem, problem.disk, None
 
     def solve(
         self,
@@ -204,15 +215,20 @@ class Prepared:
                 "make another one for every thread (lavender.prepare)"
             )
         try:
-            if self.spec.delegates and not self.options:
-                if max_iter is None and time_limit is None and callback is None and not history:
-                    made = solve_small(self._given if problem is None else problem, self.spec, impulse, tol)
-                    if made is not None:
-                        return made
-                if self.solver is None:
-                    self._begin()
+            plain = max_iter is None and time_limit is None and callback is None and not history
+            if plain and self.spec.delegates and not self.options:
+                made = solve_small(self._given if problem is None else problem, self.spec, impulse, tol)
+                if made is not None:
+                    if problem is not None and problem is not self._given:
+                        self._replace(problem)
+                    return made
             tol, max_iter, time_limit = check_budget(self.spec, tol, max_iter, time_limit)
             _check_records(self.spec, history, callback)
+            if self.solver is None:
+                if problem is not None and problem is not self._given:
+                    _check_problem(problem, self.spec)
+                    self._replace(problem)
+                self._begin()
             self._refresh(problem)
             loop = self._loop(impulse, tol, time_limit, history, callback)
             return self._run(loop, max_iter)

@@ -89,6 +89,47 @@ cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, do
     return 1
 
 
+cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, int32_t* order,
+                                int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (4) over free rows."""
+    cdef int32_t s, i, q
+    for s in range(n):
+        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
+        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        for i in range(p.n_blocks):
+            for q in range(p.ptr[order[i]], p.ptr[order[i] + 1]):
+                lam[q] = lam[q] - omega * p.step[q] * (csr_dot(a, q, lam) - p.b[q])
+
+
+cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
+                                   int32_t n) noexcept nogil:
+    """n sweeps of (3); w (m) is scratch."""
+    cdef int32_t _s, i, j, q, nt, end
+    cdef double bound
+    for _s in range(n):
+        for i in range(p.n_rows):
+            w[i] = csr_dot(a, i, lam) - p.b[i]
+        for i in range(p.n_blocks):
+            j = p.ptr[i]
+            end = p.ptr[i + 1]
+            if p.kind[i] == ROW:
+                for q in range(j, end):
+                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
+                continue
+            nt = n_tangents(p.kind[i], end - j)
+            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
+            bound = p.mu[i] * lam[j]
+            if nt > 0:
+                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
+            if n_apart(p.kind[i], end - j) & 1:
+                q = j + 1 + nt
+                bound = p.patch_radius[i] * bound
+                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
+            if p.kind[i] == CONTACT_ROLLING:
+                q = end - 2
+                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
+
+
 cdef struct context_t:          # what a sweep needs besides lam
     const blocks_t* blocks
     const csr_t* csr
@@ -121,47 +162,13 @@ cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) n
 
 
 cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (4) over free rows."""
     cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t s, i, q
-    for s in range(n):
-        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
-        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, p.n_blocks, c.rng)
-        for i in range(p.n_blocks):
-            for q in range(p.ptr[c.order[i]], p.ptr[c.order[i] + 1]):
-                lam[q] = lam[q] - c.omega * p.step[q] * (csr_dot(c.csr, q, lam) - p.b[q])
+    lav_sor_sweeps(c.blocks, c.csr, c.omega, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
 
 
 cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (3); scratch (m)."""
     cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef double* w = c.scratch
-    cdef int32_t _s, i, j, q, nt, end
-    cdef double bound, omega = c.omega
-    for _s in range(n):
-        for i in range(p.n_rows):
-            w[i] = csr_dot(c.csr, i, lam) - p.b[i]
-        for i in range(p.n_blocks):
-            j = p.ptr[i]
-            end = p.ptr[i + 1]
-            if p.kind[i] == ROW:
-                for q in range(j, end):
-                    lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
-                continue
-            nt = n_tangents(p.kind[i], end - j)
-            lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
-            bound = p.mu[i] * lam[j]
-            if nt > 0:
-                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
-            if n_apart(p.kind[i], end - j) & 1:
-                q = j + 1 + nt
-                bound = p.patch_radius[i] * bound
-                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
-            if p.kind[i] == CONTACT_ROLLING:
-                q = end - 2
-                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
+    lav_jacobi_sweeps(c.blocks, c.csr, c.omega, lam, c.scratch, n)
 
 
 cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:

@@ -129,6 +129,13 @@ def test_the_chapter_names_examples_tests_and_functions_that_exist():
         assert file in text
 
 
+def test_every_function_of_the_page_on_webassembly_is_exported():
+    sources = (path.read_text(encoding="utf-8") for path in (ROOT / "lavender_ext").rglob("*.pyx"))
+    exported = set(re.findall(r"^cdef public [\w*]+ (lav_\w+)\(", "\n".join(sources), re.MULTILINE))
+    named = set(re.findall(r"\blav_\w+", (ROOT / "docs" / "web.md").read_text(encoding="utf-8")))
+    assert named <= exported, sorted(named - exported)
+
+
 def test_every_test_that_a_page_names_exists():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py"))
     known = {path.stem for path in (ROOT / "tests").rglob("test_*.py")} | set(
@@ -137,6 +144,8 @@ def test_every_test_that_a_page_names_exists():
     for page in PAGES:
         named = set(re.findall(r"\btest_\w+", page.read_text(encoding="utf-8")))
         assert named <= known, f"{page.name} names {sorted(named - known)}"
+        for file in re.findall(r"\btests/[\w/]+\.py\b", page.read_text(encoding="utf-8")):
+            assert (ROOT / file).is_file(), f"{page.name} names {file}"
 
 
 def test_the_readme_lists_every_example():

@@ -5,10 +5,12 @@ import itertools
 
 import numpy as np
 import pytest
+from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from lavender import registry, suite
 from lavender.solution import Claim, Status
+from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
@@ -168,3 +170,34 @@ def test_what_is_no_number_of_a_budget_is_refused_of_no_problems_too(wrong):
         for problems in ([], [problem]):
             with pytest.raises(lv.InputError, match=said):
                 lv.solve_many(problems, solver, **wrong)
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])
+@pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_problem_that_replaced_the_prepared_one_stays(form, name, budget):
+    """Whichever way solves it: `auto` has a call of its own for small problems."""
+    first = FORMS[form](random_contact_problem(1, tangents=2, spin=False))
+    second = dataclasses.replace(first, b=1.7 * first.b + 0.1)
+    prepared = lv.prepare(first, name)
+    prepared.solve(second, tol=1e-8)
+    assert prepared.problem is second
+    solution = prepared.solve(tol=1e-8, **budget)
+    assert solution.residual.relative == lv.residual(second, solution.impulse).relative
+
+
+def test_a_set_up_that_was_stopped_begins_again(monkeypatch):
+    prepared = lv.prepare(suite.case("pyramidF(k=6)").problem, "auto")
+    prepare, calls = Auto.prepare, []
+
+    def stopped(self, problem):
+        calls.append(problem)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return prepare(self, problem)
+
+    monkeypatch.setattr(Auto, "prepare", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        prepared.solve(max_iter=50)
+    assert prepared.solve(max_iter=50).iterations > 0
+    assert len(calls) == 2
