@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import arrays_of, as_matrix, random_contact_problem, random_lcp, random_rows, seeds
+from random_problems import CONTACTS, arrays_of, as_matrix, random_contact_problem, random_lcp, random_rows, seeds
 
 import lavender as lv
 
@@ -414,3 +414,12 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
     for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
         assert kept is given[name]
         assert not kept.flags.writeable
+
+
+def test_impulses_of_another_kind_of_contact_are_not_carried():
+    disk, box = (CONTACTS[kind](1) for kind in ("disks", "boxes"))
+    disk, box = (replace(problem, key=None) for problem in (disk, box))
+    assert np.array_equal(disk.cones.ptr, box.cones.ptr)
+    impulse = np.ones(disk.m)
+    np.testing.assert_array_equal(disk.carry((disk, impulse)), impulse)
+    np.testing.assert_array_equal(box.carry((disk, impulse)), box.start())

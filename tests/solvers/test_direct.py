@@ -478,3 +478,17 @@ def test_auto_does_not_begin_a_factor_that_fills(even):
     assert factor.work > 1e8
     solution = lv.solve(problem, "auto", tol=1e-6)
     assert solution.success and "factorisations" not in solution.work, solution
+
+
+@pytest.mark.parametrize("bound", [np.inf, 0.05])
+@pytest.mark.parametrize(("m", "half"), [(40, 39), (60, 1), (100, 5), (900, 20)])
+def test_a_sound_factor_leaves_nothing_to_refine(m, half, bound):
+    """Refinement would hide a wrong half of a factor's solve, at the price of its work."""
+    rng = np.random.default_rng(m)
+    diagonals = [rng.normal(size=m - abs(k)) for k in range(-half, half + 1)]
+    a = sp.diags_array(diagonals, offsets=list(range(-half, half + 1)))
+    a = sp.csr_array(a + a.T)
+    a = sp.csr_array(a + sp.diags_array(4.0 * np.abs(a).sum(axis=1)))
+    solution = lv.solve(lv.Problem.lcp(a, rng.normal(size=m), -bound, bound), "direct", tol=1e-12)
+    assert solution.residual.relative < 1e-14
+    assert "refinements" not in solution.work
