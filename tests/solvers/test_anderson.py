@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from random_problems import random_lcp
 
 import lavender as lv
 
@@ -15,6 +16,16 @@ def test_anderson_is_exact_after_as_many_sweeps_as_unknowns():
     assert mixed.success
     assert mixed.iterations <= 16  # 6 in exact arithmetic; normal equations lose half the digits
     assert lv.solve(problem, "gauss_seidel", tol=1e-9, max_iter=10_000).iterations > 3 * mixed.iterations
+
+
+@pytest.mark.parametrize("memory", [1, 5, 16])
+def test_every_memory_finds_the_same_answer(memory):
+    problem = random_lcp(0, m=10)
+    solution = lv.solve(problem, "anderson", memory=memory, tol=1e-10, max_iter=100_000)
+    assert solution.success
+    # Slack is unique for positive semidefinite A; its error is about cond(A) <= 1e3 times tol.
+    exact = lv.solve(problem, "direct")
+    np.testing.assert_allclose(solution.slack, exact.slack, atol=1e-6 * np.abs(problem.b).max())
 
 
 def sweep(problem, x):
