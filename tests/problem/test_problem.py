@@ -11,7 +11,15 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
-from random_problems import CONTACTS, arrays_of, as_matrix, random_contact_problem, random_lcp, random_rows, seeds
+from random_problems import (
+    CONTACTS,
+    arrays_of,
+    as_matrix,
+    random_contact_problem,
+    random_lcp,
+    random_rows,
+    seeds,
+)
 
 import lavender as lv
 
