@@ -40,7 +40,7 @@ OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
 ALLOWED = frozenset({"sqrt", "floor", "memcpy", "memset", "memmove"})
 
 #: Standard C: no extension of a compiler without a guard, no array of variable length (MSVC has none).
-# The table of a module's Python names is one string of Cython's, of any length.
+#: The table of a module's Python names is one string of Cython's, of any length.
 DIALECT = ["-std=c11", "-pedantic", "-Wvla", "-Wall", "-Wno-unused-function", "-Wno-overlength-strings"]
 #: The plain branch of every `#if defined(__GNUC__)` of ours.
 PLAIN = ["-DLAVENDER_ONE_LANE"]

@@ -105,9 +105,8 @@ class Few:
     name: str
     gate: Gate | None  # what it may cost over generalised velocities; None: not at all
     pivots: bool  # bounded rows
-    hands_over: bool = (
-        False  # and friction; a start that is a solution is the result, a bad one is not started from
-    )
+    # And friction; a start that is a solution is the result, a bad one is not started from.
+    hands_over: bool = False
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""

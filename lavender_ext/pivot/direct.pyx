@@ -498,10 +498,6 @@ cdef class Pivoting:
         return self.t.relative
 
     @property
-    def floor(self):
-        return self.t.floor
-
-    @property
     def turn(self):
         """(m,) N s, what the last pass changed; a new array."""
         cdef Py_ssize_t at = 9 * <Py_ssize_t>self.t.s.n

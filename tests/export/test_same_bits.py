@@ -175,6 +175,19 @@ def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
     assert looked >= 3
 
 
+@pytest.mark.parametrize("method", ["direct", "lemke"])
+@pytest.mark.parametrize("n_bodies", [3, 100, 2000])
+def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_bodies):
+    rows = lv.Rows(
+        np.ones(n_bodies), np.tile(np.eye(3), (n_bodies, 1, 1)), np.ones((n_bodies, 6)),
+        jac=np.tile(np.eye(12)[6], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 1]],
+    )  # fmt: skip
+    problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
+    options, room = library.options(method), ct.c_uint64()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    assert library.c.lav_needed(library.open(problem, options).at) <= room.value
+
+
 @pytest.mark.parametrize("options", [{"memory": 2}, {"sweep": 2}, {"convex": 5}])
 def test_options_of_accelerated_sweeps(library, options):
     given = self_test_problem()
