@@ -40,6 +40,7 @@ class Curve:
     notes: tuple[str, ...] = ()  # what each point was asked for: "1e-6", "16"
     thin: bool = False  # warm starts
     steps: bool = False
+    points: bool = False  # without a line between them
     low: tuple[float, ...] = ()  # of a band about the line, as `y`
     high: tuple[float, ...] = ()
 

@@ -75,7 +75,7 @@ def _draw(axes: Any, figure: Figure, look: Mapping[str, Look]) -> None:
         k = look[c.solver]
         style: dict[str, Any] = {
             "color": k.color,
-            "linestyle": k.line,
+            "linestyle": "none" if c.points else k.line,
             "label": _plain(c.label),
             "linewidth": 0.8 if c.thin else 1.5,
         }

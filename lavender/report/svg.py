@@ -165,7 +165,7 @@ def _curve(
     # "16" for 16 iterations: the page's script says the word.
     said = "|".join(note.removesuffix(" iterations") for note in c.notes)
     asked = f' data-n="{escape(said)}"' if c.notes else ""
-    body = f'<path d="{"".join(line)}"/>'
+    body = "" if c.points else f'<path d="{"".join(line)}"/>'
     if c.low:
         edge = [f"{across(a)} {up(b)}" for a, b in zip(c.x, c.high, strict=True)]
         edge += [f"{across(a)} {up(b)}" for a, b in reversed([*zip(c.x, c.low, strict=True)])]
