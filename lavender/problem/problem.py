@@ -172,7 +172,7 @@ class Problem(Builders):
         return self._disk if self.cones.has_ellipse else self
 
     def on_disk(self, impulse: FloatArray) -> FloatArray:
-        """Impulses (m,) [N s] of this problem as those of `disk`; the largest numbers where these are beyond float64."""
+        """Impulses (m,) [N s] of this problem as those of `disk`, where that is beyond float64 the largest number."""
         if not self.cones.has_ellipse:
             return impulse
         with np.errstate(over="ignore"):
