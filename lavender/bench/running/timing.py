@@ -31,29 +31,42 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 
-__all__ = ["Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
+__all__ = ["Ask", "Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
 
 SHORT = 5e-3  # s: what took longer is not called once more for warmth
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
+class Ask:
+    """A line to time, on whatever case the solver takes."""
+
+    solver: str
+    mode: str  # "tol" | "budget" | "time"
+    tol: float
+    max_iter: int = 0  # 0: the solver's own default
+    time_limit: float = 0.0  # s, of one solve; 0: that of the plan
+    way: str = "call"  # as `Record.way`
+    start: str = "cold"
+
+
+@dataclass(frozen=True)
 class Task:
-    """One measurement to make."""
+    """One measurement to make: what an `Ask` says, on a case."""
 
     run: str
     case: str
     sha: str
     solver: str
-    mode: str  # "tol" | "budget" | "time"
+    mode: str
     tol: float
-    max_iter: int  # 0: the solver's own default
-    time_limit: float  # s, of one solve
+    max_iter: int
+    time_limit: float
     start: str = "cold"
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
-    way: str = ""  # as `Record.way`
+    way: str = ""
     turns: str = ""
     guarded: bool = True  # a solve under the time limit comes first
     lead: float = 0.0  # s, that the line takes before its call: carrying impulses
@@ -64,9 +77,9 @@ class Task:
         return measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, **what: Any) -> Task:
-        """A task on a case."""
-        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **what)
+    def of(cls, info: CaseInfo, ask: Ask, **more: Any) -> Task:
+        """What is asked for, on a case."""
+        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(ask), **more})
 
     def record(self, **what: Any) -> Record:
         """A record of this task."""
