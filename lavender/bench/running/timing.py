@@ -141,18 +141,18 @@ class Outcome:
     """What the repeats of one measurement brought, before it is judged."""
 
     impulse: FloatArray  # (m,) N s
-    status: Status
+    certificate: FloatArray | None  # (m,), with INFEASIBLE
+    status: str  # name of a Status
     iterations: int
     work: Mapping[str, int]
     message: str
     form: str
-    certificate: FloatArray | None  # (m,), with INFEASIBLE
-    setups: list[float]  # s, of each repeat
-    solves: list[float]  # s
-    times: list[float]  # s, of the line of each repeat; none where the guard did not end
-    reached: list[float]  # relative residual of each repeat, in mode "time"
+    setups: tuple[float, ...]  # s, of each repeat
+    solves: tuple[float, ...]  # s
+    times: tuple[float, ...]  # s, of the line of each repeat; none where the guard did not end
     pace: float | None  # s
     own: float | None = None  # s, in the backend's own solve
+    reached: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
 
 
 def measure(problem: Problem, task: Task) -> Record:
@@ -223,17 +223,17 @@ def outcome_of(
     """What the repeats `made` brought, the last of them `solution`."""
     return Outcome(
         impulse=solution.impulse,
-        status=solution.status,
+        certificate=solution.certificate,
+        status=solution.status.name,
         iterations=solution.iterations,
         work=solution.work,
         message=solution.message,
         form=solution.solver.form,
-        certificate=solution.certificate,
-        setups=[s.setup_time for s in made],
-        solves=[s.solve_time for s in made],
-        times=times,
-        reached=[float(s.residual.relative) for s in made] if reached else [],
+        setups=tuple(s.setup_time for s in made),
+        solves=tuple(s.solve_time for s in made),
+        times=tuple(times),
         pace=paced,
+        reached=tuple(float(s.residual.relative) for s in made) if reached else (),
     )
 
 
@@ -293,7 +293,7 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
     if isinstance(found, str):
         return task.record(status=ERROR, message=found[:500]), None
     claim = Claim(
-        found.status,
+        Status[found.status],
         found.iterations,
         found.work,
         found.message,
@@ -362,8 +362,8 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         solve_median=statistics.median(solves),
         time_min=min(both),
         time_median=statistics.median(both),
-        times=tuple(found.times) if task.way else (),
-        reached=tuple(found.reached),
+        times=found.times if task.way else (),
+        reached=found.reached,
         pace=found.pace,
         own_min=found.own,
     )
