@@ -116,9 +116,9 @@ class Plan:
         """
 
         def one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
-            way = "" if options else self.way
-            ask = Ask(spec.name, mode, tol, max_iter, self.time_limit, way, start)
-            return make(Task.of(info, ask, options=options, repeats=self.repeats))
+            ask = Ask(spec.name, mode, tol, max_iter, start=start, way="" if options else self.way)
+            more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
+            return make(Task.of(info, ask, **more))
 
         starts = ["cold"]
         if self.warm and problem.guess is not None and spec.impulse and not spec.exact:
@@ -166,7 +166,7 @@ def passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
     if spec.resumable and not spec.exact:
         asked = [*(("budget", 0.0, n) for n in plan.budgets), *asked]
     starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
-    return [Ask(spec.name, *what, plan.time_limit, "steps", start) for start in starts for what in asked]
+    return [Ask(spec.name, *what, way="steps", start=start) for start in starts for what in asked]
 
 
 def _hopeless(record: Record) -> bool:

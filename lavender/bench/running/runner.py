@@ -240,7 +240,7 @@ class Runner:
     def run_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
         """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
         repeats = self.plan.repeats if len(steps) <= SHORT_SEQUENCE else 1
-        tasks = [Task.of(info, ask, repeats=repeats) for _, info in steps]
+        tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.pass_limit, 0.0, 0
         for task in tasks:
