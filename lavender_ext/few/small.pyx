@@ -1,7 +1,7 @@
 """Problems of few rows by bodies or by A, and islands of few rows: look, solve and judge in one call.
 
     bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
-                   where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)  
+                   where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
 Under friction a part is the whole, or each island in its turn, cut out of A. Part i of n, E0_i its error of doing

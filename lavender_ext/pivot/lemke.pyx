@@ -24,7 +24,7 @@ free rows on A itself, so that what the pivots lost does not reach the result. W
 covering vector c is another path.
 """
 from libc.math cimport INFINITY, fabs, sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy
 
 import numpy as np
@@ -105,13 +105,13 @@ cdef inline int32_t limiting_row(const dictionary_t* d, int32_t c) noexcept nogi
     # (3); -1 where no basic variable falls. Among equals z leaves.
     cdef int32_t i, best = -1
     cdef double big = 0.0, s, value, ratio, least = 0.0, scale = 0.0, gap
-    cdef const double* row = d.t
+    cdef const double* row
     for i in range(d.n):
+        row = d.t + i * d.width
         if fabs(row[c]) > big:
             big = fabs(row[c])
         if fabs(row[d.n + 1]) > scale:
             scale = fabs(row[d.n + 1])
-        row += d.width
     for i in range(d.n):
         row = d.t + i * d.width
         s = -row[c]
