@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, as_csr, borrowed, equal, precision_of, read_only
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels

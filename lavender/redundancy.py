@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
@@ -214,11 +214,9 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
 def _islands(scaled: sp.csr_array) -> list[Places]:
     """Rows that hang together, directly or through others."""
-    from scipy.sparse import csgraph
-
     if not scaled.shape[0]:
         return []
-    count, label = csgraph.connected_components(scaled, directed=False)
+    count, label = sp.csgraph.connected_components(scaled, directed=False)
     sizes = np.bincount(label, minlength=count)
     return np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
 

@@ -39,8 +39,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, read_only
 from lavender.errors import InputError
 from lavender.generalized import Generalized

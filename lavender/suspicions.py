@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import ROUND, ROW
 from lavender.problem import Problem, check_problem

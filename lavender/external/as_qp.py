@@ -35,8 +35,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError

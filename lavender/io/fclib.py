@@ -19,9 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse import csgraph
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, as_array
 from lavender.cones import CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
@@ -122,7 +121,7 @@ class Contents:
         n = self.M.shape[0]
         if n == 0:
             return None
-        size = np.bincount(csgraph.connected_components(self.M, directed=False)[1]).astype(float)
+        size = np.bincount(sp.csgraph.connected_components(self.M, directed=False)[1]).astype(float)
         if 4 * ENTRY * float(size @ size) > max_bytes:
             return None
         try:

@@ -47,8 +47,8 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray, read_only
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError

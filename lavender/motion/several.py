@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, whole_number
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError

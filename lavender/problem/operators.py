@@ -6,8 +6,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
 from lavender._derived import once
 from lavender.errors import CapabilityError, InputError

@@ -7,8 +7,8 @@ from os import PathLike
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender._derived import once
 from lavender.cones import ROW, Cones

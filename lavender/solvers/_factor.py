@@ -17,9 +17,9 @@ import warnings
 from typing import Any, Protocol
 
 import numpy as np
-import scipy.sparse as sp
 from scipy.linalg import lapack
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender.lu import sparse_lu
 from lavender.problem import Problem

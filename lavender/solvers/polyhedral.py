@@ -20,8 +20,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
 from lavender.cones import ROW, project

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import IntArray
 from lavender_ext.factor import graph, symbolic
 from lavender_ext.factor.dissection import dissection

@@ -13,8 +13,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray
 from lavender.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE

@@ -10,8 +10,8 @@ import os
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
+from lavender import _sparse as sp
 from lavender._arrays import IntArray
 from lavender.problem import Problem
 from lavender.residuals import reference
