@@ -110,11 +110,12 @@ def test_free_rows_that_no_pivot_reaches_are_split():
     assert good(solution), solution
 
 
+@pytest.mark.parametrize("solver", ["lemke", "auto"])
 @pytest.mark.parametrize(("a", "b"), [([[-1.0]], [1.0]), ([[0.0, -1.0], [1.0, 0.0]], [1.0, -1.0])])
-def test_infeasible_without_symmetry(a, b):
+def test_infeasible_without_symmetry(a, b, solver):
     """w_1 < 0 whatever lambda is: y = e_1 has A^T y <= 0 and b.y > 0."""
     problem = lv.Problem.lcp(a, b)
-    solution = lv.solve(problem, "lemke")
+    solution = lv.solve(problem, solver)
     assert solution.status is lv.Status.INFEASIBLE
     assert check_certificate(problem, solution.certificate) is None
 
