@@ -72,12 +72,6 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
-@click.option(
-    "--peers",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Engines and solvers of others, as `python -m benchmarks peers --out FILE` measured them, to show beside.",
-)
 @click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
 @click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
 @click.option(
@@ -97,7 +91,6 @@ def report(
     campaign: bool,
     compare: Path | None,
     time_budgets: tuple[float, ...],
-    peers: Path | None,
     tables: bool,
     paper: bool,
     no_figures: bool,
@@ -114,7 +107,6 @@ def report(
     another report writes the folder.
     """
     from lavender import bench
-    from lavender.bench.peers import read as read_peers
     from lavender.report.contents import engine_table
     from lavender.report.engine import ENGINES, contestants
     from lavender.report.table import print_table
@@ -130,7 +122,6 @@ def report(
     how = {name: given[name] for name in ("steps", "every", "controls")}
     files = tuple(_recorded(f, out, taken, given["fresh"], how) for f in files)
     old = None if compare is None else bench.read(compare)
-    rivals = None if peers is None else read_peers(peers)
     sweeps = asked.budgets if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
     again = [f for f in files if f.endswith(".jsonl")]
@@ -151,7 +142,7 @@ def report(
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write(done.records, out, figures=not no_figures, peers=rivals, engines=engines, **shown)
+    index = write(done.records, out, figures=not no_figures, engines=engines, **shown)
     if paper:
         from lavender.report.paper import write_paper
 
@@ -177,7 +168,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

@@ -19,7 +19,6 @@ from lavender.report.text import count, residual, seconds, suspicions
 from lavender.report.verdict import Verdict, verdict
 
 if TYPE_CHECKING:
-    from lavender.bench.peers import Peers
     from lavender.report.engine import Contestant
 
 __all__ = ["page"]
@@ -53,7 +52,6 @@ def page(
     budgets: Sequence[float] = (),
     sweeps: Sequence[int] = (),
     saved: bool = True,
-    peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
@@ -71,27 +69,22 @@ def page(
         Budgets of sweeps of the recommendation.
     saved : bool
         The figures are beside the page as SVG and PNG.
-    peers : Peers, optional
-        Engines and solvers of others, whose figures are among `figures`.
     engines : sequence of Contestant
         Answers of the engines that recorded the steps.
     """
-    environment = _environment()
-    rivals = None
-    if peers is not None:
-        from lavender.report.rivals import content as content_of_peers  # with the engine behind it
-
-        rivals = content_of_peers(peers)
     content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
-    return environment.get_template("index.html.j2").render(
-        title=title,
-        saved=saved,
-        peers=rivals,
-        engines=contents.engine_table(engines),
-        count=count,
-        inf=math.inf,
-        isfinite=math.isfinite,
-        **content,
+    return (
+        _environment()
+        .get_template("index.html.j2")
+        .render(
+            title=title,
+            saved=saved,
+            engines=contents.engine_table(engines),
+            count=count,
+            inf=math.inf,
+            isfinite=math.isfinite,
+            **content,
+        )
     )
 
 
@@ -189,7 +182,6 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
         "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
         "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
         "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
-        "peer_figures": {place: _keys(some) for place, some in figures.peers.items()},
     }
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,6 @@ from lavender.errors import InputError
 from lavender.io.stored import write_text
 
 if TYPE_CHECKING:
-    from lavender.bench.peers import Peers
     from lavender.report.curves import Figures
     from lavender.report.engine import Contestant
 
@@ -27,7 +25,6 @@ def write(
     old: Records | None = None,
     times: Sequence[float] = (),
     sweeps: Sequence[int] = (),
-    peers: Peers | None = None,
     engines: Sequence[Contestant] = (),
 ) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
@@ -45,8 +42,6 @@ def write(
         Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
     sweeps : int, optional
         Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
-    peers : Peers, optional
-        Engines and solvers of others (`lavender.bench.peers.read`) to show beside them.
     engines : sequence of Contestant
         Answers of the engines that recorded the steps: `lavender.report.engine.contestants`.
 
@@ -69,10 +64,6 @@ def write(
     shown = records.latest()
     busy = working(shown)
     drawn = figures_of(busy)
-    if peers is not None:
-        from lavender.report.rivals import figures as figures_of_peers  # with the engine behind it
-
-        drawn = replace(drawn, peers=figures_of_peers(peers))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_csv(records, folder / "records.csv")
@@ -89,7 +80,6 @@ def write(
                 budgets=times,
                 sweeps=sweeps,
                 saved=figures,
-                peers=peers,
                 engines=engines,
             ),
         )

@@ -149,7 +149,7 @@ def test_cmake_builds_installs_and_is_found(folder, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, what", [("gcc", "address,undefined"), ("clang", "memory")])
 def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
-    flags = ["-std=c11", "-O1", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
+    flags = ["-std=c11", "-O0", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
     (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
     if (
         shutil.which(name) is None
@@ -204,9 +204,9 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
     assert (
-        len(re.findall("^same ", said, re.MULTILINE)) == count - 3
-    )  # `lemke`, `admm`, `auto` are held to the residual
-    assert len(re.findall("^met ", said, re.MULTILINE)) == 3
+        len(re.findall("^same ", said, re.MULTILINE)) == count - 2
+    )  # `admm`, `auto` are held to the residual
+    assert len(re.findall("^met ", said, re.MULTILINE)) == 2
     data = bytearray((tmp_path / "vectors.bin").read_bytes())
     data[-8] ^= 1  # the last bit of the last impulse
     (tmp_path / "vectors.bin").write_bytes(data)

@@ -393,20 +393,6 @@ def test_the_size_of_the_numbers_changes_no_residual(kind, seed):
         assert got.worst_row == usual.worst_row
 
 
-def test_the_inequality_between_two_points_holds():
-    """|D|_A^2 <= |D|_A |eps|_A + |eps|_D |D|_D for symmetric PSD boxed problems (D = difference, eps = e1 - e2)."""
-    for seed in range(200):
-        problem = random_lcp(seed, rank=8)
-        rng = np.random.default_rng(seed)
-        x, y = rng.uniform(size=(2, problem.m))
-        d = problem.d
-        delta = x - y
-        eps = lv.residual(problem, x).error - lv.residual(problem, y).error
-        delta_a, eps_a = (np.sqrt(max(v @ problem.matrix @ v, 0.0)) for v in (delta, eps))
-        delta_d, eps_d = (np.sqrt(v @ (d * v)) for v in (delta, eps))
-        assert delta_a**2 <= (delta_a * eps_a + eps_d * delta_d) * (1 + 1e-12)
-
-
 @pytest.mark.parametrize("form", ["rows", "generalized"])
 @pytest.mark.parametrize("small", [1e-170, 1e-200, 1e-300])
 def test_a_row_whose_products_vanish_makes_no_claim_about_itself(form, small):
