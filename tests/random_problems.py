@@ -102,6 +102,18 @@ def as_matrix(problem):
     )
 
 
+def side_by_side(parts):
+    """Problems given by their matrices as one, of which each is an island."""
+    cones = parts[0].cones
+    for part in parts[1:]:
+        cones = cones + part.cones
+    b, a = (
+        np.concatenate([part.b for part in parts]),
+        sp.block_diag([part.csr for part in parts], format="csr"),
+    )
+    return lv.Problem(b, cones, a, friction=parts[0].friction)
+
+
 def general(problem):
     """The same problem by J and M."""
     minv, free = problem.rows.inverse_mass_matrix().toarray(), problem.rows.v_free.ravel()

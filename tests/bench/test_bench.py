@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from random_problems import spd
 from stacks import chain, moving_stack, stack
 
 import lavender as lv
@@ -334,10 +335,22 @@ def a_pile_among_separate_rows():
     return lv.Problem.lcp(np.maximum(a, a.T), np.ones(106))
 
 
+def each_coupled_to_a_few():
+    rng = np.random.default_rng(3)
+    graph = np.zeros((30, 30))
+    for i in range(30):
+        for j in rng.choice(30, 4):
+            graph[i, j] = graph[j, i] = -0.1
+    np.fill_diagonal(graph, 2.0)
+    return lv.Problem.lcp(graph, np.ones(30))
+
+
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
         (chain(6), ("chain",)),
+        (lv.Problem.linear(*spd(20)), ("dense",)),
+        (each_coupled_to_a_few(), ("pile",)),
         (stack(6), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
@@ -353,21 +366,6 @@ def a_pile_among_separate_rows():
 )
 def test_structure_is_recognised(problem, words):
     assert bench.structure_of(problem) == words
-
-
-def test_a_dense_matrix_is_no_chain():
-    a = np.random.default_rng(0).standard_normal((20, 20))
-    assert bench.structure_of(lv.Problem.linear(a @ a.T + np.eye(20), np.ones(20))) == ("dense",)
-
-
-def test_what_couples_everywhere_is_a_pile():
-    rng = np.random.default_rng(3)
-    graph = np.zeros((30, 30))
-    for i in range(30):
-        for j in rng.choice(30, 4):
-            graph[i, j] = graph[j, i] = -0.1
-    np.fill_diagonal(graph, 2.0)
-    assert bench.structure_of(lv.Problem.lcp(graph, np.ones(30))) == ("pile",)
 
 
 def test_a_fingerprint_sees_every_number():

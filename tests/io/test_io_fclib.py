@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, seeds
+from random_problems import random_contact_problem, seeds, side_by_side
 
 import lavender as lv
 import lavender.io
@@ -375,11 +375,8 @@ def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
         lambda file: file["fclib_local_rolling/spacedim"].write_direct(np.array([3], np.int32)),
         "spacedim is 3",
     )
-    both = lv.Problem(
-        np.concatenate([plain.b, rolls.b]), plain.cones + rolls.cones, sp.block_diag([plain.csr, rolls.csr])
-    )
     with pytest.raises(lv.CapabilityError, match="rolling beside others"):
-        lavender.io.save(both, path)
+        lavender.io.save(side_by_side([plain, rolls]), path)
     with_spin = random_contact_problem(5, rolling=True, joints=0)
     with pytest.raises(lv.CapabilityError, match="spin rows"):
         lavender.io.save(with_spin, path)
