@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from random_problems import spd
+from random_problems import spd, touching
 from stacks import chain, moving_stack, stack
 
 import lavender as lv
@@ -313,19 +313,9 @@ def test_levels_are_written_as_people_do(level, name):
 
 def two_bodies(copies, ratio=1.0):
     """A light ball on the ground, a heavy one on it, each pair touching at `copies` equal contacts."""
-    n = 2 * copies
-    up, side = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n, 1))
-    rows = lv.Rows(
-        inv_mass=np.array([1.0, 1.0 / ratio]),
-        inv_inertia=np.stack([np.eye(3), np.eye(3) / ratio]),
-        v_free=np.zeros((2, 6)),
-        normal=up,
-        tangent=side,
-        arm_a=np.zeros((n, 3)),
-        arm_b=np.zeros((n, 3)),
-        contact_body=np.repeat(np.array([[-1, 0], [0, 1]], np.int32), copies, axis=0),
-    )
-    return rows
+    inverse = np.array([1.0, 1.0 / ratio])
+    pairs = np.repeat([[-1, 0], [0, 1]], copies, axis=0)
+    return touching(pairs, inv_mass=inverse, inv_inertia=inverse[:, None, None] * np.eye(3))
 
 
 def a_pile_among_separate_rows():

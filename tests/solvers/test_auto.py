@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds, side_by_side
+from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds, side_by_side, touching
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -278,12 +278,8 @@ def test_a_net_in_generalised_coordinates_whose_factor_fills_is_left_to_sweeps()
 
 def test_a_body_of_huge_inverse_inertia_is_refused_by_no_solver():
     # Its principal values overflow; each entry is finite.
-    rows = lv.Rows(
-        np.ones(2), np.array([np.full((3, 3), 1.7e308), np.eye(3)]), np.zeros((2, 6)),
-        normal=np.tile([0.0, 0.0, 1.0], (5, 1)), tangent=np.tile([1.0, 0.0, 0.0], (5, 1)),
-        arm_a=np.zeros((5, 3)), arm_b=np.zeros((5, 3)),
-        contact_body=np.array([[-1, 0], [-1, 1], [0, 1], [0, 1], [0, 1]], np.int32),
-    )  # fmt: skip
+    pairs = [[-1, 0], [-1, 1], [0, 1], [0, 1], [0, 1]]
+    rows = touching(pairs, inv_inertia=np.array([np.full((3, 3), 1.7e308), np.eye(3)]))
     problem = lv.Problem.from_rows(rows, mu=0.5)
     assert problem.m > 6 * rows.n_bodies  # where `admm` factors over bodies
     solution = lv.solve(problem, "admm")
