@@ -25,7 +25,6 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 import docstrings
 import matplotlib
-import tried
 
 import lavender as lv
 import lavender_ext
@@ -578,7 +577,6 @@ def write(source, cache):
     part_pages(site)
     calibration_part(site)
     api_page(site)
-    site.write("tried.md", tried.page(LEVELS))
     site.forget_others()
 
 

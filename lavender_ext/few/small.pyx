@@ -1,7 +1,7 @@
 """Problems of few rows by bodies or by A, and islands of few rows: look, solve and judge in one call.
 
     bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
-                   where exchanges are stuck Lemke's path, if asked for                      (pivot/tableau.pyx)
+                   where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
 Under friction a part is the whole, or each island in its turn, cut out of A. Part i of n, E0_i its error of doing
@@ -30,14 +30,10 @@ from lavender_ext.few.friction cimport SHORT, ask_t, part_t, solve_part, work_of
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.local import gauss_seidel
-from lavender_ext.pivot.direct cimport (HALVED, after_rounds, direct_begin, direct_begin_passes, direct_factor, direct_first,
-                                        direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end,
-                                        judge_now)
-from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED, pivots_rounds, pivots_start
-from lavender_ext.pivot.tableau import DONE as FOLLOWED
-from lavender_ext.pivot.tableau import follow as lemke
-
-TINY = 1e-11                    # of the largest entry of a column, as `lemke` has it
+from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
+                                        direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end)
+from lavender_ext.pivot.lemke cimport RAY, lemke_begin, lemke_index, lemke_lay, lemke_real, lemke_run, lemke_t
+from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED
 
 
 cdef enum:
@@ -170,33 +166,20 @@ cdef class Bounded(Small):
         return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, path
 
     cdef int followed(self, direct_t* t, own, double tol) except -2:
-        """Where exchanges are stuck: the sides on which Lemke's path leaves the rows, and exchanges from there.
+        """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
 
-        Pivots of the path, -1 where it does not end below tol.
+        Pivots of the paths, -1 where they do not end below tol.
         """
-        cdef int32_t m = t.s.n
-        cdef double[::1] start = own
-        at, x = np.asarray(<int32_t[:m]>t.s.at), np.asarray(<double[:m]>t.s.x)
-        x[:] = own
-        end, path = lemke(self.matrix, TINY, PATH * m, at, x)
-        if end != FOLLOWED:
-            return -1
-        t.relative = INFINITY
-        t.refined = t.shifts = 0
-        judge_now(t)
-        memcpy(&start[0], t.best, m * sizeof(double))   # where exchanges from there are no better
-        end_of_path = t.relative
-        pivots_start(&t.s, 0.0)
-        if pivots_rounds(&t.s, ROUNDS) == SOLVED:
-            t.relative = INFINITY
-            after_rounds(t, SOLVED)
-            if met(t, tol, True):
-                return path
-        if not end_of_path <= tol:
-            return -1
-        t.refined = 0
-        memcpy(t.best, &start[0], m * sizeof(double))
-        return path
+        cdef lemke_t l
+        cdef int64_t n = lemke_real(t.s.p)
+        cdef Room room = room_for(n * sizeof(double) + lemke_index(t.s.p) * sizeof(int32_t))
+        cdef double* real = <double*>room.at
+        with nogil:
+            lemke_lay(&l, t, real, <int32_t*>(real + n))
+            lemke_begin(&l)
+            while lemke_run(&l, PATH * t.s.n - l.pivots) == RAY:
+                pass
+        return l.pivots if t.relative <= tol else -1
 
 
 cdef enum:                      # arrays of an island's
