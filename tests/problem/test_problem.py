@@ -220,6 +220,10 @@ BAD_ROWS = {
     "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+    "axes whose product is inf - inf": (
+        {"normal": np.tile([1e200, 1e200, 0], (8, 1)), "tangent": np.tile([1e200, -1e200, 0], (8, 1))},
+        "off by inf",
+    ),
     "tangent": (
         {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
         "orthogonal",
