@@ -66,8 +66,8 @@ def test_files_of_any_name_are_reported(lavender, tmp_path):
         with contextlib.suppress(OSError):  # a file system that takes no such name has none to report
             os.rename(tmp_path / "plain.npz", os.path.join(os.fsencode(folder), name))
     assert os.listdir(folder)
-    for _ in range(2):  # measured, and read again
-        code, out, err = lavender("report", folder, "--out", "out", *QUICK)
+    for more in ((), ("--no-figures",)):  # measured and drawn, and read again
+        code, out, err = lavender("report", folder, "--out", "out", *QUICK, *more)
         assert (code, err.strip()) == (0, "")
         assert "Traceback" not in out
         out.encode("utf-8")

@@ -84,9 +84,11 @@ def test_fields_of_a_snapshot_have_their_types(field, value, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["pile", "bridge"])
-def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name):
-    sim = lv.Simulation(lv.Scene(name))
+@pytest.mark.parametrize(
+    ("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})]
+)
+def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name, solver):
+    sim = lv.Simulation(lv.Scene(name, **solver))
     for _ in range(30):
         sim.step()
     shot = sim.snapshot()
