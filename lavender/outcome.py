@@ -64,7 +64,8 @@ def finish(
     if status is CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
     elif status is FLOOR and not judged.at_floor:
-        contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e} or {FLOOR_MOST:.0e}"
+        least = min(2.0 * judged.floor, FLOOR_MOST)
+        contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
     elif status is INFEASIBLE:
         reason = (
             "no certificate was given" if certificate is None else check_certificate(problem, certificate)
