@@ -40,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, read_only
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem import PRECISIONS, Problem

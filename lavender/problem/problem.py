@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender._derived import once
+from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
