@@ -40,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, read_only
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem import PRECISIONS, Problem
@@ -274,7 +274,8 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
 def unstretched(problem: Problem, found: Residual) -> Residual:
     """The residual of a problem with ellipses, from that of its disks."""
     s = problem.cones.stretch
-    error, slack = read_only(s * found.error), read_only(found.slack / s)
+    with np.errstate(over="ignore"):
+        error, slack = read_only(s * found.error), read_only(found.slack / s)
     return replace(found, error=error, slack=slack, _problem=problem)
 
 

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, as_array
+from lavender._later import sparse as sp
 from lavender.cones import CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
