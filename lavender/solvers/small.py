@@ -33,7 +33,7 @@ SWEPT = 32  # sweeps of a part at most, before its factors
 FACTORED = 0.05  # ns of a multiply-add of factors of parts
 # ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
 # Coulomb's law sooner; and up to which nobody looks at the clock in between.
-FIRST = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
+AT_ONCE = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
 MOST = 1e7
 
 
@@ -225,6 +225,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", gate(FIRST["cone"], FIRST["coulomb"]), True, True)
+AUTO = Few("auto", gate(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
 DIRECT = Few("direct", None, True)
 NEWTON = Few("newton", gate(MOST, MOST), False)

@@ -351,7 +351,7 @@ cdef inline bint same(const island_t* x, const island_t* y) noexcept nogil:
 
 
 cdef inline int32_t swept_before(const blocks_t* p, int32_t most) noexcept nogil:
-    """Sweeps of an island before its factors: of many rows these pay sooner, at once under the cone's law, where they are few."""
+    """Sweeps of an island before its factors: of many rows these pay sooner, and at once under the cone's law."""
     if p.n_rows <= FEW:
         return most
     return 0 if p.law == CONE else most * FEW // p.n_rows
@@ -435,7 +435,7 @@ cdef class Friction(Small):
         cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks, number, body
         cdef double[::1] numbers, work
         cdef int32_t i, j, q, m, k, n = -1, first = 0
-        cdef int64_t swept, unheard = 0
+        cdef int64_t swept, read, unheard = 0
         cdef double factored
         cdef island_t two[2]
         cdef island_t* x
@@ -477,7 +477,8 @@ cdef class Friction(Small):
                     good = solve_part(&x.s, o, r, &work[0], &order[0])
                     if not good:
                         break
-                    unheard += <int64_t>(o.factored - factored) + (size[i, 2] + OF_JOINT * (m if over_bodies else 0)) * (o.swept - swept)
+                    read = OF_JOINT * m if over_bodies else size[i, 2]
+                    unheard += <int64_t>(o.factored - factored) + read * (o.swept - swept)
                     if unheard > LISTEN:
                         unheard = 0
                         with gil:

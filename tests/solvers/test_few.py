@@ -22,7 +22,7 @@ from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
 from lavender.solvers.costs import candidates
 from lavender.solvers.newton_systems import general
-from lavender.solvers.small import AUTO, FIRST, ISLAND, Few, call_ends_within, velocities_cost
+from lavender.solvers.small import AT_ONCE, AUTO, ISLAND, Few, call_ends_within, velocities_cost
 from lavender.solvers.structure import Structure
 from lavender_ext.few.many import solve_first
 
@@ -238,7 +238,7 @@ def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
     found = solve_first(problem.metric, None, np.inf, AUTO.gate)
     cost = velocities_cost(problem, general.prepare(problem).largest)
-    assert (found is not None) == (cost <= FIRST[problem.law])
+    assert (found is not None) == (cost <= AT_ONCE[problem.law])
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
