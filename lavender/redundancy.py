@@ -44,7 +44,7 @@ ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
 Places = npt.NDArray[np.intp]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Redundancy:
     """What `redundancy` found; `str()` says it in a few lines."""
 

@@ -69,7 +69,7 @@ class Rounding:
         return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Residual:
     """Error of one impulse. `str()` is one line."""
 
