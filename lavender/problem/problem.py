@@ -17,7 +17,7 @@ from lavender.generalized import Generalized
 from lavender.problem.builders import Builders
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VelocityForm:
     """min 1/2 |y|^2 + 1/2 z^T diag(theta) z over y [sqrt J], z = scaled impulse, in the metric of d.
 
