@@ -26,7 +26,7 @@ import click
 import numpy as np
 
 import lavender as lv
-from benchmarks.drawn import wild
+from benchmarks import drawn
 from benchmarks.islands import forms
 from benchmarks.output import folder_of, markdown, write_json
 from lavender import suite
@@ -140,10 +140,10 @@ PARTS: dict[str, Part] = {
 def problems(args: Asked) -> Iterator[tuple[str, Problem]]:
     """Name and problem of all that is asked for."""
     for name in args.sets:
-        if name == "wild":
+        if name in drawn.__all__:
             first, last = map(int, args.seeds.split(":"))
             for seed in range(first, last):
-                yield f"wild({seed})", wild(seed=seed, rows=args.rows).problem
+                yield f"{name}({seed})", getattr(drawn, name)(seed=seed, rows=args.rows).problem
         elif name == "scenes":
             for scene in SCENES:
                 simulation = lv.Simulation(lv.Scene(scene, solver="newton"))
