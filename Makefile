@@ -17,7 +17,7 @@ kernels:  ## build what changed in lavender_ext/
 	$(PYTHON) setup.py -q build_ext --inplace
 
 test: kernels  ## every test
-	$(PYTHON) -m pytest -q
+	$(PYTHON) -m pytest -q -n auto --dist worksteal
 
 quick: kernels  ## tests but for the slow ones, first failure stops
 	$(PYTHON) -m pytest -q -x -m "not slow"

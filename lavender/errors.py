@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from typing import Any
 
@@ -29,6 +28,8 @@ class UnknownName(LavenderError, KeyError):
     """A solver, option, order, scene or case that does not exist; the message names the nearest."""
 
     def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
+        import difflib  # needed only where something went wrong
+
         known = sorted(known)
         plain = {word.lower(): word for word in reversed(known)}
         near = [plain[w] for w in difflib.get_close_matches(str(name).lower(), plain, n=3, cutoff=0.5)]

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import scipy.sparse as sp
-from scipy.sparse.csgraph import structural_rank
+from lavender._later import sparse as sp
 
 __all__ = ["sparse_lu"]
 
@@ -20,6 +19,6 @@ def sparse_lu(matrix: Any, **options: Any) -> Any:
 
     a = sp.csc_array(matrix)
     # A diagonal without a gap is one entry for every row and column.
-    if not a.diagonal().all() and structural_rank(sp.csr_array(a)) < a.shape[0]:
+    if not a.diagonal().all() and sp.csgraph.structural_rank(sp.csr_array(a)) < a.shape[0]:
         raise RuntimeError("the matrix is singular whatever its entries are")
     return splu(a, **options)

@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from lavender._arrays import IntArray, as_array, whole_number
+from lavender._later import sparse as sp
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.problem import Problem
 from lavender_ext.core.order import (
@@ -184,7 +183,7 @@ def body_ranks(problem: Problem) -> IntArray:
         return own
     graph = sp.csr_array((np.ones(len(pair), np.int8), (pair[:, 0], pair[:, 1])), shape=(n, n))
     rank = np.empty(n, np.int32)
-    rank[reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = own
+    rank[sp.csgraph.reverse_cuthill_mckee(sp.csr_matrix(graph + graph.T), symmetric_mode=True)] = own
     return rank
 
 
@@ -194,7 +193,7 @@ def local_order(problem: Problem) -> IntArray:
         if problem.n_blocks == 0:
             return np.zeros(0, np.int32)
         graph = sp.csr_matrix(_block_graph(problem))
-        return np.ascontiguousarray(reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
+        return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
     rank = np.append(body_ranks(problem), np.int32(-1))
     pair = rank[_block_bodies(problem)]
     low, high = pair.min(axis=1), pair.max(axis=1)

@@ -18,9 +18,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import lapack
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
 from lavender.problem import Problem, check_problem
@@ -43,7 +44,7 @@ ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
 Places = npt.NDArray[np.intp]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Redundancy:
     """What `redundancy` found; `str()` says it in a few lines."""
 
@@ -214,11 +215,9 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
 def _islands(scaled: sp.csr_array) -> list[Places]:
     """Rows that hang together, directly or through others."""
-    from scipy.sparse import csgraph
-
     if not scaled.shape[0]:
         return []
-    count, label = csgraph.connected_components(scaled, directed=False)
+    count, label = sp.csgraph.connected_components(scaled, directed=False)
     sizes = np.bincount(label, minlength=count)
     return np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
 
@@ -312,8 +311,6 @@ def _by_qr(a: FloatArray, tol: float) -> Places:
 
 def _by_cholesky(a: FloatArray, tol: float) -> Places:
     """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
-    from scipy.linalg import lapack
-
     # Rounding alone leaves a pivot of about len(a) 2^-53.
     _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
@@ -333,8 +330,6 @@ def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
 
 def _null_basis(a: FloatArray, found: Places) -> FloatArray:
     """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
-    from scipy.linalg import lapack
-
     kept = np.setdiff1d(np.arange(len(a)), found)
     vectors = np.zeros((len(a), len(found)))
     vectors[found] = np.eye(len(found))
@@ -387,12 +382,12 @@ def _polished(p: Problem, rough: FloatArray, previous: FloatArray) -> FloatArray
         part = Problem(p.b[rows] - rest, Cones.free(len(rows)), p.csr[rows][:, rows])
         y = redundancy(part).nearest_to(previous[rows])
         x[rows] = np.clip(y, c.lower[rows], c.upper[rows])
-    good, bad = residual(p, x), residual(p, rough)
-    return x if good.relative <= max(bad.relative, 2.0 * good.floor) else rough
+    good, bad = residual(p, x, "float64"), residual(p, rough, "float64")
+    return x if good.relative <= bad.relative or good.at_floor else rough
 
 
 def _accepted(p: Problem, impulse: FloatArray, tol: float = ACCEPTED) -> FloatArray:
-    r = residual(p, impulse)
-    if r.relative > max(tol, 2.0 * r.floor):
+    r = residual(p, impulse, "float64")
+    if not (r.relative <= tol or r.at_floor):
         raise SolveFailed(f"the representative impulse is not a solution to {tol:.0e}: {r}")
     return impulse

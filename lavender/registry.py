@@ -20,7 +20,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, cached_property
-from importlib.metadata import entry_points
 from typing import Any, Protocol
 
 from lavender._arrays import FloatArray
@@ -241,6 +240,8 @@ registered: dict[str, SolverSpec] = {}
 @cache
 def load() -> None:
     """Fill `registered` once: what is built in, and what plug-ins offer."""
+    from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
+
     for table in TABLES:
         for spec in importlib.import_module(table).SPECS:
             object.__setattr__(spec, "own", True)

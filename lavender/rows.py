@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import (
     FloatArray,
@@ -17,6 +16,7 @@ from lavender._arrays import (
     precision_of,
     read_only,
 )
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender_ext.core import gate
@@ -164,10 +164,12 @@ class Rows:
     def _take_frames(self) -> None:
         # What float32 leaves of unit vectors is made whole; what is meant otherwise is told.
         n, t = self.normal, self.tangent
-        along = np.einsum("ij,ij->i", n, t)
-        off = np.abs(np.stack([np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along])).max(
-            axis=0
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            along = np.einsum("ij,ij->i", n, t)
+            parts = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along]
+            off = np.nan_to_num(
+                np.abs(np.stack(parts)).max(axis=0), nan=np.inf, posinf=np.inf
+            )  # inf - inf is far off, too
         if off.max() > ROUNDED:
             i = int(np.argmax(off))
             raise InputError(

@@ -16,6 +16,11 @@ from functools import partial
 import hypothesis
 import pytest
 
+for variable in ("COLUMNS", "LINES"):
+    # readline, which pytest loads, tells processes that it starts of a terminal: what they print would be folded.
+    os.environ.pop(variable, None)
+    os.unsetenv(variable)
+
 # Timings say nothing on a shared machine, so no deadline, of an example or of drawing it; the same examples every run,
 # so a failure repeats. HYPOTHESIS_PROFILE=search draws new ones.
 timeless = hypothesis.settings(deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])

@@ -72,12 +72,6 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
 )
-@click.option(
-    "--peers",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Engines and solvers of others, as `python -m benchmarks peers --out FILE` measured them, to show beside.",
-)
 @click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
 @click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
 @click.option(
@@ -97,7 +91,6 @@ def report(
     campaign: bool,
     compare: Path | None,
     time_budgets: tuple[float, ...],
-    peers: Path | None,
     tables: bool,
     paper: bool,
     no_figures: bool,
@@ -114,13 +107,13 @@ def report(
     another report writes the folder.
     """
     from lavender import bench
-    from lavender.bench.peers import read as read_peers
     from lavender.report.contents import engine_table
     from lavender.report.engine import ENGINES, contestants
+    from lavender.report.findings import Report
     from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.text import count
-    from lavender.report.write import write
+    from lavender.report.write import write_all
 
     for limit in time_budgets:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -130,7 +123,6 @@ def report(
     how = {name: given[name] for name in ("steps", "every", "controls")}
     files = tuple(_recorded(f, out, taken, given["fresh"], how) for f in files)
     old = None if compare is None else bench.read(compare)
-    rivals = None if peers is None else read_peers(peers)
     sweeps = asked.budgets if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
     again = [f for f in files if f.endswith(".jsonl")]
@@ -146,18 +138,16 @@ def report(
         more = {"sequence": given["sequence"], "fresh": given["fresh"], "given": partial(was_given, context)}
         done = measure(files, asked, plan, path, **more)
     engines = [] if campaign else contestants(files, done.records.latest())
-    shown: dict[str, Any] = {"old": old, "times": time_budgets, "sweeps": sweeps}
-    print_report(done.records, console(), whole=tables, **shown)
+    found = Report(done.records, old, time_budgets, sweeps, engines)
+    print_report(found, console(), whole=tables)
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write(done.records, out, figures=not no_figures, peers=rivals, engines=engines, **shown)
+    index = write_all(found, out, figures=not no_figures)
     if paper:
         from lavender.report.paper import write_paper
 
-        _say(
-            f"figures, tables and method of a paper: {write_paper(done.records, out / 'paper', time_budgets)}"
-        )
+        _say(f"figures, tables and method of a paper: {write_paper(found, out / 'paper')}")
     _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
     if done.note:
         _say(done.note)
@@ -177,7 +167,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "peers", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

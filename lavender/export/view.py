@@ -42,7 +42,7 @@ METHODS = {
     if spec.own and not spec.external
 }
 #: Those whose factor is LAPACK's in the package, or whose turns are chosen there: others bits, the same judge.
-OTHER_BITS = ("lemke", "admm", "auto")
+OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
 

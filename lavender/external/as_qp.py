@@ -35,9 +35,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.cones import ROW
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows
 from lavender.external.running import Answer, Call, Limits, proof, quiet
 from lavender.solution import Status

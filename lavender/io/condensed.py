@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.io.stored import Budget
 from lavender.lu import sparse_lu
@@ -23,7 +22,7 @@ def condensed(
     mass: sp.csr_array, jt: sp.csr_array, f: FloatArray, budget: Budget
 ) -> tuple[sp.csr_array, FloatArray]:
     """A (m, m) and J M^-1 f (m,) of M (n, n), J^T (n, m) and f (n,); raises InputError where they take too much."""
-    label = csgraph.connected_components(mass, directed=False)[1]
+    label = sp.csgraph.connected_components(mass, directed=False)[1]
     budget.spend(ENTRY * most_entries(label, jt), "A = H^T M^-1 H")
     solve = _factor(mass, label, budget)
     m = jt.shape[1]
@@ -62,7 +61,7 @@ def _factor(matrix: sp.csr_array, label: np.ndarray, budget: Budget) -> Callable
     try:
         if dense <= budget.left:
             return sparse_lu(matrix).solve
-        order = csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
+        order = sp.csgraph.reverse_cuthill_mckee(sp.csr_array(matrix), symmetric_mode=False)
         permuted = sp.coo_array(matrix[order][:, order])
         off = permuted.row.astype(np.int64) - permuted.col
         width = 2 * int(off.max(initial=0)) - int(off.min(initial=0)) + 1

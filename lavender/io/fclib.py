@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from scipy.sparse import csgraph
 
 from lavender._arrays import FloatArray, as_array
+from lavender._later import sparse as sp
 from lavender.cones import CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
@@ -122,7 +121,7 @@ class Contents:
         n = self.M.shape[0]
         if n == 0:
             return None
-        size = np.bincount(csgraph.connected_components(self.M, directed=False)[1]).astype(float)
+        size = np.bincount(sp.csgraph.connected_components(self.M, directed=False)[1]).astype(float)
         if 4 * ENTRY * float(size @ size) > max_bytes:
             return None
         try:
@@ -418,9 +417,11 @@ def contents(
         form = "local" if problem.matrix is not None or soft else "global"
     if form not in ("local", "global"):
         raise InputError(f"form is {form!r}; 'local' or 'global' is needed")
-    unknown = sorted(set(drop) - {"names", "key"})
+    unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
-        raise InputError(f"drop names {', '.join(unknown)}; only 'names' and 'key' may be left out")
+        raise InputError(
+            f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
+        )
     reasons = _cannot_hold(problem, form, drop)
     if reasons:
         text = "; ".join(reasons)
@@ -493,6 +494,12 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         reasons.append("names of blocks (drop=('names',) leaves them out)")
     if problem.key is not None and "key" not in drop:
         reasons.append("keys of blocks (drop=('key',) leaves them out)")
+    if problem.generalized is not None and problem.generalized.names is not None and "names" not in drop:
+        reasons.append("names of velocities (drop=('names',) leaves them out)")
+    if problem.precision != "float64" and "precision" not in drop:
+        reasons.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
+    if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
+        reasons.append("half a surrogate pair in its name (give it another)")
     if form == "global":
         reasons += _no_global_form(problem)
     return reasons

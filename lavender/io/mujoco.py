@@ -47,9 +47,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray, read_only
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import CapabilityError
 from lavender.problem import Problem
 

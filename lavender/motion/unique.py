@@ -44,9 +44,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
 from lavender.problem import Problem
@@ -91,13 +91,11 @@ def uniqueness(problem: Problem) -> Uniqueness:
     count = np.diff(c.ptr)
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
-    from scipy.sparse import csgraph
-
     a = problem.csr
     block = np.repeat(np.arange(c.n_blocks), count)
     # Rows of one contact belong together whatever A says: the disk joins them.
     chain = sp.csr_array((np.ones(problem.m), (np.arange(problem.m), c.ptr[block])), shape=a.shape)
-    _, label = csgraph.connected_components(abs(a) + chain, directed=False)
+    _, label = sp.csgraph.connected_components(abs(a) + chain, directed=False)
     reasons, kappa = [], 0.0
     for island in _islands(label):
         if not friction[island].any():

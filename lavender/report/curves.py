@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
@@ -267,7 +267,6 @@ class Figures:
     profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
     sequences: Mapping[str, tuple[Figure, ...]]
     over: tuple[Figure, ...] = ()  # the one over all cases
-    peers: Mapping[str, tuple[Figure, ...]] = field(default_factory=dict)  # `lavender.report.rivals`
     moved: Figures | None = (
         None  # the same with motion errors [m/s] in place of residuals, where they are known
     )
@@ -275,7 +274,7 @@ class Figures:
     def __iter__(self) -> Iterator[Figure]:
         yield from self.over
         yield from self.families.values()
-        for group in (self.profiles, self.sequences, self.cases, self.peers):
+        for group in (self.profiles, self.sequences, self.cases):
             for some in group.values():
                 yield from some
         if self.moved is not None:

@@ -15,8 +15,7 @@ __all__ = ["Cell", "Table", "latex", "markdown", "print_table", "tex"]
 #: Heads of columns that hold words; what stands under any other is a number.
 WORDS = frozenset({
     "case", "solver", "status", "claim", "form", "structure", "law", "change", "asked", "hardest", "sequence",
-    "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "fastest here", "problem",
-    "problems", "scene", "ours", "fastest peer", "engine", "time / ours",
+    "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "fastest here",
 })  # fmt: skip
 COLOURS = {"good": "green", "warn": "yellow", "bad": "red"}
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import InputError
 from lavender.problem import Problem

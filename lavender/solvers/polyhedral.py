@@ -20,9 +20,9 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.certificates import check_certificate
 from lavender.cones import ROW, project
 from lavender.deadline import Deadline

@@ -12,6 +12,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.pivot.principal cimport pivoting_t
@@ -73,3 +74,11 @@ cdef int32_t direct_first(direct_t* t, int32_t sweeps, int32_t n) noexcept nogil
 cdef int32_t direct_rounds(direct_t* t, int32_t n) noexcept nogil
 cdef void direct_begin_passes(direct_t* t, int32_t stuck) noexcept nogil
 cdef int32_t direct_pass(direct_t* t, int32_t n) noexcept nogil
+
+
+cdef class Pivoting:
+    cdef direct_t t
+    cdef Data p, judged
+    cdef object reals, ints, order, outside, error
+
+    cdef int told(self, int32_t code) except -1

@@ -395,10 +395,6 @@ cdef class Pivoting:
         Every row is free; A is symmetric. Without `outside`: else LU, in room for a band of m - 1, as rows stand.
     """
 
-    cdef direct_t t
-    cdef Data p, judged
-    cdef object reals, ints, order, outside, error
-
     def __init__(self, Data p, int band, order, double tiny, Data judged=None, outside=None, bint linear=False,
                  bint symmetric=True):
         cdef int32_t m = p.blocks.n_rows
@@ -496,6 +492,11 @@ cdef class Pivoting:
     def relative(self):
         """Relative residual of the best impulse, inf before any."""
         return self.t.relative
+
+    @property
+    def floor(self):
+        """What rounding alone costs it, relative."""
+        return self.t.floor
 
     @property
     def turn(self):

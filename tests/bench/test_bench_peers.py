@@ -12,14 +12,14 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks.peers import command, engines_table, solvers_tables
+from benchmarks.peers import engines, race
+from benchmarks.peers import tables as comparison
+from benchmarks.peers.command import command, engines_table, solvers_tables
+from benchmarks.peers.contest import Result, ours
+from benchmarks.peers.problems import problems
 from lavender import suite
-from lavender.bench import peers
-from lavender.bench.peers import adapters, engines, problems, race
-from lavender.bench.peers.contest import Contestant, Result
-from lavender.cli.entry import cli
-from lavender.report import compared as comparison
-from lavender.report import rivals
+from lavender.bench.peers import adapters
+from lavender.bench.peers.adapters import Contestant
 
 SMALL = {  # laws and kinds of bounds that adapters must translate
     "lcp": "box_stack(n=2)",
@@ -37,7 +37,7 @@ def reached(contestant, problem, limit=5.0):
 
 
 def by_name(name, siconos=""):
-    return next(c for c in adapters.contestants(siconos) if c.name == name)
+    return next(c for c in [*ours(), *adapters.contestants(siconos)] if c.name == name)
 
 
 def is_adapter(name):
@@ -247,92 +247,3 @@ def test_command(tmp_path):
     if importlib.util.find_spec("pybullet") is not None:
         assert any("pybullet" in s["engine"] for s in record["steps"])
     assert "not here: " in done.output and "| stack6 | lavender newton |" in done.output
-
-
-# -- in the report ---------------------------------------------------------------------------------
-
-
-def written(tmp_path):
-    """A run as it is kept: engines on one scene by hand, `results_by_hand`, and a peer that did not run."""
-    steps = [
-        engines.Step("stack6", "lavender, 16 sweeps", False, 1e-5, 24, 1e-4, 1e-9, 1e-6),
-        engines.Step("stack6", "<b>other</b>", False, 5e-6, 24, 1e-4, 1e-3, math.nan),
-        engines.Step("stack6", "late", False, math.nan, 0, math.nan, math.nan, math.nan, "did not settle"),
-    ]
-    missing = Result("big", 2000, "lcp", "piqp", True, [], "ImportError: no module")
-    path = tmp_path / "peers.json"
-    versions = {name: "1" for name in peers.PACKAGES if name != "scs"}
-    peers.Peers("a cpu", versions, steps, [*results_by_hand(), missing]).write(path)
-    return path
-
-
-def test_what_was_written_is_read(tmp_path):
-    found = peers.read(written(tmp_path))
-    assert found.results[:-1] == results_by_hand()
-    assert [s.engine for s in found.steps] == ["lavender, 16 sweeps", "<b>other</b>", "late"]
-    assert found.cpu == "a cpu" and found.absent == ["scs"]
-
-
-@pytest.mark.parametrize(
-    "text", ["", "{", "[]", "{}", '{"cpu": "", "versions": {}, "steps": [{"no": 1}], "solvers": []}', "\0"]
-)
-def test_other_files_are_refused(tmp_path, text):
-    path = tmp_path / "p.json"
-    path.write_text(text)
-    with pytest.raises(lv.InputError, match=r"p\.json.*benchmarks peers --out"):
-        peers.read(path)
-    with pytest.raises(lv.InputError, match="cannot read"):
-        peers.read(tmp_path / "absent.json")
-
-
-def test_the_report_shows_peers_with_losses(tmp_path):
-    plan = lv.bench.Plan(levels=(1e-3,), budgets=(4,), repeats=1)
-    records = lv.bench.run(["stack(n=2)"], ["pgs"], plan=plan)
-    run = peers.read(written(tmp_path))
-    text = lv.report.write(records, tmp_path / "r", peers=run).read_text()
-    assert 'aria-label="ours over the fastest peer' in text
-    assert "Lost: 3 of 6." in text and "did not settle" in text
-    assert "Not installed there: scs." in text and "piqp on big: ImportError: no module" in text
-    # each side's time and the judged error: of a solver at the level, of an engine what its step leaves
-    assert "<td>pgs, 1.00 s</td><td>osqp, 10.0 s</td>" in text
-    assert '<td>1 (10.0 µs)</td><td class="n">24</td>' in text and '<td class="n">1.0e-6</td>' in text
-    assert "<b>other</b>" not in text.replace("\\u003cb", "") and "&lt;b&gt;other" in text
-    for name in ("peers", "peers_scene_stack6", "peers_big"):
-        assert (tmp_path / "r" / "figures" / f"{name}.svg").stat().st_size > 1000
-    (over,) = rivals.figures(run)["over"]
-    ratios = {c.label: dict(zip(c.x, c.y, strict=True)) for c in over.curves}
-    assert ratios["to 1e-3"] == {2000.0: 0.1, 8.0: 3.0}
-    assert all(c.points for c in over.curves)
-    without = lv.report.write(records, tmp_path / "q", figures=False).read_text()
-    assert "Other engines and solvers" not in without
-
-
-def test_the_command_takes_a_run_of_peers(tmp_path):
-    words = [
-        "report",
-        "stack(n=2)",
-        "--solvers",
-        "pgs",
-        "--levels",
-        "1e-3",
-        "--budgets",
-        "4",
-        "--repeats",
-        "1",
-    ]
-    out = ["--no-figures", "--out", str(tmp_path / "r")]
-    done = CliRunner().invoke(cli, [*words, *out, "--peers", str(written(tmp_path))], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    assert "Other engines and solvers" in (tmp_path / "r" / "index.html").read_text()
-    shown = [
-        "report",
-        str(tmp_path / "r" / "records.jsonl"),
-        "--no-figures",
-        "--out",
-        str(tmp_path / "again"),
-    ]
-    done = CliRunner().invoke(cli, [*shown, "--peers", str(written(tmp_path))], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    assert "Other engines and solvers" in (tmp_path / "again" / "index.html").read_text()
-    with pytest.raises(lv.InputError, match="benchmarks peers --out"):
-        CliRunner().invoke(cli, [*words, *out, "--peers", str(tmp_path / "absent")], catch_exceptions=False)

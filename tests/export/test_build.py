@@ -113,7 +113,10 @@ def test_rust_and_javascript_have_the_hash_of_c(folder, shared, compiler, tmp_pa
             print(reason)
     if shutil.which("cargo"):
         export.write("rust", tmp_path / "rust")
-        where = {"cwd": tmp_path / "rust"}
+        plain = tmp_path / "cc"  # 20 s of optimising change no bit
+        plain.write_text(f'#!/bin/sh\nexec {compiler} "$@" -O0\n')
+        plain.chmod(0o755)
+        where = {"cwd": tmp_path / "rust", "env": {**os.environ, "CC": str(plain)}}
         assert tower("cargo", "run", "--offline", "--release", "-q", "--example", "tower", **where) == wanted
         run("cargo", "test", "--offline", "--release", "-q", "--lib", **where)
         ran += 1
@@ -149,7 +152,7 @@ def test_cmake_builds_installs_and_is_found(folder, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name, what", [("gcc", "address,undefined"), ("clang", "memory")])
 def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
-    flags = ["-std=c11", "-O1", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
+    flags = ["-std=c11", "-O0", "-g1", f"-fsanitize={what}", "-fno-sanitize-recover=all", "-I", folder]
     (tmp_path / "empty.c").write_text("int main(void) { return 0; }\n")
     if (
         shutil.which(name) is None
@@ -204,9 +207,9 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, *link, "-o", tmp_path / "check")
     said = run(tmp_path / "check", cwd=tmp_path)
     assert (
-        len(re.findall("^same ", said, re.MULTILINE)) == count - 3
-    )  # `lemke`, `admm`, `auto` are held to the residual
-    assert len(re.findall("^met ", said, re.MULTILINE)) == 3
+        len(re.findall("^same ", said, re.MULTILINE)) == count - 2
+    )  # `admm`, `auto` are held to the residual
+    assert len(re.findall("^met ", said, re.MULTILINE)) == 2
     data = bytearray((tmp_path / "vectors.bin").read_bytes())
     data[-8] ^= 1  # the last bit of the last impulse
     (tmp_path / "vectors.bin").write_bytes(data)

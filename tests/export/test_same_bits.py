@@ -118,7 +118,7 @@ def test_every_method_has_the_bits_of_the_package(library, at):
         assert (
             said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
         )
-        if tol and name not in ("newton", "direct"):
+        if (tol or name == "lemke") and name not in ("newton", "direct"):
             assert said.iterations == found.iterations, case
     assert ran >= 4
 

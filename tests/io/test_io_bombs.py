@@ -13,6 +13,7 @@ import zipfile
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 
 import lavender as lv
 import lavender.io
@@ -263,7 +264,7 @@ def test_a_condensed_matrix_is_never_larger_than_expected():
             i, j = rng.integers(0, n, 2)
             mass[i, j] = mass[j, i] = mass[i, j] + (1.0 if i == j else 0.1)
         file = contents(mass, h)
-        label = fclib.csgraph.connected_components(file.M, directed=False)[1]
+        label = connected_components(file.M, directed=False)[1]
         assert file.problem().csr.nnz <= most_entries(label, file.H)
 
 

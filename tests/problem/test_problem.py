@@ -19,6 +19,7 @@ from random_problems import (
     random_lcp,
     random_rows,
     seeds,
+    touching,
 )
 
 import lavender as lv
@@ -137,10 +138,8 @@ def test_rows_have_names():
 
 def test_pinned_bodies_are_legal():
     """A body of infinite mass gives empty rows of A."""
-    rows = lv.Rows(
-        inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)), v_free=np.ones((1, 6)), normal=[[0, 0, 1.0]] * 2,
-        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, 0], [0, -1]],
-    )  # fmt: skip
+    still = {"inv_mass": [0.0], "inv_inertia": np.zeros((1, 3, 3)), "v_free": np.ones((1, 6))}
+    rows = touching([[-1, 0], [0, -1]], **still)
     problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
     assert not problem.csr.toarray().any()
     np.testing.assert_array_equal(problem.d, [1.0, 1.0])
@@ -220,6 +219,10 @@ BAD_ROWS = {
     "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+    "axes whose product is inf - inf": (
+        {"normal": np.tile([1e200, 1e200, 0], (8, 1)), "tangent": np.tile([1e200, -1e200, 0], (8, 1))},
+        "off by inf",
+    ),
     "tangent": (
         {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
         "orthogonal",
@@ -293,25 +296,9 @@ def test_an_unknown_solver_gets_the_nearest_names():
     with pytest.raises(lv.UnknownName, match="did you mean 'jacobi'") as raised:
         lv.solve(random_lcp(0), "jakobi")
     assert isinstance(raised.value, KeyError)
-    with pytest.raises(lv.InputError, match="Problem is needed"):
-        lv.solve(I2, "pgs")
-    for ask in (lv.available, lv.known, lv.cross_check):
+    for ask in (lv.solve, lv.available, lv.known, lv.cross_check):
         with pytest.raises(lv.InputError, match="Problem is needed"):
             ask(I2)
-    with pytest.raises(lv.UnknownName, match="unknown solver"):
-        lv.solve(random_lcp(0), ["pgs"])
-    with pytest.raises(lv.InputError, match="capability 'fast'"):
-        lv.available(fast=True)
-    with pytest.raises(lv.UnknownName, match="law"):
-        lv.available(law="ncp")
-
-
-def test_raise_for_status():
-    problem = random_lcp(0)
-    good = lv.solve(problem, "pgs", tol=1e-6, max_iter=20_000)
-    assert good.raise_for_status() is good
-    with pytest.raises(lv.SolveFailed, match="MAX_ITERATIONS"):
-        lv.solve(problem, "pgs", tol=1e-12, max_iter=1).raise_for_status()
 
 
 # -- the registry --------------------------------------------------------------------------------------------
@@ -390,30 +377,21 @@ def makers(sparse):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.csc_array, sp.coo_array])
+@pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.csc_array, sp.coo_array, sp.bsr_array])
 @pytest.mark.parametrize("maker", makers(None))
 def test_arrays_that_are_copied_stay_writable_and_unshared(maker, sparse):
-    given = given_arrays()
-    problem = makers(sparse)[maker](given)
+    given, matrices = given_arrays(), []
+    form = sparse and (lambda a: matrices.append(sparse(a)) or matrices[-1])
+    problem = makers(form)[maker](given)
     before = pickle.dumps(problem)
     assert [name for name, array in given.items() if not array.flags.writeable] == []
     kept = arrays_of(problem, "problem", set())
     assert [k for k, x in kept for y in given.values() if x.size and np.shares_memory(x, y)] == []
     for array in given.values():
         array[...] = array + 1  # a loop fills its arrays anew
-    assert pickle.dumps(problem) == before
-
-
-@pytest.mark.parametrize("sparse", [sp.csr_array, sp.csc_array, sp.coo_array, sp.bsr_array])
-def test_sparse_matrices_that_are_copied_stay_writable_and_unshared(sparse):
-    given = given_arrays()
-    a, jac, mass = (sparse(given[name]) for name in "AJM")
-    problem = lv.Problem.lcp(a, given["b"])
-    general = lv.Problem.from_jacobian(jac, mass, given["v"], cones=lv.Cones.free(len(given["J"])))
-    before = pickle.dumps((problem, general))
-    for matrix in (a, jac, mass):
+    for matrix in matrices:
         matrix.data += 1.0
-    assert pickle.dumps((problem, general)) == before
+    assert pickle.dumps(problem) == before
 
 
 def test_arrays_that_are_adopted_are_shared_and_read_only():

@@ -149,21 +149,23 @@ def test_singular_linear_systems_say_their_rank(m):
     assert solution.work["rank"] == rank
 
 
-@pytest.mark.parametrize("kind", ["symmetric", "asymmetric"])
+@pytest.mark.parametrize(
+    ("kind", "solver"), [("symmetric", "direct"), ("symmetric", "newton"), ("asymmetric", "direct")]
+)
 @given(seed=seeds, m=st.integers(2, 12))
-def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, seed, m):
+def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, solver, seed, m):
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, m - 1))
     a = symmetric(g @ g.T) if kind == "symmetric" else g @ rng.normal(size=(m - 1, m))
     left = np.linalg.svd(a)[0][:, -1]
     problem = lv.Problem.linear(a, a @ rng.normal(size=m) + left)
     assume(check_certificate(problem, left) is None)  # where not even this is a proof to rounding, nothing is
-    solution = lv.solve(problem, "direct")
+    solution = lv.solve(problem, solver)
     assert solution.status is lv.Status.INFEASIBLE, solution
     assert check_certificate(problem, solution.certificate) is None
 
 
-@pytest.mark.parametrize("solver", ["direct", "lemke", "auto"])
+@pytest.mark.parametrize("solver", ["direct", "lemke", "newton", "auto"])
 @given(seed=seeds, m=st.integers(2, 14))
 def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
     problem = without_solution(seed, m)

@@ -11,8 +11,8 @@ from random_problems import good, random_lcp, seeds
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
-from lavender.solvers import lemke
-from lavender_ext.pivot.tableau import DONE, HELD, PIVOTS, RAY, follow
+from lavender.solvers.pivoting import PivotState
+from lavender_ext.pivot.lemke import DONE, PIVOTS, RAY, Lemke
 
 
 def random_bounds(rng, m):
@@ -31,31 +31,36 @@ def random_mix(seed, m):
     return g @ g.T + 0.5 * np.eye(m) + skew - skew.T, 2.0 * rng.normal(size=m), low, high
 
 
+def paths_of(problem):
+    """The rows of a problem and the paths on them, begun at its start."""
+    rows = PivotState(problem).rows
+    paths = Lemke(rows)
+    paths.begin(problem.start())
+    return rows, paths
+
+
 @given(seed=seeds, m=st.integers(1, 6))
 def test_a_compiled_path_ends_where_enumeration_does(seed, m):
-    a, b, low, high = random_mix(seed, m)
-    problem = lv.Problem.lcp(a, b, low, high)
-    at, x = np.full(m, 7, np.int32), np.full(m, np.nan)
-    assert follow(problem.csr_data, 1e-11, 20 * m, at, x)[0] == DONE
-    ((truth, _),) = enumerate_lcp(a, b, low, high)
-    bounded = np.isfinite(low) | np.isfinite(high)
-    np.testing.assert_allclose(x[bounded], truth[bounded], atol=1e-7)
-    assert np.isnan(x[~bounded]).all() and not at[~bounded].any()
-    np.testing.assert_array_equal(truth[at == -1], low[at == -1])
-    np.testing.assert_array_equal(truth[at == 1], high[at == 1])
-    assert set(at) <= {-1, 0, 1}
+    problem = lv.Problem.lcp(*random_mix(seed, m))
+    rows, paths = paths_of(problem)
+    assert paths.run(20 * m) == DONE
+    ((truth, _),) = enumerate_lcp(problem.dense(), problem.b, problem.cones.lower, problem.cones.upper)
+    np.testing.assert_allclose(rows.best.impulse, truth, atol=1e-7)
+    assert paths.run(20 * m) == DONE, "the last word is the last"
 
 
-def test_a_compiled_path_stops_at_its_pivots_at_a_ray_and_before_free_rows_it_cannot_eliminate():
-    at, x = np.zeros(2, np.int32), np.zeros(2)
-    problem = lv.Problem.lcp(np.eye(2), [1.0, 2.0])
-    assert follow(problem.csr_data, 1e-11, 1, at, x) == (PIVOTS, 1)
-    assert follow(problem.csr_data, 1e-11, 9, at, x)[0] == DONE
-    np.testing.assert_allclose(x, [1.0, 2.0])
-    ray = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0])
-    assert follow(ray.csr_data, 1e-11, 9, at, x)[0] == RAY
-    saddle = lv.Problem.lcp([[1.0, 1.0], [-1.0, 1e-14]], [1.0, 1.0], [0.0, -np.inf], [np.inf, np.inf])
-    assert follow(saddle.csr_data, 1e-11, 9, at, x)[0] == HELD
+def test_a_compiled_path_stops_at_its_pivots_and_at_a_ray_and_splits_free_rows_it_cannot_eliminate():
+    rows, paths = paths_of(lv.Problem.lcp(np.eye(2), [1.0, 2.0]))
+    assert (paths.run(1), paths.pivots) == (PIVOTS, 1)
+    assert paths.run(9) == DONE
+    np.testing.assert_allclose(rows.best.impulse, [1.0, 2.0])
+    _, paths = paths_of(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]))
+    assert paths.run(9) == RAY
+    np.testing.assert_allclose(paths.ray[0], paths.ray[1])
+    low = [0.0, -np.inf]
+    rows, paths = paths_of(lv.Problem.lcp([[1.0, 1.0], [-1.0, 1e-14]], [1.0, -1.0], low, [np.inf, np.inf]))
+    assert paths.run(9) == DONE
+    np.testing.assert_allclose(rows.best.impulse, [1.0, 0.0], atol=1e-12)
 
 
 @given(seed=seeds, m=st.integers(1, 6))
@@ -105,11 +110,12 @@ def test_free_rows_that_no_pivot_reaches_are_split():
     assert good(solution), solution
 
 
+@pytest.mark.parametrize("solver", ["lemke", "auto"])
 @pytest.mark.parametrize(("a", "b"), [([[-1.0]], [1.0]), ([[0.0, -1.0], [1.0, 0.0]], [1.0, -1.0])])
-def test_infeasible_without_symmetry(a, b):
+def test_infeasible_without_symmetry(a, b, solver):
     """w_1 < 0 whatever lambda is: y = e_1 has A^T y <= 0 and b.y > 0."""
     problem = lv.Problem.lcp(a, b)
-    solution = lv.solve(problem, "lemke")
+    solution = lv.solve(problem, solver)
     assert solution.status is lv.Status.INFEASIBLE
     assert check_certificate(problem, solution.certificate) is None
 
@@ -143,29 +149,33 @@ def test_pivots_in_parts_are_those_of_one_call_to_the_bit(seed, m, cuts, singula
         g[:, : m // 2] = 0.0
     low, high = random_bounds(rng, m)
     problem = lv.Problem.lcp(g @ g.T + skew - skew.T, 2.0 * rng.normal(size=m), low, high)
-    solver = registry.get("lemke").load()()
-    state, whole = solver.prepare(problem), problem.start()
-    one = solver.resume(state, whole, 10_000, 1e-9)
-    state, parts = solver.prepare(problem), problem.start()
-    claims = [solver.resume(state, parts, n, 1e-9) for n in [*cuts, 10_000]]
-    assert claims[-1].status is one.status
-    assert sum(c.iterations for c in claims) == one.iterations
-    for kind in one.work:
-        assert sum(c.work.get(kind, 0) for c in claims) == one.work[kind]
-    assert parts.tobytes() == whole.tobytes()
-    assert solver.resume(state, parts, 5, 1e-9).iterations == 0  # the last word is the last
-    again = problem.start()
-    assert solver.run(state, again, 10_000, 1e-9).iterations == one.iterations  # `run` begins anew
-    assert again.tobytes() == whole.tobytes()
+    ends = []
+    for parts in ([], cuts):
+        rows, paths = paths_of(problem)
+        codes = [paths.run(n) for n in [*parts, *9 * [10_000]]]  # rays end a call, too
+        ends.append((codes[-1], paths.pivots, paths.paths, rows.work, rows.best.impulse.tobytes()))
+    assert ends[0] == ends[1]
+    state, solver = PivotState(problem), registry.get("lemke").load()()
+    for _ in range(2):  # `run` begins anew
+        impulse = problem.start()
+        claim = solver.run(state, impulse, 10_000, 1e-9)
+        assert claim.iterations <= ends[0][1]  # less where a ray is a proof
+        assert claim.status is lv.Status.INFEASIBLE or impulse.tobytes() == ends[0][4]
 
 
-def test_the_end_of_a_path_is_counted_by_the_rows_found_free(monkeypatch):
-    monkeypatch.setattr(lemke, "FORMED", 1e-4)
-    m = 60
-    problem = lv.Problem.lcp(2.0 * np.eye(m), np.where(np.arange(m) < 6, 1.0, 3.0), np.zeros(m), np.ones(m))
-    solution = lv.solve(problem, "lemke", time_limit=10.0)  # 6 free: 0.02 s; all of the dictionary: 173 s
-    assert solution.success
-    assert solution.work["factorisations"] == 1
+def test_a_factor_that_would_end_too_late_is_not_begun():
+    problem = random_lcp(3, 80)
+    solver, impulse = registry.get("lemke").load()(), problem.start()
+    rng = np.random.default_rng(0)
+    skew = rng.normal(size=(80, 80))
+    problem = lv.Problem.lcp(problem.dense() + skew - skew.T, problem.b)
+    state = PivotState(problem)
+    state.outside.seconds = 1e9
+    claim = solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert "factorisations" not in claim.work
+    state.outside.seconds = 0.0
+    assert solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0).status is lv.Status.CONVERGED
 
 
 def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
@@ -179,7 +189,5 @@ def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
 
 def test_a_prepared_solve_that_is_cut_keeps_no_path():
     prepared = lv.prepare(random_lcp(3, 60), "lemke")
-    cut = prepared.solve(max_iter=2)
-    assert cut.status is lv.Status.MAX_ITERATIONS
-    assert prepared.state.walk is None  # a dictionary of every row
+    assert prepared.solve(max_iter=2).status is lv.Status.MAX_ITERATIONS
     assert prepared.solve().iterations == lv.solve(random_lcp(3, 60), "lemke").iterations

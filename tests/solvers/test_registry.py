@@ -141,7 +141,7 @@ def raises():
 )
 def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypatch):
     entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
-    monkeypatch.setattr(registry, "entry_points", lambda group: entries)
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "registered", {})
     registry.load.cache_clear()
     try:

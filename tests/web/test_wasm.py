@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import lavender as lv
@@ -16,7 +15,6 @@ from lavender.scene import SCENES
 from lavender.web import compile as wasm
 from lavender.web import cut, pages
 from lavender.web.scenes import describe, page_scenes
-from lavender_ext.host import memory
 
 HERE = Path(__file__).resolve().parent.parent
 ROOT = HERE.parent
@@ -239,19 +237,6 @@ def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     done = node(CHECK, module_file, tmp_path)
     assert done.returncode == 1
     assert sign in done.stderr
-
-
-def test_structs_lie_by_the_rules_of_c():
-    """Every field at a multiple of its width, the whole at a multiple of the widest."""
-    for name, (size, offsets) in memory.layout().items():
-        at, widest = 0, 1
-        for field, kind in memory.STRUCTS[name].items():
-            width = np.dtype(np.intp).itemsize if kind == "p" else int(kind[-1])
-            at = -(-at // width) * width
-            assert offsets[field] == at, (name, field)
-            at += width * int(kind[:-2] or 1)
-            widest = max(widest, width)
-        assert size == -(-at // widest) * widest, name
 
 
 # -- scenes and command ----------------------------------------------------------------------------------------

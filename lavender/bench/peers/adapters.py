@@ -1,12 +1,9 @@
-"""Time to a given error: every solver here against the solvers of others, on the same problems, by one judge.
+"""Solvers of others on a problem by their own interface: time to a given error, judged like ours.
 
-A contestant runs a problem at tighter and tighter settings of its own; each run gives a time and the judge's
-residual, and the time to an error is the least time of a run that has it, whatever was asked. Ours get a
-problem whose A is known and pay for the solver's set-up and solve; "from scratch" they pay for forming A too.
-The others get it in their better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in the
-layout they read): conversion and judging are not counted, the call of their own interface is. CPU time, least
-of several; each contestant runs in a process of its own, which may die or be ended; contestants take turns, and
-the quick ones run again in later rounds.
+A contestant runs a problem at tighter and tighter settings of its own; each run gives a time and an impulse, and the
+time to an error is the least time of a run that has it, by the judge, whatever was asked. It gets a problem in its
+better form (impulse or velocity form of `lavender.external.as_qp`, scaled, in the layout it reads): conversion and
+judging are not counted, the call of its own interface is, in CPU time.
 """
 
 from __future__ import annotations
@@ -15,8 +12,8 @@ import functools
 import importlib.util
 import subprocess
 import tempfile
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import monotonic, process_time
 from typing import Any
@@ -26,7 +23,6 @@ import scipy.sparse as sp
 
 from lavender import registry
 from lavender._arrays import FloatArray
-from lavender.bench.peers.contest import SCRATCH, TARGETS, Call, Contestant
 from lavender.cones import CONTACT
 from lavender.errors import InputError
 from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
@@ -37,9 +33,8 @@ from lavender.external.running import Limits
 from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solve import prepare
 
-__all__ = ["LADDER", "check_siconos", "contestants"]
+__all__ = ["LADDER", "Call", "Contestant", "Runs", "check_siconos", "contestants"]
 
 #: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
 LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
@@ -50,32 +45,18 @@ QUICK = {
 }
 DENSE_ROWS = 1700  # rows up to which Siconos' solvers of dense matrices are asked
 
-# -- ours ------------------------------------------------------------------------------------------
+Call = Callable[[], tuple[float, FloatArray]]  # one run: s of CPU, impulse (m,) [N s]
+Runs = Callable[[Problem, float], Iterator[Call]]  # problem, limit [s] -> a call for each setting
 
 
-def _ours(name: str, scratch: bool) -> Contestant:
-    """`prepare` and `solve` of a problem of which A and d are known, or of one of which nothing is yet."""
+@dataclass(frozen=True)
+class Contestant:
+    """A solver with its form."""
 
-    def runs(problem: Problem, limit: float) -> Iterator[Call]:
-        def once(tol: float) -> tuple[float, FloatArray]:
-            given = replace(problem, copy=False) if scratch else problem
-            start = process_time()
-            prepared = prepare(given, name)
-            seconds = process_time() - start
-            reference(given)  # the judge's
-            first = given.start()
-            start = process_time()
-            impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
-            return seconds + process_time() - start, impulse
-
-        if not scratch:
-            reference(problem)
-            if problem.csr_data.d.size and "rows" in registry.get(name).operators:
-                _ = problem.data
-        for tol in TARGETS:
-            yield functools.partial(once, tol)
-
-    return Contestant(name + SCRATCH * scratch, False, runs, registry.get(name).refuses)
+    name: str
+    peer: bool
+    runs: Runs = field(repr=False)
+    refuses: Callable[[Problem], str | None] = field(default=lambda _: None, repr=False)
 
 
 # -- QP and cone backends --------------------------------------------------------------------------
@@ -359,7 +340,7 @@ def _installed(module: str) -> bool:
 
 
 def contestants(siconos: str = "") -> list[Contestant]:
-    """Every solver of ours, and every installed one of others in each of its forms.
+    """Every installed solver of others, in each of its forms.
 
     Parameters
     ----------
@@ -371,8 +352,7 @@ def contestants(siconos: str = "") -> list[Contestant]:
     InputError
         That interpreter has none.
     """
-    ours = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
-    made = [_ours(name, scratch) for name in ours for scratch in (False, True)]
+    made: list[Contestant] = []
     for backend in BACKENDS:
         if registry.specs()[backend.name].missing() is not None:
             continue

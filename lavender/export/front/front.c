@@ -59,7 +59,7 @@ struct lav_solver {
   int32_t driven;              /* Newton's method has begun, as `asked` says */
   blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
   struct pivot_direct_direct_t direct;
-  int32_t pivots, *whole;      /* of Lemke's path */
+  struct pivot_lemke_lemke_t lemke;
   double *table;               /* Lemke's dictionary, or the factor of admm */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;

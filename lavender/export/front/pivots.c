@@ -2,43 +2,41 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- direct and lemke: pivots on bounded rows ------------------------------------------------------------------------- */
 
-enum { GUESS_SWEEPS = 2, BATCH = 32, STAYING = 6 }; /* rounds between two looks at the clock; passes that gain nothing */
-static const double TINY_PIVOT = 1e-13, TINY_PATH = 1e-11;
+enum { GUESS_SWEEPS = 2, BATCH = 32, STAYING = 6 }; /* rounds or pivots between two looks at the clock; passes that gain nothing */
+static const double TINY_PIVOT = 1e-13;
 
 static int32_t prepare_pivots(lav_solver *s) {
   struct pivot_direct_direct_t *t = &s->direct;
   const int64_t m = s->p.n_rows;
-  int32_t bands[2] = {0, 0}, band, i, *index;
-  int64_t n = m;
+  int32_t bands[2] = {0, 0}, band, i, *index, *whole = NULL;
   double size[2] = {0.0, 0.0}, *real;
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
   t->symmetric = size[1] == 0.0 || size[0] / size[1] <= 1e-14;
   band = !t->symmetric ? (int32_t)m - 1 : bands[0] > bands[1] ? bands[0] : bands[1];
   t->linear = 1;
-  for (i = 0; i < m; i++) {
+  for (i = 0; i < m; i++)
     if (s->p.lower[i] != -INFINITY || s->p.upper[i] != INFINITY) t->linear = 0;
-    n += s->p.lower[i] != -INFINITY && s->p.upper[i] != INFINITY;
-  }
   for (i = 0; i < s->p.n_blocks; i++)
     if (s->p.kind[i] != LAV_ROW) t->linear = 0;
   real = TAKE(s, double, pivot_direct_direct_real(&s->read, band));
   index = TAKE(s, int32_t, pivot_direct_direct_index(&s->read));
   if (s->options.method == LAV_LEMKE) {
-    s->table = TAKE(s, double, n * (n + 2));
-    s->whole = TAKE(s, int32_t, 13 * m + 2);
+    s->table = TAKE(s, double, pivot_lemke_lemke_real(&s->p));
+    whole = TAKE(s, int32_t, pivot_lemke_lemke_index(&s->p));
   }
   if (s->is_short) return LAV_ERROR_ROOM;
   t->e0 = s->start[0];
   t->v0 = s->start[1];
   t->least = 1e-13;
   pivot_direct_direct_lay(t, &s->read, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
+  if (whole) pivot_lemke_lemke_lay(&s->lemke, t, s->table, whole);
   return LAV_OK;
 }
 
 /* Rounds until the next look at the clock, within the budget. */
 static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
-  const int32_t left = budget->iterations - s->pivots - s->direct.s.n_rounds;
+  const int32_t left = budget->iterations - s->direct.s.n_rounds;
   return left < BATCH ? left : BATCH;
 }
 
@@ -91,33 +89,28 @@ static int32_t pivot_all(lav_solver *s, const lav_budget *budget, lav_result *ou
   return proximal(s, budget, code == pivot_principal_STUCK);
 }
 
-/* Lemke's path, then exchanges from the sides on which it leaves the rows. */
-static int32_t follow_path(lav_solver *s, const lav_budget *budget) {
-  struct pivot_direct_direct_t *t = &s->direct;
-  lav_budget after = *budget;
-  int32_t code;
-  COPY(t->s.x, s->impulse, s->p.n_rows);
-  code = k_lemke_rows(&s->q, &s->a, TINY_PATH, budget->iterations, s->table, s->whole, t->s.at, t->s.x, &s->pivots);
-  if (code != pivot_tableau_DONE) return code == pivot_tableau_PIVOTS ? LAV_MAX_ITERATIONS : LAV_STALLED;
-  pivot_direct_judge_now(t);
-  pivot_principal_pivots_start(&t->s, 0.0);
-  after.iterations = s->pivots + BATCH;
-  if (!pivot_direct_is_good(t)) go_on(s, &after, pivot_principal_ROUNDS);
-  t->s.n_rounds = 0; /* the path alone counts */
-  return LAV_STALLED;
+static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
+  struct pivot_lemke_lemke_t *l = &s->lemke;
+  int32_t code, left;
+  pivot_lemke_lemke_begin(l);
+  do {
+    left = budget->iterations - l->pivots;
+    code = pivot_lemke_lemke_run(l, is_timed(budget) && left > BATCH ? BATCH : left);
+    if (code == pivot_lemke_DONE) return LAV_STALLED;
+  } while (l->pivots < budget->iterations && !is_late(s, budget));
+  return l->pivots < budget->iterations ? LAV_TIME_LIMIT : LAV_MAX_ITERATIONS;
 }
 
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct pivot_direct_direct_t *t = &s->direct;
-  s->pivots = 0;
   pivot_direct_direct_begin(t, s->impulse);
-  out->outcome = s->options.method == LAV_LEMKE ? follow_path(s, budget) : pivot_all(s, budget, out);
+  out->outcome = s->options.method == LAV_LEMKE ? follow_paths(s, budget) : pivot_all(s, budget, out);
   if (t->relative < INFINITY) COPY(s->impulse, t->best, s->p.n_rows);
   if (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED)
     out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_end(t)) ? LAV_CONVERGED
                    : t->relative <= 2.0 * t->floor && t->relative < 1.0                       ? LAV_FLOOR
                                                                                                 : LAV_STALLED;
-  out->iterations = s->pivots + t->s.n_rounds;
+  out->iterations = s->options.method == LAV_LEMKE ? s->lemke.pivots : t->s.n_rounds;
   out->restarts = t->s.factorisations;
 }
 #endif

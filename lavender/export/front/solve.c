@@ -282,7 +282,8 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
       return room.n_index / 2 + room.n_real + 16;
     default: break;
   }
-  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 22 * m + (bodies ? 12 * n : 0) + (method == LAV_LEMKE ? 4 * m * m + 12 * m : m * (m < band ? m : band));
+  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 22 * m + (bodies ? 12 * n : 0) + m * (m < band ? m : band);
+  if (method == LAV_LEMKE) numbers += 4 * m * m + 9 * m; /* two places in the dictionary for each row */
   if (method == LAV_ADMM) numbers = m * m + (10 + 2 * memory) * m + CONTROL + GRAM;
   return numbers + (bodies ? 90 * m + 6 * k + n : 0) + 64;
 }

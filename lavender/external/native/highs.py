@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.running import Answer, Limits, at_least

@@ -18,9 +18,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender_ext.newton.solve import WHATS
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import IntArray
+from lavender._later import sparse as sp
 from lavender_ext.factor import graph, symbolic
 from lavender_ext.factor.dissection import dissection
 

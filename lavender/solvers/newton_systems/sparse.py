@@ -13,9 +13,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored

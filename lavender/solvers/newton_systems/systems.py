@@ -10,9 +10,9 @@ import os
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import IntArray
+from lavender._later import sparse as sp
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies

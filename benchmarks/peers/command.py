@@ -8,16 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
-from benchmarks.output import folder_of
-from lavender.bench.peers import PROBLEMS, Peers, adapters, problems, race
-from lavender.bench.peers import engines as peer_engines
-from lavender.bench.peers.contest import Result
-from lavender.bench.peers.engines import Step
-from lavender.report.compared import (
+from benchmarks.output import folder_of, write_json
+from benchmarks.peers import engines as peer_engines
+from benchmarks.peers import race
+from benchmarks.peers.contest import Result, ours
+from benchmarks.peers.engines import Step
+from benchmarks.peers.problems import PROBLEMS, problems
+from benchmarks.peers.tables import (
     Comparison,
     compare,
     losses,
@@ -27,9 +29,14 @@ from lavender.report.compared import (
     solver_table,
     step_table,
 )
+from lavender.bench import machine
+from lavender.bench.peers.adapters import contestants
 from lavender.report.table import markdown
 
 __all__ = ["command", "engines_table", "solvers_tables"]
+
+PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
+            "quadprog", "scs")  # fmt: skip
 
 
 def solvers_tables(results: Sequence[Result]) -> list[str]:
@@ -110,32 +117,37 @@ def command(
     def note(text: str) -> None:
         click.echo(text, err=True)
 
+    steps: list[Step] = []
+    found: list[Result] = []
+    versions = machine.versions(PACKAGES)
+
     def keep() -> None:
         if out is not None:
-            found.write(out)
+            write_json(out, found, versions=versions, steps=[asdict(s) for s in steps])
 
-    found = Peers()
-    click.echo(f"{found.cpu}; " + ", ".join(f"{k} {v}" for k, v in found.versions.items()))
-    absent = found.absent + ([] if siconos else ["siconos (--siconos)"])
+    click.echo(f"{machine.cpu_name()}; " + ", ".join(f"{k} {v}" for k, v in versions.items()))
+    absent = [name for name in PACKAGES if name not in versions] + (
+        [] if siconos else ["siconos (--siconos)"]
+    )
     click.echo("not here: " + (", ".join(absent) or "nothing") + "\n")
     if engines:
         for scene in filter(None, scenes.split(",")):
             note(scene)
-            found.steps += peer_engines.measure_scene(scene, sweeps)
-        click.echo("\n".join(engines_table(found.steps)) + "\n")
+            steps += peer_engines.measure_scene(scene, sweeps)
+        click.echo("\n".join(engines_table(steps)) + "\n")
     if solvers:
         rounds_of_all = race.race(
             problems(files or PROBLEMS, note),
-            adapters.contestants(siconos),
+            [*ours(), *contestants(siconos)],
             limit=limit,
             rounds=rounds,
             watch=note,
         )
         try:
             for results in rounds_of_all:
-                found.results += results
+                found += results
                 keep()  # an interruption costs one problem
         except KeyboardInterrupt:
             note("stopped")
-        click.echo("\n".join(solvers_tables(found.results)))
+        click.echo("\n".join(solvers_tables(found)))
     keep()

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender.bench.peers.contest import SCIPY, SCRATCH, TARGETS, Result
-from lavender.bench.peers.engines import Step
+from benchmarks.peers.contest import SCIPY, SCRATCH, TARGETS, Result
+from benchmarks.peers.engines import Step
 from lavender.report.table import Table
 from lavender.report.text import residual, seconds
 
