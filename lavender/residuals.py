@@ -274,7 +274,8 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
 def unstretched(problem: Problem, found: Residual) -> Residual:
     """The residual of a problem with ellipses, from that of its disks."""
     s = problem.cones.stretch
-    error, slack = read_only(s * found.error), read_only(found.slack / s)
+    with np.errstate(over="ignore"):
+        error, slack = read_only(s * found.error), read_only(found.slack / s)
     return replace(found, error=error, slack=slack, _problem=problem)
 
 

@@ -164,10 +164,12 @@ class Rows:
     def _take_frames(self) -> None:
         # What float32 leaves of unit vectors is made whole; what is meant otherwise is told.
         n, t = self.normal, self.tangent
-        along = np.einsum("ij,ij->i", n, t)
-        off = np.abs(np.stack([np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along])).max(
-            axis=0
-        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            along = np.einsum("ij,ij->i", n, t)
+            parts = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along]
+            off = np.nan_to_num(
+                np.abs(np.stack(parts)).max(axis=0), nan=np.inf, posinf=np.inf
+            )  # inf - inf is far off, too
         if off.max() > ROUNDED:
             i = int(np.argmax(off))
             raise InputError(

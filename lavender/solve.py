@@ -376,13 +376,15 @@ class _Loop:
         start_point = self.impulse.copy()
         start = perf_counter()
         try:
-            claim = self._call(max_iter, self.time_limit)
+            try:
+                claim = self._call(max_iter, self.time_limit)
+            finally:
+                self.time = perf_counter() - start
             if not self.broken:
-                return claim
+                tell = getattr(self.solver, "tell", None)  # judges, and finds words
+                return claim if tell is None else tell(self.state, self.impulse, claim)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        finally:
-            self.time = perf_counter() - start
         if not all_finite(self.impulse):
             self.impulse[:] = start_point
         return claim

@@ -191,13 +191,14 @@ class Problem:
         d = np.diag(self.A).copy()
         self.d = self._filled(d)
         self.nu = self.d.copy()
+        vanished = (d > 0) & (d < NORMAL)  # in float64: such a row has no unit there
         # A solve by the factor of M is as exact as M in the best units of its velocities allows.
         unit = 1 / np.sqrt(np.diag(mass))
         scaled = (unit[:, None] * mass * unit[None, :]).astype(float)
         condition = np.linalg.cond(scaled) if np.isfinite(scaled).all() else np.inf
         self.roundings += 10 * n * L(condition)
         self.d_edge = not np.isfinite(self.A).all() or bool(
-            np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))
+            np.any(vanished | ((d > 0) & (d < L(1e-12) * np.diag(self.size))))
         )
 
     def _pairs(self):
@@ -322,8 +323,11 @@ class Problem:
                     if not excess(high) > 0:
                         break
                     high = 2 * high
-                for _ in range(200):
-                    rise = (low + high) / 2
+                rise = high
+                while (
+                    low < (half := (low + high) / 2) < high
+                ):  # to the last bit, however small it is beside `high`
+                    rise = half
                     low, high = (rise, high) if excess(rise) > 0 else (low, rise)
                 top = base + rise
                 scale = a * a * top / ((1 + a * a) * rise + rest)

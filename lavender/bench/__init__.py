@@ -10,10 +10,10 @@ from lavender.bench.cases import Item, resolve, sequence, steps_in, structure_of
 from lavender.bench.machine import cpu_name
 from lavender.bench.record import CaseInfo, Record, Run, Skip, level_name
 from lavender.bench.running.campaign import CampaignPlan, campaign, seeds
-from lavender.bench.running.finals import Ask, finals
+from lavender.bench.running.finals import finals
 from lavender.bench.running.plan import Plan
 from lavender.bench.running.runner import Event, carry, run, solver_names
-from lavender.bench.running.timing import Task, measure, one_thread
+from lavender.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.bench.store import Records, Store, read, write_csv, write_json
 from lavender.bench.submitted import Submission, Verified, verify
 

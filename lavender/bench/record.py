@@ -21,8 +21,10 @@ __all__ = [
     "file_name",
     "from_json",
     "level_name",
+    "plain",
     "printable",
     "to_json",
+    "values_in",
 ]
 
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
@@ -250,7 +252,7 @@ class Record(_Texts):
 
 def measurement_key(what: Any) -> tuple[Any, ...]:
     """The identity of a measurement, of its `Task` as of its `Record`."""
-    options = repr(sorted(_plain(what.options).items()))
+    options = repr(sorted(plain(what.options).items()))
     asked = (what.start, what.mode, what.tol, what.max_iter, what.time_limit, what.way, what.turns)
     return (what.case, what.sha, what.solver, options, *asked)
 
@@ -262,7 +264,7 @@ KINDS: dict[str, type] = {"run": Run, "case": CaseInfo, "skip": Skip, "done": Do
 def to_json(entry: Entry) -> dict[str, Any]:
     """A dictionary that JSON can hold: inf and nan become words."""
     kind = next(name for name, cls in KINDS.items() if isinstance(entry, cls))
-    return {"kind": kind, **{f.name: _plain(getattr(entry, f.name)) for f in fields(entry)}}
+    return {"kind": kind, **{f.name: plain(getattr(entry, f.name)) for f in fields(entry)}}
 
 
 def from_json(line: Any) -> Entry:
@@ -276,12 +278,26 @@ def from_json(line: Any) -> Entry:
     if not isinstance(line, Mapping) or not isinstance(line.get("kind"), str) or line["kind"] not in KINDS:
         raise ValueError("not an entry of a records file")
     cls = KINDS[line["kind"]]
+    try:
+        return cls(**values_in(cls, line))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"not an entry of a records file ({error})") from None
+
+
+def values_in(cls: Any, line: Mapping[str, Any]) -> dict[str, Any]:
+    """Those fields of a data class that JSON can hold, as far as a line has them.
+
+    Raises
+    ------
+    ValueError
+        One is of another type than declared, or out of its range.
+    """
     values = {}
     for f in fields(cls):
-        if f.name not in line:
+        kind = str(f.type)
+        if f.name not in line or kind not in _TYPES:
             continue
         value = line[f.name]
-        kind = str(f.type)
         if kind.startswith("float") and (
             _is_whole(value) or (_is_word(value) and value in ("inf", "-inf", "nan"))
         ):
@@ -290,15 +306,12 @@ def from_json(line: Any) -> Entry:
             value = tuple(map(_number, value) if "float" in kind else value)
         wanted, holds = _TYPES[kind]
         if not holds(value):
-            raise ValueError(f"not an entry of a records file ({f.name} is not {wanted})")
-        rule = _RANGES.get((line["kind"], f.name)) or (_RANGES[""] if isinstance(value, float) else None)
+            raise ValueError(f"{f.name} is not {wanted}")
+        rule = _RANGES.get((cls.__name__, f.name)) or (_RANGES[""] if isinstance(value, float) else None)
         if rule and not rule[1](value):
-            raise ValueError(f"not an entry of a records file ({f.name} is not {rule[0]})")
+            raise ValueError(f"{f.name} is not {rule[0]}")
         values[f.name] = value
-    try:
-        return cls(**values)
-    except TypeError as error:
-        raise ValueError(f"not an entry of a records file ({error})") from None
+    return values
 
 
 def _number(value: Any) -> Any:
@@ -359,27 +372,30 @@ _TYPES: dict[str, _Rule] = {
 #: What their values are limited to; "" is the rule of every other number with a fraction.
 _RANGES: dict[Any, _Rule] = {
     "": ("0 or more", lambda v: not v < 0.0),
-    ("run", "plan"): ("a plan with positive levels", _is_plan),
-    ("record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
-    ("record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
-    ("record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
-    ("record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
-    ("record", "time_limit"): ("a positive number of seconds", _is_positive),
-    ("record", "max_iter"): ("0 or more", lambda v: v >= 0),
-    ("record", "repeats"): ("0 or more", lambda v: v >= 0),
-    ("record", "iterations"): ("0 or more", lambda v: v >= 0),
+    ("Run", "plan"): ("a plan with positive levels", _is_plan),
+    ("Record", "start"): ("cold, warm or carried", lambda v: v in ("cold", "warm", "carried")),
+    ("Record", "mode"): ("tol, budget or time", lambda v: v in ("tol", "budget", "time")),
+    ("Record", "way"): ("call, steps, batch or nothing", lambda v: v in ("", "call", "steps", "batch")),
+    ("Record", "tol"): ("a finite number of 0 or more", lambda v: 0.0 <= v < math.inf),
+    ("Record", "time_limit"): ("a positive number of seconds", _is_positive),
+    ("Record", "max_iter"): ("0 or more", lambda v: v >= 0),
+    ("Record", "repeats"): ("0 or more", lambda v: v >= 0),
+    ("Record", "iterations"): ("0 or more", lambda v: v >= 0),
+    ("Outcome", "iterations"): ("0 or more", lambda v: v >= 0),
+    ("Outcome", "work"): ("0 or more", lambda v: all(n >= 0 for n in v.values())),
 }
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """What JSON can hold of a value: inf and nan become words."""
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, (bool, int, str)) or value is None:
         return value
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     return str(value)

@@ -172,14 +172,19 @@ class Problem(Builders):
         return self._disk if self.cones.has_ellipse else self
 
     def on_disk(self, impulse: FloatArray) -> FloatArray:
-        """Impulses (m,) [N s] of this problem as those of `disk`."""
-        return impulse / self.cones.stretch if self.cones.has_ellipse else impulse
+        """Impulses (m,) [N s] of this problem as those of `disk`, where that is beyond float64 the largest number."""
+        if not self.cones.has_ellipse:
+            return impulse
+        with np.errstate(over="ignore"):
+            found = impulse / self.cones.stretch
+        beyond = np.isinf(found) & np.isfinite(impulse)
+        return np.where(beyond, np.copysign(np.finfo(float).max, found), found)
 
     @once
     def _disk(self) -> Problem:
         # A' = S A S,   b' = S b,   lambda = S lambda',   w' = S w,   S = diag(stretch), 1 but at tangents of ellipses
         s, cones = self.cones.stretch, self.cones.disks
-        guess = None if self.guess is None else self.guess / s
+        guess = None if self.guess is None else self.on_disk(self.guess)
         more: dict[str, Any] = {"guess": guess, "key": self.key, "names": self.names, "name": self.name}
         more |= {"friction": self.friction, "precision": self.precision}
         if self.generalized is None:
@@ -236,8 +241,6 @@ class Problem(Builders):
         ------
         CapabilityError
             The problem was given as a matrix.
-        InputError
-            An inverse inertia is so large that its principal values overflow.
         """
         jac = self.jacobian
         scale = 1.0 / np.sqrt(self.d)
@@ -246,16 +249,11 @@ class Problem(Builders):
             return VelocityForm(k, scale * self.b, self.compliance * scale**2, scale)  # type: ignore[operator]
         rows = self.rows
         assert rows is not None
-        n = rows.n_bodies
         # M^-1 = L L^T by blocks; a singular inverse inertia (a pinned axis) has a root but no Cholesky factor.
-        value, vector = np.linalg.eigh(rows.inv_inertia) if n else (np.zeros((0, 3)), np.zeros((0, 3, 3)))
-        root = vector * np.sqrt(np.maximum(value, 0.0))[:, None, :]
-        beyond = np.flatnonzero(~np.isfinite(root).all(axis=(1, 2)))
-        if len(beyond):
-            raise InputError(
-                f"inv_inertia [1/(kg m2)] of body {beyond[0]} has principal values beyond float64; {len(beyond)} "
-                "bodies in all: give it in other units, or take a solver that needs no velocity form"
-            )
+        # In units 4^n of its own, so that no principal value overflows.
+        unit = np.frexp(np.abs(rows.inv_inertia).max(axis=(1, 2), initial=0.0))[1] // 2
+        value, vector = np.linalg.eigh(np.ldexp(rows.inv_inertia, -2 * unit[:, None, None]))
+        root = vector * np.ldexp(np.sqrt(np.maximum(value, 0.0)), unit[:, None])[:, None, :]
         half = replace(
             rows, inv_mass=np.sqrt(rows.inv_mass), inv_inertia=root, copy=False
         ).inverse_mass_matrix()

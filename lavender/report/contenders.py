@@ -8,8 +8,9 @@ from typing import Any
 
 from lavender.bench.cases import Source
 from lavender.bench.line import needs_more
-from lavender.bench.running.finals import Ask, finals
+from lavender.bench.running.finals import finals
 from lavender.bench.running.plan import UNLIMITED, Plan
+from lavender.bench.running.timing import Ask
 from lavender.bench.store import Records
 from lavender.registry import specs
 from lavender.report import tables

@@ -5,21 +5,19 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import contents, tables
 from lavender.report.curves import Figure, Figures
-from lavender.report.moved import robustness_by_speed, speed_levels, working
+from lavender.report.findings import Report
+from lavender.report.moved import robustness_by_speed
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
 from lavender.report.text import count, residual, seconds, suspicions
-from lavender.report.verdict import Verdict, verdict
-
-if TYPE_CHECKING:
-    from lavender.report.engine import Contestant
+from lavender.report.verdict import Verdict
 
 __all__ = ["page"]
 
@@ -43,78 +41,37 @@ def _environment() -> Any:
     return environment
 
 
-def page(
-    records: Records,
-    figures: Figures,
-    title: str = "lavender report",
-    *,
-    old: Records | None = None,
-    budgets: Sequence[float] = (),
-    sweeps: Sequence[int] = (),
-    saved: bool = True,
-    engines: Sequence[Contestant] = (),
-) -> str:
+def page(report: Report, figures: Figures, title: str = "lavender report", saved: bool = True) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
     Parameters
     ----------
-    records : Records
+    report : Report
     figures : Figures
-        Of these records: `curves.figures`.
-    old : Records, optional
-        An earlier run to compare with.
-    budgets : s, optional
-        Time budgets of the recommendation.
-    sweeps : int, optional
-        Budgets of sweeps of the recommendation.
+        Of its records: `curves.figures`.
+    title : str
     saved : bool
         The figures are beside the page as SVG and PNG.
-    engines : sequence of Contestant
-        Answers of the engines that recorded the steps.
     """
-    content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
-    return (
-        _environment()
-        .get_template("index.html.j2")
-        .render(
-            title=title,
-            saved=saved,
-            engines=contents.engine_table(engines),
-            count=count,
-            inf=math.inf,
-            isfinite=math.isfinite,
-            **content,
-        )
-    )
+    return _environment().get_template("index.html.j2").render(
+        title=title, saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
+    )  # fmt: skip
 
 
-def _content(
-    records: Records,
-    figures: Figures,
-    old: Records | None,
-    budgets: Sequence[float],
-    sweeps: Sequence[int],
-) -> dict[str, Any]:
+def _content(report: Report, figures: Figures) -> dict[str, Any]:
     """Everything that the template names."""
-    still = contents.idle_table(records)
-    records = working(records)
-    failures, spreads = (
-        tables.failures(records),
-        sorted(tables.spreads(records), key=lambda s: -s.factor),
-    )
-    found = verdict(records, budgets, sweeps)
-    budgets = budgets or tables.time_budgets(records)
-    levels = tables.levels_of(records)
-    campaign = tables.is_campaign(records)
-    lines = [] if campaign else tables.advice(records, budgets)
+    records, found, levels, campaign = report.records, report.verdict, report.levels, report.is_campaign
+    failures = tables.failures(records)
+    spreads = sorted(tables.spreads(records), key=lambda s: -s.factor)
     return {
         **_drawings(records, figures, found),
         **_cases(records, figures, levels),
-        **_changes(old, records),
+        **_changes(report.before, records),
         "verdict": found,
-        "others": [] if campaign else _others(records, lines, found, levels, budgets),
-        "idle": still,
+        "others": _others(report),
+        "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
+        "engines": contents.engine_table(report.engines),
         "moved": None if campaign else contents.moved_table(records),
         "speed_advice": None if campaign else contents.speed_table(records),
         "noise": NOISE,
@@ -122,9 +79,8 @@ def _content(
         "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
-        "budgets_of_time": budgets,
-        "advice": contents.advice_table(records, lines, budgets, _links(lines, figures)),
-        "swept": contents.sweeps_table(lines),
+        "advice": contents.advice_table(report, _links(report.lines, figures)),
+        "swept": contents.sweeps_table(report.lines),
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
@@ -144,7 +100,7 @@ def _content(
         "campaign": campaign,
         "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
         "robustness_by_speed": contents.robustness_table(
-            robustness_by_speed(records) if campaign else [], speed_levels(records), " m/s"
+            robustness_by_speed(records) if campaign else [], report.speeds, " m/s"
         ),
         "sequences": {
             name: contents.pass_table(passes).without("sequence", "steps")
@@ -231,14 +187,9 @@ def _changes(old: Records | None, records: Records) -> dict[str, Any]:
 MOST_OTHERS = 6
 
 
-def _others(
-    records: Records,
-    lines: Sequence[tables.Line],
-    found: Verdict,
-    levels: Sequence[float],
-    budgets: Sequence[float],
-) -> list[str]:
+def _others(report: Report) -> list[str]:
     """What would change the choice: other levels and times, single structures, each with who is first there."""
+    records, levels, found, lines = report.records, report.levels, report.verdict, report.lines
     if not found.leaders or not lines:
         return []
     cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
@@ -248,7 +199,7 @@ def _others(
         asked |= {
             f"to {level_name(x)}": tables.to_level(records, "all", cases, x) for x in levels if x != middle
         }
-        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in budgets}
+        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in report.times}
     asked |= {f"on {line.name}": line.by_level[middle] for line in lines if len(lines) > 1}
     by_solver: dict[str, list[str]] = {}
     for where, advice in asked.items():

@@ -31,6 +31,7 @@ from lavender.solvers.solve_log import SolveLog
 # Relative residual of a start up to which sweeps go on from it, though doing nothing has less: which rows it holds free
 # is worth it. Under limits of 1 and 10 ms residuals from stale guesses are then 1.8 and 1.3 times smaller.
 STALE = 1e3
+NOTHING_TOLD = Claim(Status.MAX_ITERATIONS, 0)
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
 
 
@@ -41,6 +42,7 @@ class State:
     problem: Problem
     sweeps: Sweeps | None = None
     call: bool = True  # the compiled call may be made
+    log: SolveLog | None = None  # of the solve that has ended, as long as it is not told
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,7 @@ class Auto:
     def run(
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        problem = state.problem
+        problem, state.log = state.problem, None
         deadline = Deadline(time_limit)
         if max_iter >= ONE_CALL and state.call:
             made = AUTO.solve(problem, impulse, tol)
@@ -88,29 +90,29 @@ class Auto:
                 return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        log = SolveLog(problem, tol, max_iter, deadline)
+        sweeps = state.sweeps
+        log = SolveLog(problem, tol, max_iter, deadline, None if sweeps is None else sweeps.state.data)
         log.offer(impulse)
         if log.best > 1.0:
             log.given = impulse.copy() if log.best < STALE else None
             log.offer(problem.start())  # doing nothing is better
-        interrupted = False
+        state.log = log
         try:
             if max_iter > 0 and log.best > tol:
-                solve(log, self.plan, state.sweeps)
+                solve(log, self.plan, sweeps)
         except KeyboardInterrupt:
-            interrupted = True  # the best impulse goes back all the same
+            log.interrupted = True  # the best impulse goes back all the same
+        return NOTHING_TOLD
+
+    def tell(self, state: State, impulse: FloatArray, claim: Claim) -> Claim:
+        """When the clock has stopped: the best impulse, judged, and what ran."""
+        log, state.log = state.log, None
+        if log is None:
+            return claim
+        if log.end is not None:
+            log.end()
         impulse[:] = log.impulse
-        nothing = "no time for anything" if max_iter > 0 else "no iterations were asked for"
-        if log.best <= tol:
-            nothing = "the start is a solution"
-        return Claim(
-            Status.INTERRUPTED if interrupted else log.status,
-            log.iterations,
-            log.work,
-            log.message or nothing,
-            certificate=log.certificate,
-            turns=tuple(log.turns),
-        )
+        return log.claim()
 
 
 def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.deadline import CHUNK_TIME
+from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
@@ -28,7 +28,7 @@ from lavender_ext.few.looks import Looks, sweeps_left
 __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
 FIRST = 32  # sweeps before the first look at what they promise
-ALL = 1e18  # iterations: until the time is up
+MOST = 2**30  # sweeps of one call
 PROBE = 0.5  # of the time that is left: for iterations whose pace is not known yet
 
 
@@ -154,7 +154,9 @@ class Sweeps(Resumed):
     relative = 1.0  # residual of the last look
     least = 0.0  # ns that another method takes at least
     told = 0, 0  # sweeps and restarts of the turns before
-    watched = True
+    alone = False  # the first turn has all of the time,
+    before = 1.0  # the residual that it begins at,
+    claim: Claim  # and what came of it
 
     def set_up(self) -> None:
         """All that needs no impulse, and what is to be known when time is short."""
@@ -164,23 +166,52 @@ class Sweeps(Resumed):
         self.count()
 
     def run_first(self, log: SolveLog) -> bool:
-        """Half of the time, and all of it where the other half is too short for any other; whether any may follow."""
-        self.log, before = log, log.best
-        half = 0.5e9 * (log.deadline.left() or 0.0)
-        n = half / self.cost.each if half > self.costs.sure * self.least else ALL
-        self.watched = False
-        claim = self.turn(int(min(max(n, 1.0), log.left)))
-        self.watched = True
-        log.note(self.name, claim, before)
-        if log.ends_late(self.least) or log.done():
+        """Half of the time, and all of it where the other half is too short for any other; whether any may follow.
+
+        Where none follows nothing but sweeping is done here: `end` judges the last, when the clock has stopped.
+        """
+        self.log, self.before = log, log.best
+        deadline, each = log.deadline, 1e-9 * self.cost.each
+        half = 0.5 * (deadline.left() or 0.0)
+        self.alone = 1e9 * half <= self.costs.sure * self.least
+        if not self.alone:
+            deadline = Deadline(half)
+        self.begin()
+        if self.alone:
+            log.end = self.end
+        try:
+            pace = self.state.within(
+                self.impulse, self.relative, min(log.left, MOST), log.tol, FIRST, deadline.left, each, PROBE,
+                CHUNK_TIME, not self.alone,
+            )  # fmt: skip
+            log.pace = pace / each
+        finally:
+            if not self.alone:
+                self.end()
+        if self.alone or log.ends_late(self.least) or log.done():
             return False
-        if not self.has_done(claim):
+        if not self.has_done(self.claim):
             self.rest = np.inf
         return True
 
+    def end(self) -> None:
+        """Of the first turn: what came of it."""
+        log, looks = self.log, self.state
+        if looks.best is not None:
+            log.take(looks.best)
+        if self.alone:
+            log.by = log.problem.metric
+            log.offer(self.impulse)
+            log.timed_out = looks.done < log.left
+        self.relative = log.best if looks.now is None else looks.now.relative
+        self.status = STATUS[looks.status]
+        self.close()
+        self.claim = Claim(self.status, looks.done, self.work)
+        log.note(self.name, self.claim, self.before)
+
     def begin(self) -> None:
         log = self.log
-        self.impulse = log.impulse.copy() if log.given is None else log.given.copy()
+        self.impulse = log.impulse.copy() if log.given is None else log.given
         self.relative = log.best
         if self.state is None:
             self.set_up()
@@ -189,8 +220,7 @@ class Sweeps(Resumed):
         """At most n, given up where they promise no end for less than the others."""
         looks = self.state
         done, step = looks.done, min(max(looks.done // 2, FIRST), n)
-        least = self.others / self.cost.each
-        looks.run(self.impulse, self.relative, done + n, self.log.tol, step, FIRST, least, self.watched)
+        looks.run(self.impulse, self.relative, n, self.log.tol, step, FIRST, self.others / self.cost.each)
         self.relative, self.status = self.log.take(looks.now), STATUS[looks.status]
         return int(looks.done) - done
 

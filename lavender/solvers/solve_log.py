@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -10,10 +11,11 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
-from lavender.residuals import at_floor, judged, known, quick, reference, remember
+from lavender.residuals import at_floor, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
 from lavender.solvers.small import told
+from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]
@@ -25,8 +27,21 @@ GAIN = 0.99  # of the residual: then nobody gets anywhere
 class SolveLog:
     """What ran on a (sub)problem, what it cost, and the best impulse."""
 
-    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        tol: float,
+        budget: int,
+        deadline: Deadline | None = None,
+        by: Data | None = None,
+    ) -> None:
         self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
+        self.by = (
+            problem.metric if by is None else by
+        )  # what impulses are judged by: as given, or A formed of it
+        self.end: Callable[[], None] | None = None  # what is left to do when the clock has stopped
+        self.interrupted = False
+        self.timed_out = False  # it ended for want of time, a little before the deadline
         self.best, self.impulse = np.inf, problem._start  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
         self.turns: list[Turn] = []
@@ -39,7 +54,7 @@ class SolveLog:
         """Judge an impulse (m,) and keep it if it is the best."""
         relative = known(self.problem, impulse)
         if relative is None:
-            return self.take(judged(self.problem, impulse.copy()))
+            return self.take(Judged(self.by, impulse.copy()))
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
         return relative
@@ -82,7 +97,7 @@ class SolveLog:
 
     @property
     def late(self) -> bool:
-        return self.deadline.passed()
+        return self.timed_out or self.deadline.passed()
 
     def ends_late(self, cost: float) -> bool:
         """What is counted for so long [ns] would end after the deadline, at the pace so far."""
@@ -124,6 +139,20 @@ class SolveLog:
         if self.late:
             return Status.TIME_LIMIT
         return Status.MAX_ITERATIONS if self.left <= 0 else Status.STALLED
+
+    def claim(self) -> Claim:
+        """All of it, told."""
+        nothing = "no time for anything" if self.budget > 0 else "no iterations were asked for"
+        if self.best <= self.tol:
+            nothing = "the start is a solution"
+        return Claim(
+            Status.INTERRUPTED if self.interrupted else self.status,
+            self.iterations,
+            self.work,
+            self.message or nothing,
+            certificate=self.certificate,
+            turns=tuple(self.turns),
+        )
 
     # -- islands ---------------------------------------------------------------------------------
 

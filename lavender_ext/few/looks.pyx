@@ -2,9 +2,10 @@
 
     rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
 
-They go on while rest is no more than `least`; each time half as many as were done, `first` at least. `now` is the
-judge's.
+They go on while rest is no more than `least`; each time half as many as were done, `first` at least. Where A was formed
+of J and M looks are at A, which cost a sweep and not ten; what is below tol there is the judge's.
 """
+from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, log
 from libc.stdint cimport int32_t
 
@@ -48,7 +49,7 @@ cdef class Looks:
     cdef readonly int split, memory
     cdef readonly Watch watch
     cdef readonly object space, prepared, order, rng     # as `accelerated.run` takes them
-    cdef readonly Judged now            # of the last look,
+    cdef readonly Judged now, best      # of the last look, and of all
     cdef readonly double before         # relative residual before the last sweeps,
     cdef readonly int last, done        # how many these were, and all of them
     cdef readonly int status            # of the watch
@@ -63,33 +64,81 @@ cdef class Looks:
         self.watch = Watch(data, PATIENCE, metric if formed else None)
         self.prepared = gauss_seidel.prepare(data) if exact else None
         self.space = allocate(data, MEMORY)
+        self.space[2].fill(0.0)         # its pages are there before the first sweep
         self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
         self.rng = np.zeros(1, np.uint64)
 
-    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least, bint watched=True):
-        """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first look.
-
-        `least`: sweeps left that they promise at most, to go on. `watched`: by their watch between two looks as well,
-        whose checks cost as much as the first sweeps.
-        """
-        cdef Judged now
-        cdef int32_t status, last, swept, restarts
+    cdef int begin(self, lam) except -1:
         if self.data.factored or self.data.is_general:
             velocity_change(self.data, lam, self.space[3])
+        return 0
+
+    cdef int sweep(self, lam, int n, double tol) except -1:
+        """n of them, fewer where their watch ends them, whose checks cost as much as the first sweeps; none for tol = 0."""
+        cdef int32_t last, swept
+        self.status, last, swept, self.restarts = run(
+            self.data, self.watch, lam, n, tol, MEMORY, self.prepared, self.exact, 0, self.space, self.order,
+            self.split, 0, self.rng, False)
+        if tol == 0.0:
+            self.watch.state.check_at = self.watch.state.total
+        self.done += last
+        self.sweeps += swept
+        return last
+
+    cdef double look(self, lam, double before, int last, double tol) except *:
+        """The relative residual after `last` sweeps from `before`: by what is swept, and below tol by the judge."""
+        self.now = Judged(self.data, lam.copy())
+        if self.now.relative <= tol and self.data is not self.metric:
+            self.now = Judged(self.metric, self.now.impulse)
+        if self.best is None or self.now.relative < self.best.relative:
+            self.best = self.now
+        self.before, self.last = before, last
+        return self.now.relative
+
+    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least):
+        """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first look.
+
+        `least`: sweeps left that they promise at most, to go on.
+        """
+        cdef int last
+        cdef int32_t end = self.done + n
+        cdef double now
+        self.begin(lam)
         while True:
-            status, last, swept, restarts = run(
-                self.data, self.watch, lam, sweeps, tol if watched else 0.0, MEMORY, self.prepared, self.exact, 0,
-                self.space, self.order, self.split, 0, self.rng, False)
-            if not watched:
-                self.watch.state.check_at = self.watch.state.total
-            self.done += last
-            self.sweeps += swept
-            now = Judged(self.metric, lam.copy())
-            if now.relative <= tol or status != RUNNING or self.done >= n or \
-                    sweeps_left(last, before, now.relative, tol) > least:
-                self.now, self.before, self.last, self.status, self.restarts = now, before, last, status, restarts
+            last = self.sweep(lam, sweeps, tol)
+            now = self.look(lam, before, last, tol)
+            if now <= tol or self.status != RUNNING or self.done >= end or sweeps_left(last, before, now, tol) > least:
                 return
-            before = now.relative
-            sweeps = self.done // 2 if self.done // 2 > first else first
-            if sweeps > n - self.done:
-                sweeps = n - self.done
+            before = now
+            sweeps = min(max(self.done // 2, first), end - self.done)
+
+    def within(self, lam, double before, int n, double tol, int first, left, double each, double share, double chunk,
+               bint looked):
+        """The same for as long as `left()` [s] says, a sweep counted for `each` [s]; returns what one has taken [s].
+
+        For `share` of the time before the clock is asked, then as many as fit at the pace of the last, none longer than
+        `chunk` [s]. Looks are the only checks; `looked`: the last sweeps end with one.
+        """
+        cdef double time = left(), was, pace = each
+        cdef int32_t at = self.done, end = at + n, due = at + first, step
+        cdef double fit = min(share * time, chunk) / each
+        cdef bint look
+        self.begin(lam)
+        while True:
+            step = max(1, min(<int32_t>min(fit, 1e9), min(due, end) - self.done))
+            self.sweep(lam, step, 0.0)
+            look = self.done == due
+            if look:
+                before = self.look(lam, before, self.done - at, tol)
+                if before <= tol:
+                    break
+                at, due = self.done, self.done + max(self.done // 2, first)
+            PyErr_CheckSignals()
+            was, time = time, left()
+            pace = max(was - time, 1e-9) / (step + look)
+            if self.done >= end or 2.0 * time <= pace:
+                break
+            fit = min(time, chunk) / pace
+        if looked and self.done > at:
+            self.look(lam, before, self.done - at, tol)
+        return pace

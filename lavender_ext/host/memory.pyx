@@ -8,8 +8,7 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 import numpy as np
 
 from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, H_NEED_CONTACTS, H_NEED_PAIRS, H_PAIRS_VALID,
-                                         N_CACHE_IMPULSE, N_JOINT, N_SIZES, S_OUT, bind, engine_t)
-from lavender_ext.engine.kept cimport copy_ints, copy_keys, copy_reals, rolling_reals
+                                         N_CACHE_IMPULSE, N_JOINT, N_SIZES, ROWS_PER_CONTACT, S_OUT, bind, engine_t)
 
 
 cdef public void lav_engine_values(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -43,6 +42,24 @@ cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t
         out[CAP_CONTACT] = quarter_more(e.head[H_NEED_CONTACTS])
 
 
+cdef inline void copy_reals(const double* source, double* goal, int64_t n) noexcept nogil:
+    cdef int64_t k
+    for k in range(n):
+        goal[k] = source[k]
+
+
+cdef inline void copy_ints(const int32_t* source, int32_t* goal, int64_t n) noexcept nogil:
+    cdef int64_t k
+    for k in range(n):
+        goal[k] = source[k]
+
+
+cdef inline void copy_keys(const uint64_t* source, uint64_t* goal, int64_t n) noexcept nogil:
+    cdef int64_t k
+    for k in range(n):
+        goal[k] = source[k]
+
+
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                  const int32_t* to_size, double* to_real, int32_t* to_index,
                                  uint64_t* to_keys) noexcept nogil:
@@ -58,7 +75,7 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     copy_reals(a.joint_impulse, b.joint_impulse, a.v_free - a.joint_impulse)
     copy_reals(a.cache_impulse, b.cache_impulse, N_CACHE_IMPULSE * c)
     copy_reals(a.cache_local, b.cache_local, 6 * c)
-    copy_reals(a.cache_roll, b.cache_roll, rolling_reals(size) * c)
+    copy_reals(a.cache_roll, b.cache_roll, 3 * c if size[ROWS_PER_CONTACT] > 4 else 0)
     copy_ints(a.head, b.head, a.pair - a.head)
     copy_ints(a.joint_body, b.joint_body, 2 * kj)
     copy_ints(a.ptr, b.ptr, kj + c + 1)

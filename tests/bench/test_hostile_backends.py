@@ -298,6 +298,7 @@ def test_what_a_worker_says_is_what_this_process_says():
         {"solves": [1e9]},
         {"solves": [float("nan")]},
         {"times": [1e9]},
+        {"times": [float("nan")]},
         {"times": None},
         {"pace": "fast"},
         {"certificate": True},

@@ -116,10 +116,12 @@ def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monke
     bench.run([path], ["pgs"], bench.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
     before = (tmp_path / "r.jsonl").read_bytes()
     monkeypatch.setattr(bench, "run", None)
-    code, out, _ = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again", "--no-figures")
+    out_to = ("--out", tmp_path / "again", "--no-figures", "--paper")
+    code, out, _ = lavender("report", tmp_path / "r.jsonl", *out_to)
     assert code == 0
     assert "stack8" in out
     assert (tmp_path / "again" / "index.html").exists()
+    assert "lcp" in (tmp_path / "again" / "paper" / "tables.tex").read_text(encoding="utf-8")
     assert (tmp_path / "r.jsonl").read_bytes() == before
 
 

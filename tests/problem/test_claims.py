@@ -263,16 +263,6 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
 
 
-def test_ctrl_c_leaves_what_a_plug_in_has_come_to(plug_in):
-    def run(problem, impulse):
-        impulse[:] = 3.0
-        raise KeyboardInterrupt
-
-    solution = lv.solve(random_lcp(14), plug_in(run))
-    assert solution.status is lv.Status.INTERRUPTED
-    np.testing.assert_array_equal(solution.impulse, 3.0)
-
-
 def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
     class Few:
         def solve(self, problem, impulse, tol):

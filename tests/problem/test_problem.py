@@ -19,6 +19,7 @@ from random_problems import (
     random_lcp,
     random_rows,
     seeds,
+    touching,
 )
 
 import lavender as lv
@@ -137,10 +138,8 @@ def test_rows_have_names():
 
 def test_pinned_bodies_are_legal():
     """A body of infinite mass gives empty rows of A."""
-    rows = lv.Rows(
-        inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)), v_free=np.ones((1, 6)), normal=[[0, 0, 1.0]] * 2,
-        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, 0], [0, -1]],
-    )  # fmt: skip
+    still = {"inv_mass": [0.0], "inv_inertia": np.zeros((1, 3, 3)), "v_free": np.ones((1, 6))}
+    rows = touching([[-1, 0], [0, -1]], **still)
     problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
     assert not problem.csr.toarray().any()
     np.testing.assert_array_equal(problem.d, [1.0, 1.0])
@@ -220,6 +219,10 @@ BAD_ROWS = {
     "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+    "axes whose product is inf - inf": (
+        {"normal": np.tile([1e200, 1e200, 0], (8, 1)), "tangent": np.tile([1e200, -1e200, 0], (8, 1))},
+        "off by inf",
+    ),
     "tangent": (
         {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
         "orthogonal",

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
 from random_trees import random_general
 from scipy.sparse import block_diag
 
@@ -239,15 +239,6 @@ def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
     found = solve_first(problem.metric, None, np.inf, AUTO.gate)
     cost = velocities_cost(problem, general.prepare(problem).largest)
     assert (found is not None) == (cost <= FIRST[problem.law])
-
-
-def side_by_side(parts):
-    """One problem, given by A, of which each is an island."""
-    cones = parts[0].cones
-    for part in parts[1:]:
-        cones = cones + part.cones
-    b = np.concatenate([part.b for part in parts])
-    return lv.Problem(b, cones, block_diag([p.csr for p in parts], format="csr"), friction=parts[0].friction)
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])

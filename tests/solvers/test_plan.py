@@ -20,6 +20,7 @@ from lavender.solvers.methods import Sweeps
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.structure import Structure
 from lavender.suite.build import Bodies, Contacts, contact_problem
+from lavender_ext.few import looks
 
 NAMES = (
     "stack(n=200)",
@@ -149,30 +150,48 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypat
     log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
     log.offer(problem.start())
     solve(log, None, state.sweeps)
+    assert log.end is not None
+    log.end()
     assert log.iterations > 0
     assert [turn.solver for turn in log.turns] == ["anderson"]
 
 
 @pytest.mark.parametrize("pace", [0.1, 1.0, 2.0])
 def test_sweeps_that_cost_more_than_counted_end_in_time(pace, monkeypatch):
-    """The clock stands but for them; past the limit is one of them and a look at the most."""
+    """The clock stands but for them; past the limit is half of one, for what is more than half over is not begun."""
     problem = suite.case("granularF(n=4)").problem
     reference(problem)
     state, now = Auto().prepare(problem), [0.0]
     Auto().ready(state, 1e-3)
+    state.sweeps.least = 1e9  # nothing else ends in time
     monkeypatch.setattr("lavender.deadline.perf_counter", lambda: now[0])
-    original, each = Sweeps.iterate, 1e-9 * pace * state.sweeps.cost.each
+    original, each = looks.run, 1e-9 * pace * state.sweeps.cost.each
 
-    def iterate(self, n):
-        found = original(self, n)
-        now[0] += (n + 1) * each
-        return found
+    def run(data, watch, impulse, n, *more):
+        now[0] += n * each
+        return original(data, watch, impulse, n, *more)
 
-    monkeypatch.setattr(Sweeps, "iterate", iterate)
-    log = SolveLog(problem, 1e-15, 10**6, deadline=Deadline(1e-3))
+    monkeypatch.setattr(looks, "run", run)
+    log = SolveLog(problem, 1e-300, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
-    state.sweeps.run_first(log)
-    assert 0.8e-3 <= now[0] <= 1e-3 + 2.5 * each
+    assert not state.sweeps.run_first(log)
+    log.end()
+    assert 0.8e-3 <= now[0] <= 1e-3 + 0.6 * each
+    assert log.turns[-1].after == lv.residual(problem, log.impulse).relative
+    assert log.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR)
+
+
+def test_looks_are_at_what_is_swept_and_what_is_below_tol_is_the_judges():
+    """Of J and M where A is swept a look at A costs a sweep, one at J and M ten."""
+    problem = random_general(5, contacts=6)
+    reference(problem)
+    made = looks.Looks(problem.metric, problem.data, problem.law == "cone", 0)
+    impulse = problem.start()
+    made.run(impulse, 1.0, 4, 1e-300, 4, 32, np.inf)
+    assert made.now.data is problem.data is not problem.metric
+    made.run(impulse, made.now.relative, 4, 2.0 * made.now.relative, 4, 32, np.inf)
+    assert made.now.data is problem.metric
+    assert made.now.relative == lv.residual(problem, made.now.impulse).relative
 
 
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):

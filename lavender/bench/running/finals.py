@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from time import perf_counter
@@ -17,47 +17,18 @@ from lavender.bench.cases import Item, Source, resolve
 from lavender.bench.record import CaseInfo, Record
 from lavender.bench.running.plan import Plan
 from lavender.bench.running.runner import Runner, Watch, is_foreign
-from lavender.bench.running.timing import Task, just_written, one_thread, outcome_of, pace, record_of
+from lavender.bench.running.timing import Ask, Task, just_written, one_thread, outcome_of, pace, record_of
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
 from lavender.many import solve_many
 
-__all__ = ["ROUNDS", "Ask", "finals"]
+__all__ = ["ROUNDS", "finals"]
 
 ROUNDS, LEAST_ROUNDS, MOST_ROUNDS = 7, 3, 41
 SPARE = 3.0  # s, for more repetitions than usual where they are cheap
 STAGE = 20.0  # time limits, that all repetitions may take together once there were the least
 LOADED = 32  # cases that are held in memory at a time
 ALIKE = 10  # rows of the largest over the smallest problem, up to which they are a batch
-
-
-@dataclass(frozen=True)
-class Ask:
-    """A line to time on every case, or over every sequence, that the solver takes."""
-
-    solver: str
-    mode: str
-    tol: float
-    max_iter: int = 0  # 0: the solver's own default
-    time_limit: float = 0.0  # s, of mode "time"
-    way: str = "call"
-    start: str = "cold"
-
-    def task(self, info: CaseInfo, plan: Plan, turns: str) -> Task:
-        """One repetition of it on one case."""
-        return Task.of(
-            info,
-            solver=self.solver,
-            mode=self.mode,
-            tol=self.tol,
-            max_iter=self.max_iter,
-            time_limit=self.time_limit or plan.time_limit,
-            start=self.start,
-            repeats=1 if self.way == "steps" else 2,
-            way=self.way,
-            turns=turns,
-            guarded=False,
-        )
 
 
 Made = dict[tuple[Any, ...], list[Record]]  # records of one measurement, one of each repetition
@@ -156,12 +127,22 @@ class _Stage:
             return False  # a process of its own adds its start, or takes no limit
         return spec.refuses(item.problem) is None
 
+    def task(self, ask: Ask, info: CaseInfo) -> Task:
+        """One repetition of a line on one case."""
+        more = {
+            "time_limit": ask.time_limit or self.runner.plan.time_limit,
+            "repeats": 1 if ask.way == "steps" else 2,
+            "turns": self.turns,
+            "guarded": False,
+        }
+        return Task.of(info, ask, **more)
+
     def keep(self, made: Made, record: Record | None) -> None:
         if record is not None and record.key not in self.known:
             made.setdefault(record.key, []).append(record)
 
     def one(self, ask: Ask, item: Item, info: CaseInfo, before: Any) -> tuple[Record | None, Any]:
-        task = ask.task(info, self.runner.plan, self.turns)
+        task = self.task(ask, info)
         if task.key in self.known and ask.start != "carried":
             return None, None
         record, after = self.runner.step(item.problem, task, self.runner.specs[ask.solver], before)
@@ -169,9 +150,7 @@ class _Stage:
         return record, after
 
     def run_pass(self, ask: Ask, steps: Cases, made: Made) -> None:
-        if ask.way == "batch" or all(
-            ask.task(info, self.runner.plan, self.turns).key in self.known for _, info in steps
-        ):
+        if ask.way == "batch" or all(self.task(ask, info).key in self.known for _, info in steps):
             return
         before = None
         for item, info in steps:
@@ -180,7 +159,7 @@ class _Stage:
 
     def batch(self, ask: Ask, some: Cases, made: Made) -> None:
         """One call of `solve_many`: each problem's record has its share of the time."""
-        tasks = [ask.task(info, self.runner.plan, self.turns) for _, info in some]
+        tasks = [self.task(ask, info) for _, info in some]
         if all(task.key in self.known for task in tasks):
             return
         fresh = [just_written(item.problem) for item, _ in some]

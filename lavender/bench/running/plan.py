@@ -1,14 +1,15 @@
-"""What to measure: levels, budgets, starts, orders, and the rule that makes tasks of them."""
+"""What to measure: levels, budgets, starts, orders, and the rule that makes measurements of them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 from lavender.bench.record import CaseInfo, Record
-from lavender.bench.running.timing import Task
+from lavender.bench.running.timing import Ask, Task
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ORDERS
 from lavender.problem import Problem
@@ -104,69 +105,44 @@ class Plan:
         """For the description of a run."""
         return asdict(self)
 
-    def tasks(self, info: CaseInfo, problem: Problem, spec: SolverSpec) -> Iterator[Task | None]:
-        """The measurements of one solver on one case; send each record back in, it decides what follows.
+    def carry_out(
+        self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
+    ) -> None:
+        """Make the measurements of one solver on one case; each record decides what follows.
 
         To a tolerance: an exact solver once, at the tightest level. Others level by level; one that can
         be resumed, or that ran out of time, is not asked for a tighter level than the one it missed: the
         iterates would be the same. Then budgets, then sweep orders at the middle budget.
         """
+
+        def one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
+            ask = Ask(spec.name, mode, tol, max_iter, start=start, way="" if options else self.way)
+            more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
+            return make(Task.of(info, ask, **more))
+
         starts = ["cold"]
         if self.warm and problem.guess is not None and spec.impulse and not spec.exact:
             starts.append("warm")
-
-        def task(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Task:
-            return Task.of(
-                info,
-                solver=spec.name,
-                mode=mode,
-                tol=tol,
-                max_iter=max_iter,
-                time_limit=self.time_limit,
-                start=start,
-                options=options,
-                repeats=self.repeats,
-                way="" if options else self.way,
-            )
-
+        most = UNLIMITED if spec.resumable else 0
         for start in starts:
-            levels = self.levels[-1:] if spec.exact else self.levels
-            for level in levels:
-                record: Record | None = yield task("tol", level, UNLIMITED if spec.resumable else 0, start)
-                if (
-                    record is not None
-                    and not record.relative <= level
-                    and (spec.resumable or _hopeless(record))
-                ):
+            for level in self.levels[-1:] if spec.exact else self.levels:
+                record = one("tol", level, most, start)
+                if not record.relative <= level and (spec.resumable or _hopeless(record)):
                     break
             if not spec.exact:
-                yield from self._to_speeds(task, spec, start)
+                self._to_speeds(partial(one, "tol", max_iter=most, start=start))
             if spec.resumable and not spec.exact:
                 for n in self.budgets:
-                    yield task("budget", 0.0, n, start)
+                    one("budget", 0.0, n, start)
         if spec.order and self.budgets and not spec.exact:
             middle = self.budgets[len(self.budgets) // 2]
             for word in self.orders:
                 name, _, seed = word.partition(":")
                 if name in ("bottom_up", "top_down") and problem.rows is None:
                     continue  # without bodies nobody knows the ground
-                more = {"seed": int(seed)} if seed else {}
-                yield task("budget", 0.0, middle, "cold", order=name, **more)
+                one("budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {}))
 
-    def carry_out(
-        self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
-    ) -> None:
-        """Make every measurement of `tasks`."""
-        tasks = self.tasks(info, problem, spec)
-        record: Record | None = None
-        while True:
-            try:
-                task = tasks.send(record)  # type: ignore[attr-defined]
-            except StopIteration:
-                return
-            record = make(task)
-
-    def _to_speeds(self, task: Callable[..., Task], spec: SolverSpec, start: str) -> Iterator[Task | None]:
+    def _to_speeds(self, solve_to: Callable[[float], Record]) -> None:
         """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""
         tol = FIRST_TOL
         last: Record | None = None
@@ -180,16 +156,17 @@ class Plan:
                     if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
                         return
                     tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * level / speed))
-                last = yield task("tol", tol, UNLIMITED if spec.resumable else 0, start)
+                last = solve_to(tol)
 
 
-def passes(plan: Plan, spec: SolverSpec) -> list[tuple[str, str, float, int]]:
-    """What is run over a sequence: (start, mode, tol, max_iter), each budget and level."""
-    starts = ["cold", "carried"] if spec.impulse and not spec.exact else ["cold"]
-    asked = plan.levels[-1:] if spec.exact else plan.levels
-    levels = [("tol", level, UNLIMITED if spec.resumable else 0) for level in asked]
-    budgets = [("budget", 0.0, n) for n in plan.budgets] if spec.resumable and not spec.exact else []
-    return [(start, *what) for start in starts for what in [*budgets, *levels]]
+def passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
+    """What is run over a sequence: each budget and level, cold and carried."""
+    most = UNLIMITED if spec.resumable else 0
+    asked = [("tol", level, most) for level in (plan.levels[-1:] if spec.exact else plan.levels)]
+    if spec.resumable and not spec.exact:
+        asked = [*(("budget", 0.0, n) for n in plan.budgets), *asked]
+    starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
+    return [Ask(spec.name, *what, way="steps", start=start) for start in starts for what in asked]
 
 
 def _hopeless(record: Record) -> bool:

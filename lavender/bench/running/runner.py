@@ -16,7 +16,7 @@ from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.record import CaseInfo, Record, Run, Skip, asked_of
 from lavender.bench.running.plan import Plan, passes
-from lavender.bench.running.timing import Task, measure_impulse, one_thread
+from lavender.bench.running.timing import Ask, Task, measure_impulse, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
 from lavender.errors import LavenderError
@@ -230,39 +230,17 @@ class Runner:
             if reason:
                 self.keep(Skip(self.this.run, items[0].sequence, name, reason))
             else:
-                for what in passes(self.plan, spec):
+                for ask in passes(self.plan, spec):
                     self.tell(items[0].sequence, name)
-                    self.run_pass(steps, spec, *what)
+                    self.run_pass(steps, spec, ask)
             self.done += len(steps)
         for item in items:
             item.forget()
 
-    def run_pass(
-        self,
-        steps: list[tuple[Item, CaseInfo]],
-        spec: SolverSpec,
-        start: str,
-        mode: str,
-        tol: float,
-        max_iter: int,
-    ) -> None:
+    def run_pass(self, steps: list[tuple[Item, CaseInfo]], spec: SolverSpec, ask: Ask) -> None:
         """One pass. It ends where its steps have taken `Plan.pass_limit` together, and a note says so."""
         repeats = self.plan.repeats if len(steps) <= SHORT_SEQUENCE else 1
-        tasks = [
-            Task.of(
-                info,
-                solver=spec.name,
-                mode=mode,
-                tol=tol,
-                max_iter=max_iter,
-                time_limit=self.plan.time_limit,
-                start=start,
-                options={},
-                repeats=repeats,
-                way="steps",
-            )
-            for _, info in steps
-        ]
+        tasks = [Task.of(info, ask, repeats=repeats, time_limit=self.plan.time_limit) for _, info in steps]
         problems = [item for item, _ in steps]
         limit, spent, made = self.plan.pass_limit, 0.0, 0
         for task in tasks:
@@ -273,7 +251,7 @@ class Runner:
             self.out.add(record)
             self.tell(task.case, spec.name, record, True)
         before: tuple[Problem, FloatArray] | None = None
-        if start == "carried" and 0 < made < len(tasks) and spent <= limit:
+        if ask.start == "carried" and 0 < made < len(tasks) and spent <= limit:
             # Stopped on the way: the impulses of the last step come from the same steps again, unrecorded.
             for item, task in zip(problems[:made], tasks, strict=False):
                 again = replace(task, repeats=1)
@@ -287,12 +265,12 @@ class Runner:
             self.tell(record.case, spec.name, record)
             spent, made = spent + _cost(record), made + 1
         if made < len(tasks):
-            asked = asked_of(mode, tol, max_iter)
+            asked = asked_of(ask.mode, ask.tol, ask.max_iter)
             reason = (
                 f"stopped after {made} of {len(tasks)} steps, which took more than the pass limit of {limit:.3g} s "
                 "together (--pass-limit)"
             )
-            self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {start}", spec.name, reason))
+            self.keep(Skip(self.this.run, f"{problems[0].sequence}, {asked}, {ask.start}", spec.name, reason))
 
     def step(
         self, problem: Problem, task: Task, spec: SolverSpec, before: tuple[Problem, FloatArray] | None

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any
 
 from lavender.apart import served as apart
+from lavender.bench.record import plain
+
+if TYPE_CHECKING:
+    from lavender.bench.running.timing import Outcome
 
 __all__ = ["serve"]
 
@@ -32,23 +37,12 @@ def _runner() -> apart.Handler:
     return run
 
 
-def _as_data(found: Any) -> tuple[dict[str, Any], bytes]:
+def _as_data(found: Outcome | str) -> tuple[dict[str, Any], bytes]:
     """An outcome as words and numbers (`lavender.bench.running.worker` reads them)."""
     if isinstance(found, str):
         return {"error": found[:500]}, b""
-    certificate = found.certificate
-    said = {
-        "status": found.status.name,
-        "iterations": int(found.iterations),
-        "work": {str(k): int(n) for k, n in found.work.items()},
-        "message": str(found.message)[:500],
-        "form": str(found.form)[:500],
-        "setups": found.setups,
-        "solves": found.solves,
-        "times": found.times,
-        "pace": found.pace,
-        "own": found.own,
-        "certificate": certificate is not None,
-    }
-    more = b"" if certificate is None else certificate.tobytes()
-    return said, found.impulse.tobytes() + more
+    found = replace(found, message=str(found.message)[:500], form=str(found.form)[:500])
+    arrays = ("impulse", "certificate")
+    said = {f.name: plain(getattr(found, f.name)) for f in fields(found) if f.name not in arrays}
+    more = b"" if found.certificate is None else found.certificate.tobytes()
+    return {**said, "certificate": found.certificate is not None}, found.impulse.tobytes() + more

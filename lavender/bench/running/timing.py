@@ -31,29 +31,42 @@ from lavender.residuals import reference
 from lavender.solution import Claim, Solution, Status
 from lavender.solve import prepare, solve
 
-__all__ = ["Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
+__all__ = ["Ask", "Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
 
 SHORT = 5e-3  # s: what took longer is not called once more for warmth
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 
 
 @dataclass(frozen=True)
+class Ask:
+    """A line to time, on whatever case the solver takes."""
+
+    solver: str
+    mode: str  # "tol" | "budget" | "time"
+    tol: float
+    max_iter: int = 0  # 0: the solver's own default
+    time_limit: float = 0.0  # s, of one solve; 0: that of the plan
+    way: str = "call"  # as `Record.way`
+    start: str = "cold"
+
+
+@dataclass(frozen=True)
 class Task:
-    """One measurement to make."""
+    """One measurement to make: what an `Ask` says, on a case."""
 
     run: str
     case: str
     sha: str
     solver: str
-    mode: str  # "tol" | "budget" | "time"
+    mode: str
     tol: float
-    max_iter: int  # 0: the solver's own default
-    time_limit: float  # s, of one solve
+    max_iter: int
+    time_limit: float
     start: str = "cold"
     options: Mapping[str, Any] = field(default_factory=dict)
     repeats: int = 1
     step: int = -1
-    way: str = ""  # as `Record.way`
+    way: str = ""
     turns: str = ""
     guarded: bool = True  # a solve under the time limit comes first
     lead: float = 0.0  # s, that the line takes before its call: carrying impulses
@@ -64,9 +77,9 @@ class Task:
         return measurement_key(self)
 
     @classmethod
-    def of(cls, info: CaseInfo, **what: Any) -> Task:
-        """A task on a case."""
-        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **what)
+    def of(cls, info: CaseInfo, ask: Ask, **more: Any) -> Task:
+        """What is asked for, on a case."""
+        return cls(run=info.run, case=info.case, sha=info.sha, step=info.step, **{**vars(ask), **more})
 
     def record(self, **what: Any) -> Record:
         """A record of this task."""
@@ -128,18 +141,18 @@ class Outcome:
     """What the repeats of one measurement brought, before it is judged."""
 
     impulse: FloatArray  # (m,) N s
-    status: Status
+    certificate: FloatArray | None  # (m,), with INFEASIBLE
+    status: str  # name of a Status
     iterations: int
     work: Mapping[str, int]
     message: str
     form: str
-    certificate: FloatArray | None  # (m,), with INFEASIBLE
-    setups: list[float]  # s, of each repeat
-    solves: list[float]  # s
-    times: list[float]  # s, of the line of each repeat; none where the guard did not end
-    reached: list[float]  # relative residual of each repeat, in mode "time"
+    setups: tuple[float, ...]  # s, of each repeat
+    solves: tuple[float, ...]  # s
+    times: tuple[float, ...]  # s, of the line of each repeat; none where the guard did not end
     pace: float | None  # s
     own: float | None = None  # s, in the backend's own solve
+    reached: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
 
 
 def measure(problem: Problem, task: Task) -> Record:
@@ -210,17 +223,17 @@ def outcome_of(
     """What the repeats `made` brought, the last of them `solution`."""
     return Outcome(
         impulse=solution.impulse,
-        status=solution.status,
+        certificate=solution.certificate,
+        status=solution.status.name,
         iterations=solution.iterations,
         work=solution.work,
         message=solution.message,
         form=solution.solver.form,
-        certificate=solution.certificate,
-        setups=[s.setup_time for s in made],
-        solves=[s.solve_time for s in made],
-        times=times,
-        reached=[float(s.residual.relative) for s in made] if reached else [],
+        setups=tuple(s.setup_time for s in made),
+        solves=tuple(s.solve_time for s in made),
+        times=tuple(times),
         pace=paced,
+        reached=tuple(float(s.residual.relative) for s in made) if reached else (),
     )
 
 
@@ -280,7 +293,7 @@ def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, 
     if isinstance(found, str):
         return task.record(status=ERROR, message=found[:500]), None
     claim = Claim(
-        found.status,
+        Status[found.status],
         found.iterations,
         found.work,
         found.message,
@@ -349,8 +362,8 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         solve_median=statistics.median(solves),
         time_min=min(both),
         time_median=statistics.median(both),
-        times=tuple(found.times) if task.way else (),
-        reached=tuple(found.reached),
+        times=found.times if task.way else (),
+        reached=found.reached,
         pace=found.pace,
         own_min=found.own,
     )

@@ -19,7 +19,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.apart.process import Ended, Process
 from lavender.bench.machine import memory_share
-from lavender.bench.record import CRASHED, KILLED, Record
+from lavender.bench.record import CRASHED, KILLED, Record, values_in
 from lavender.bench.running.timing import Outcome, Task, judged
 from lavender.problem import Problem
 from lavender.solution import Status
@@ -112,50 +112,22 @@ def outcome_in(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | st
         raise ValueError("not a table")
     if isinstance(said.get("error"), str):
         return str(said["error"])
-    numbers = np.frombuffer(answer[1], float) if len(answer[1]) % 8 == 0 else np.empty(0)
-    status, work = said.get("status"), said.get("work")
-    if not isinstance(status, str) or status not in Status.__members__:
+    values = values_in(Outcome, said)
+    if values.get("status") not in Status.__members__:
         raise ValueError("no status")
+    numbers = np.frombuffer(answer[1], float) if len(answer[1]) % 8 == 0 else np.empty(0)
     if len(numbers) != m * (2 if said.get("certificate") is True else 1):
         raise ValueError("impulses of another length")
-    if not _is_count(said.get("iterations")) or not isinstance(work, dict):
-        raise ValueError("no counts")
-    if not all(isinstance(k, str) and _is_count(n) for k, n in work.items()):
-        raise ValueError("counts that are none")
-    if not all(isinstance(said.get(name), str) for name in ("message", "form")):
-        raise ValueError("no message")
-    setups, solves = _times(said.get("setups")), _times(said.get("solves"))
-    times, pace, own = _times(said.get("times"), some=False), said.get("pace"), said.get("own")
-    if len(setups) != len(solves) or not max(math.fsum(setups + solves), math.fsum(times)) <= took:
-        raise ValueError("times that did not pass")
-    if any(t is not None and not (isinstance(t, float) and 0.0 <= t <= took) for t in (pace, own)):
-        raise ValueError("no pace, or times that did not pass")
-    return Outcome(
-        impulse=numbers[:m],
-        status=Status[status],
-        iterations=said["iterations"],
-        work=work,
-        message=said["message"],
-        form=said["form"],
-        certificate=numbers[m:] if len(numbers) > m else None,
-        setups=setups,
-        solves=solves,
-        times=times,
-        reached=[],  # of runs to a time, which no worker is asked for
-        pace=pace,
-        own=own,
-    )
-
-
-def _times(said: Any, some: bool = True) -> list[float]:
-    if (
-        not isinstance(said, list)
-        or (some and not said)
-        or not all(isinstance(t, float) and t >= 0.0 for t in said)
-    ):
+    try:
+        found = Outcome(numbers[:m], numbers[m:] if len(numbers) > m else None, **values)
+    except TypeError as error:
+        raise ValueError(str(error)) from None
+    parts = (*found.setups, *found.solves)
+    if not parts or len(found.setups) != len(found.solves):
         raise ValueError("no times")
-    return said
-
-
-def _is_count(n: Any) -> bool:
-    return isinstance(n, int) and not isinstance(n, bool) and 0 <= n < 2**63
+    known = all(t >= 0.0 for t in (*parts, *found.times))
+    if not known or not max(math.fsum(parts), math.fsum(found.times)) <= took:
+        raise ValueError("times that did not pass")
+    if not all(t is None or t <= took for t in (found.pace, found.own)):
+        raise ValueError("a pace, or a time of its own, that did not pass")
+    return found

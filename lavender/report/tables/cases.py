@@ -34,6 +34,8 @@ class Reach:
     message: str
     worst_name: str
     form: str
+    motion: float  # -, relative motion error of the best run; nan where there is none
+    bound: float  # sqrt J, proved bound of it; nan where nothing is proved
 
     @property
     def at_floor(self) -> bool:
@@ -102,6 +104,8 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 message=last.message,
                 worst_name=last.worst_name,
                 form=last.form,
+                motion=math.nan if best is None or best.motion is None else best.motion,
+                bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
     return out
