@@ -146,8 +146,8 @@ def layout() -> dict[str, Any]:
     Returns
     -------
     dict
-        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> place, number; orders: name ->
-        number; steppers: name -> what it writes.
+        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> place, number; orders:
+        name -> number; steppers: name -> what it writes.
     """
     return {
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
