@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import lapack
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
 from lavender.problem import Problem, check_problem
@@ -43,7 +44,7 @@ ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
 Places = npt.NDArray[np.intp]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Redundancy:
     """What `redundancy` found; `str()` says it in a few lines."""
 
@@ -310,8 +311,6 @@ def _by_qr(a: FloatArray, tol: float) -> Places:
 
 def _by_cholesky(a: FloatArray, tol: float) -> Places:
     """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
-    from scipy.linalg import lapack
-
     # Rounding alone leaves a pivot of about len(a) 2^-53.
     _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
     return np.sort(order[rank:] - 1)
@@ -331,8 +330,6 @@ def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
 
 def _null_basis(a: FloatArray, found: Places) -> FloatArray:
     """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
-    from scipy.linalg import lapack
-
     kept = np.setdiff1d(np.arange(len(a)), found)
     vectors = np.zeros((len(a), len(found)))
     vectors[found] = np.eye(len(found))

@@ -40,8 +40,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, read_only
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem import PRECISIONS, Problem
@@ -69,7 +69,7 @@ class Rounding:
         return f"impulse {self.impulse:.1e}, data {self.data:.1e}{more}"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Residual:
     """Error of one impulse. `str()` is one line."""
 

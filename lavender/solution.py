@@ -48,7 +48,7 @@ class Turn:
     after: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Claim:
     """What one call of a solver's `run` says of itself."""
 
@@ -62,7 +62,7 @@ class Claim:
     turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class History:
     """Recorded at fixed iteration counts, never at times; arrays of one length."""
 
@@ -108,7 +108,7 @@ class SolverRun:
     form: str = ""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
 

@@ -48,8 +48,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray, read_only
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import CapabilityError
 from lavender.problem import Problem
 

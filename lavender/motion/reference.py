@@ -27,7 +27,7 @@ ACCEPTED = 1e-10  # relative residual that makes a reference, or twice the floor
 CONVEX = ("linear", "lcp", "cone")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reference:
     """An impulse that stands for the solution, or the best that was found. `str()` is one line."""
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, whole_number
+from lavender._later import sparse as sp
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
 from lavender._derived import once
+from lavender._later import issparse
+from lavender._later import sparse as sp
 from lavender.errors import CapabilityError, InputError
 from lavender.problem.data import ProblemData
 from lavender_ext.core import assemble
@@ -96,7 +97,7 @@ class Operators(ProblemData):
     @once
     def csr(self) -> sp.csr_array:
         """A in compressed rows (m, m), int32 indices, read-only."""
-        if sp.issparse(self.matrix):
+        if issparse(self.matrix):
             return self.matrix
         indptr, indices, data = self._compressed
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))

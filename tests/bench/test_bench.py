@@ -368,6 +368,15 @@ def test_a_fingerprint_sees_every_number():
         lv.Problem.lcp(2 * p.matrix, p.b),
         lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
     ]
+    jac, mass, v = (
+        np.array([[1.0, 0.2], [0.0, 1.0]]),
+        np.array([[2.0, 0.3], [0.3, 1.0]]),
+        np.array([-1.0, 0.5]),
+    )
+    cones = lv.Cones.contacts(0.5, 1)
+    for s in (1.0, 2.0):  # one A and one b
+        variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
+    variants.append(dataclasses.replace(variants[-1], precision="float32"))
     prints = [bench_cases.fingerprint(v) for v in variants]
     assert len(set(prints)) == len(variants)
     assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]

@@ -220,6 +220,12 @@ def test_no_time_limit_is_said(name):
     assert ("takes no time limit" in solution.message) == (not stoppable)
 
 
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("limit", [1e10, np.inf])
+def test_a_limit_that_no_clock_holds_is_one_that_never_comes(name, limit):
+    assert lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=limit).success
+
+
 APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACKENDS]
 
 

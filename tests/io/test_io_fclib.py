@@ -1,5 +1,6 @@
 """FCLIB files: what they hold is kept to the bit, what they cannot hold is named."""
 
+import dataclasses
 import os
 import sys
 
@@ -279,6 +280,11 @@ def one_body(**given):
 def test_what_fclib_cannot_hold_is_named(tmp_path):
     rows = soft(global_problem())
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
+    single = np.eye(3, dtype=np.float32)
+    moved = lv.Problem.from_jacobian(
+        single, single, single[0], cones=lv.Cones.contacts(0.5),
+        dof_names=["x", "y", "z"], name="\ud800",
+    )  # fmt: skip
     heavy, pinned = one_body(inv_mass=[0.0]), one_body(inv_inertia=[np.diag([1.0, 0.0, 1.0])])
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 bounded rows"]),
@@ -290,6 +296,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
         (named, {}, ["names of blocks", "keys of blocks"]),
         (named, {"drop": ["names"]}, ["keys of blocks"]),
+        (moved, {}, ["names of velocities", "precision 'float32'", "surrogate"]),
         (soft(rows, 0.5), {}, ["compliance"]),
         (heavy, {}, ["infinite mass"]),
         (pinned, {}, ["infinite inertia"]),
@@ -302,9 +309,11 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
     assert os.listdir(tmp_path) == []
     lavender.io.save(named, tmp_path / "p.hdf5", drop=["names", "key"])
     lavender.io.save(heavy, tmp_path / "p.hdf5", form="local")
+    plain = dataclasses.replace(moved, name="plain")
+    lavender.io.save(plain, tmp_path / "p.hdf5", drop=["names", "precision"])
     with pytest.raises(lv.InputError, match="'local' or 'global'"):
         lavender.io.save(rows, tmp_path / "p.hdf5", form="middle")
-    with pytest.raises(lv.InputError, match="only 'names' and 'key'"):
+    with pytest.raises(lv.InputError, match="only 'names', 'key' and 'precision'"):
         lavender.io.save(rows, tmp_path / "p.hdf5", drop=["compliance"])
     with pytest.raises(lv.InputError, match="cannot write"):
         lavender.io.save(rows, tmp_path / "nowhere" / "p.hdf5")

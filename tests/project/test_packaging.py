@@ -189,11 +189,12 @@ print(json.dumps([first, list(sys.modules)]))
     assert listed & heavy == set()
 
 
-def test_a_problem_in_numbers_is_made_and_judged_without_sparse_arrays():
+def test_a_small_problem_in_numbers_is_made_and_solved_without_scipy():
     code = """
 import sys, lavender as lv
 problem = lv.Problem.contact([[2.0, 0.5], [0.5, 1.0]], [1.0, -2.0], [0.5])
-lv.residual(problem, [0.5, 0.0])
+for solver in ("auto", "pgs"):
+    assert lv.solve(problem, solver).success
 print("scipy" in sys.modules)
 """
     assert python(code).strip() == "False"

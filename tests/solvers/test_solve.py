@@ -30,6 +30,7 @@ REFUSED = {
     "a start too short": (lambda: lv.solve(TINY, "pgs", impulse=[1.0]), lv.InputError, "shape"),
     "a start not finite": (lambda: lv.solve(TINY, "pgs", impulse=[1.0, np.inf]), lv.InputError, "impulse"),
     "a start of words": (lambda: lv.solve(TINY, "pgs", impulse=["a", "b"]), lv.InputError, "impulse"),
+    "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
     "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
     "history of a finite solver": (
         lambda: lv.solve(TINY, "direct", history=True),
@@ -53,6 +54,19 @@ def test_nothing_ran_where_a_request_is_refused(register):
     with pytest.raises(lv.LavenderError):
         lv.solve(TINY, "pgs", nothing=1)
     assert ran == []
+
+
+def test_what_is_found_can_be_compared_and_kept_in_a_set():
+    for found in (
+        lambda: lv.solve(TINY, "pgs", history=True),
+        lambda: lv.solve(TINY, "pgs", history=True).history,
+        lambda: lv.solve(TINY).residual,
+        lambda: lv.redundancy(TINY),
+        lambda: lv.motion_error(dataclasses.replace(TINY), [0.0, 0.0]),
+        lambda: lv.Simulation("stack").scene.bodies[1],
+    ):
+        one, two = found(), found()
+        assert one == one and one != two and len({one, two}) == 2
 
 
 def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import IntArray
+from lavender._later import sparse as sp
 from lavender_ext.factor import graph, symbolic
 from lavender_ext.factor.dissection import dissection
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import IntArray
+from lavender._later import sparse as sp
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies
