@@ -183,7 +183,7 @@ def run(p: Problem, part: Part | None, args: Asked) -> tuple[bool, int, float, b
             return False, 0, process_time() - begun, b""
         took = process_time() - begun
     r = found.residual
-    good = found.success or r.relative <= 2.0 * r.floor or found.status.name == "INFEASIBLE"
+    good = found.success or r.at_floor or found.status.name == "INFEASIBLE"
     return (
         good,
         found.work.get("factorisations", 0),

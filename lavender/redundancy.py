@@ -382,12 +382,12 @@ def _polished(p: Problem, rough: FloatArray, previous: FloatArray) -> FloatArray
         part = Problem(p.b[rows] - rest, Cones.free(len(rows)), p.csr[rows][:, rows])
         y = redundancy(part).nearest_to(previous[rows])
         x[rows] = np.clip(y, c.lower[rows], c.upper[rows])
-    good, bad = residual(p, x), residual(p, rough)
-    return x if good.relative <= max(bad.relative, 2.0 * good.floor) else rough
+    good, bad = residual(p, x, "float64"), residual(p, rough, "float64")
+    return x if good.relative <= bad.relative or good.at_floor else rough
 
 
 def _accepted(p: Problem, impulse: FloatArray, tol: float = ACCEPTED) -> FloatArray:
-    r = residual(p, impulse)
-    if r.relative > max(tol, 2.0 * r.floor):
+    r = residual(p, impulse, "float64")
+    if not (r.relative <= tol or r.at_floor):
         raise SolveFailed(f"the representative impulse is not a solution to {tol:.0e}: {r}")
     return impulse

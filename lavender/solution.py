@@ -221,7 +221,8 @@ class Solution:
         """The same of a problem with ellipses, from that of its disks."""
         s = problem.cones.stretch
         impulse, proof = read_only(s * self.impulse), self.certificate
-        found = residual(problem, impulse)  # of the numbers that are handed out: s (lambda / s) rounds
+        # Of the numbers that are handed out: s (lambda / s) rounds.
+        found = residual(problem, impulse, "float64")
         return replace(
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )

@@ -460,7 +460,7 @@ class _Loop:
             self.impulse[:] = best[1]
 
     def _record(self) -> bool:
-        r = residual(self.problem, self.impulse)
+        r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
         self._next_record = next_count(self.done)

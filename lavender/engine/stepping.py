@@ -371,8 +371,7 @@ class Stepping:
         if solution.status is Status.INTERRUPTED and "callback" not in p.solver_options:
             raise KeyboardInterrupt  # the front door has turned it into a result; half a solve is no step
         self._last = solution
-        judged = solution.residual
-        if solution.success or judged.relative <= 2.0 * judged.floor:
+        if solution.success or solution.residual.at_floor:
             return solution.impulse
         if p.on_failure == "raise":
             raise SolveFailed(f"{self.scene!r}, step {self._steps}: {solution}")

@@ -173,7 +173,7 @@ class Motions:
             except CapabilityError:
                 continue
             out[name] = None
-            if self.motions and found.residual.relative <= max(tol, 2.0 * found.residual.floor):
+            if self.motions and (found.success or found.residual.at_floor):
                 near = self.nearest(found.impulse)
                 off = distance(p, found.impulse, near.impulse)
                 out[name] = Pick(self.motions.index(near), off.speed)

@@ -381,6 +381,12 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
     io.save(impossible, tmp_path / "impossible.npz")
     code, out, _ = lavender("solve", tmp_path / "impossible.npz", "--solver", "direct")
     assert ("INFEASIBLE" in out, code) == (True, cli.EXIT_INFEASIBLE)
+    # An impulse that ran away is accepted nowhere, nor is one that moves where nothing was to do.
+    away = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
+    idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0], guess=[1e6, 0.0])
+    for wrong, more in ((away, ()), (idle, ("--max-iter", 0))):
+        io.save(wrong, tmp_path / "wrong.npz")
+        assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
 def test_the_nearest_name_is_found_whatever_its_case(lavender):

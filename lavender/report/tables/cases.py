@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.groups import DIED, levels_of, pairs
+from lavender.residuals import at_floor
 
 __all__ = ["Claims", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
 
@@ -40,7 +41,7 @@ class Reach:
     @property
     def at_floor(self) -> bool:
         """No better residual can be asked of float64."""
-        return self.best <= 2.0 * self.floor
+        return at_floor(self.best, self.floor)
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def failures(records: Records) -> list[Record]:
     for r in records:
         if r.turns:
             continue  # the same runs again, in turns
-        missed = r.mode == "tol" and not r.success and not r.relative <= 2.0 * r.floor
+        missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
         if (missed and not proven) or lost or r.contradicted:
