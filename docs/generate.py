@@ -34,10 +34,11 @@ from lavender import bench, registry, suite
 from lavender.bench import level_name, structure_of
 from lavender.ordering import ORDERS
 from lavender.problem import LAWS
-from lavender.report import advice, contents, geometric_means, reaches
+from lavender.report import contents, geometric_means, reaches
 from lavender.report.curves import figures as report_figures
 from lavender.report.curves import work_precision
 from lavender.report.draw import matplotlib_panels
+from lavender.report.findings import Report
 from lavender.report.page import page as report_page
 from lavender.report.style import looks
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
@@ -359,10 +360,10 @@ def by_structure(records):
         words = (f"**{c.lead}** {c.text}" if c.lead else c.text.replace(" / ", "<br>"), c.after.lstrip(", "))
         return "<br>".join(filter(None, words))
 
-    lines = advice(records)
-    found = contents.advice_table(records, lines, tuple(lines[0].by_time))
+    report = Report(records)
+    found = contents.advice_table(report)
     rows = [(f"{cell(name)}<br>{name.more}", *map(cell, cells)) for name, *cells in found.rows]
-    first = 1 + len(lines[0].by_level)
+    first = 1 + len(report.levels)
     to_level = table(found.heads[:first], [row[:first] for row in rows])
     in_time = table(("structure", *found.heads[first:]), [(row[0], *row[first:]) for row in rows])
     return f"{ADVICE}\n\n:::{{container}} wide\n{to_level}\n\n{in_time}\n:::"
@@ -374,7 +375,7 @@ def measured_page(site, records, figures):
     structures = by_structure(records)
     site.write(
         "report.html",
-        report_page(records, report_figures(records), "lavender report of these pages", saved=False),
+        report_page(Report(records), report_figures(records), "lavender report of these pages", saved=False),
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender import _sparse as sp
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender_ext.core import gate
 from lavender_ext.judge.measure import all_finite

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray, as_array, as_csr, borrowed, equal, precision_of, read_only
+from lavender._later import issparse
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr
@@ -264,7 +265,7 @@ class Generalized:
 
 
 def _rows(jac: Any, n: int) -> Compressed:
-    sparse = sp.issparse(jac)
+    sparse = issparse(jac)
     given = jac if sparse else borrowed("J", jac, (None, None))
     if given.shape[1] != n:
         raise InputError(f"J has shape {given.shape}; (any, {n}) is needed, as M has {n} velocities")
@@ -282,7 +283,7 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
         mass = sp.block_diag(
             [sp.coo_array(block) for block in given], format="csr"
         )  # dense ones warn from SciPy 1.18 on
-    if not sp.issparse(mass):
+    if not issparse(mass):
         dense = borrowed("M", mass, (None, None))
         n = len(dense)
         if dense.shape != (n, n):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender import _sparse as sp
+from lavender._later import sparse as sp
 
 __all__ = ["sparse_lu"]
 

@@ -55,13 +55,15 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, `impulses` of another length than `problems`, or as `solve`.
+        `threads` is not a whole number from 1, `impulses` of another length than `problems`, `impulse`, or as `solve`.
     UnknownName, CapabilityError, SolverUnavailable
         As `solve`, for the first problem that is refused.
     """
     given = list(problems)
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise InputError(f"threads is {threads!r}; a whole number from 1 is needed")
+    if "impulse" in options:
+        raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
     if impulses is not None and len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
     starts = [None] * len(given) if impulses is None else list(impulses)

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import IntArray, as_array, whole_number
+from lavender._later import sparse as sp
 from lavender.errors import CapabilityError, InputError, UnknownName
 from lavender.problem import Problem
 from lavender_ext.core.order import (

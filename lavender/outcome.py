@@ -13,7 +13,7 @@ from lavender.certificates import check_certificate
 from lavender.cones import ROW
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, in_one_call
-from lavender.residuals import residual
+from lavender.residuals import FLOOR_MOST, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -41,7 +41,7 @@ def finish(
     sweeps_per_decade: float = math.nan,
 ) -> Solution:
     """The judge's residual, and the status that it bears out; a claim that it contradicts is told."""
-    judged = residual(problem, impulse)
+    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
     status, message = claim.status, claim.message
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
@@ -64,7 +64,8 @@ def finish(
     if status is CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
     elif status is FLOOR and not judged.at_floor:
-        contradicted = f"says FLOOR, relative residual {relative:.2e} is above twice {judged.floor:.2e}"
+        least = min(2.0 * judged.floor, FLOOR_MOST)
+        contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
     elif status is INFEASIBLE:
         reason = (
             "no certificate was given" if certificate is None else check_certificate(problem, certificate)

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import (
     FloatArray,
     IntArray,
@@ -17,6 +16,7 @@ from lavender._arrays import (
     precision_of,
     read_only,
 )
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender_ext.core import gate

@@ -48,7 +48,7 @@ class Turn:
     after: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Claim:
     """What one call of a solver's `run` says of itself."""
 
@@ -62,7 +62,7 @@ class Claim:
     turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class History:
     """Recorded at fixed iteration counts, never at times; arrays of one length."""
 
@@ -108,7 +108,7 @@ class SolverRun:
     form: str = ""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Solution:
     """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
 
@@ -221,7 +221,8 @@ class Solution:
         """The same of a problem with ellipses, from that of its disks."""
         s = problem.cones.stretch
         impulse, proof = read_only(s * self.impulse), self.certificate
-        found = residual(problem, impulse)  # of the numbers that are handed out: s (lambda / s) rounds
+        # Of the numbers that are handed out: s (lambda / s) rounds.
+        found = residual(problem, impulse, "float64")
         return replace(
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )

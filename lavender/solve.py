@@ -460,7 +460,7 @@ class _Loop:
             self.impulse[:] = best[1]
 
     def _record(self) -> bool:
-        r = residual(self.problem, self.impulse)
+        r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
         self._next_record = next_count(self.done)
@@ -580,7 +580,7 @@ def check_budget(
     max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
     if time_limit is not None and (not _is_number(time_limit) or not time_limit > 0.0):
         raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
-    return float(tol), max_iter, time_limit
+    return float(tol), max_iter, None if time_limit == np.inf else time_limit
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.cones import ROUND, ROW
 from lavender.problem import Problem, check_problem
 from lavender.residuals import residual

@@ -64,6 +64,18 @@ def random_rows(rng, bodies=5, joints=3, contacts=8):
     )
 
 
+def touching(contact_body, **given):
+    """Bodies at rest of 1 kg and 1 kg m^2 that touch at their centres along z; `given`: what of it is otherwise."""
+    body = np.reshape(contact_body, (-1, 2)).astype(np.int32)
+    c, n = len(body), len(given.get("inv_mass", range(body.max(initial=-1) + 1)))
+    fields = {
+        "inv_mass": np.ones(n), "inv_inertia": np.tile(np.eye(3), (n, 1, 1)), "v_free": np.zeros((n, 6)),
+        "normal": np.tile([0.0, 0.0, 1.0], (c, 1)), "tangent": np.tile([1.0, 0.0, 0.0], (c, 1)),
+        "arm_a": np.zeros((c, 3)), "arm_b": np.zeros((c, 3)), "contact_body": body,
+    }  # fmt: skip
+    return lv.Rows(**fields | given)
+
+
 def random_contact_problem(seed, friction="coulomb", tangents=None, spin=True, rolling=False, **sizes):
     """A factored problem with free and bounded joint rows and contacts; `tangents` None mixes 0, 1, 2."""
     rng = np.random.default_rng(seed)
@@ -100,6 +112,18 @@ def as_matrix(problem):
         guess=problem.guess,
         name=problem.name,
     )
+
+
+def side_by_side(parts):
+    """Problems given by their matrices as one, of which each is an island."""
+    cones = parts[0].cones
+    for part in parts[1:]:
+        cones = cones + part.cones
+    b, a = (
+        np.concatenate([part.b for part in parts]),
+        sp.block_diag([part.csr for part in parts], format="csr"),
+    )
+    return lv.Problem(b, cones, a, friction=parts[0].friction)
 
 
 def general(problem):

@@ -40,7 +40,7 @@ def _child(pipe: Any, contestant: Contestant, problem: Problem, limit: float) ->
                     again = call()[0]
                     spent, seconds = spent + max(again, 1e-6), min(seconds, again)
                 pipe.send((seconds, judged.relative))
-                if judged.relative <= max(least, 2.0 * judged.floor) or late:
+                if judged.relative <= least or judged.at_floor or late:
                     break
         pipe.send(None)
     except BaseException as error:  # whatever another project's code does

@@ -139,6 +139,7 @@ class Process:
         """
         frames = [pickle.dumps(m, pickle.HIGHEST_PROTOCOL) for m in messages]
         self._room = room
+        limit = min(limit, threading.TIMEOUT_MAX)  # inf, and what no lock waits for
         until = time.monotonic() + limit
         try:
             self._send(b"".join(struct.pack("<Q", len(f)) + f for f in frames), limit)

@@ -301,18 +301,22 @@ def describe(item: Item, run: str) -> CaseInfo:
 
 
 def fingerprint(problem: Problem) -> str:
-    """Hash of the numbers of a problem."""
+    """Hash of the numbers of a problem; what bodies' v* is to it stands in b."""
     digest = hashlib.sha256(problem.friction.encode())
-    c, r = problem.cones, problem.rows
+    c, r, g = problem.cones, problem.rows, problem.generalized
     arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
     arrays += [c.rolling] if c.has_rolling else []
     if r is None:
-        arrays += [problem.csr.indptr, problem.csr.indices, problem.csr.data]
+        for a in (problem.csr,) if g is None else (g.jac, g.mass):
+            arrays += [a.indptr, a.indices, a.data]
+        arrays += [] if g is None else [g.v_free, problem.compliance]
     else:
         arrays += [r.jac, r.joint_body, r.normal, r.tangent, r.arm_a, r.arm_b, r.contact_body, r.inv_mass]
         arrays += [r.inv_inertia, problem.compliance]
     for x in arrays:
         digest.update(b"-" if x is None else np.ascontiguousarray(x).tobytes() + b"|")
+    if problem.precision != "float64":
+        digest.update(problem.precision.encode())
     return digest.hexdigest()[:16]
 
 

@@ -195,7 +195,7 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
             under = solve(
                 problem.relaxed("coulomb"), tol=STRICT, impulse=problem.start(), time_limit=5.0
             ).residual
-            coulomb = 0.0 if under.relative <= 2.0 * under.floor else under.relative
+            coulomb = 0.0 if under.at_floor else under.relative
         out.append(
             Step(
                 model=path.stem,
@@ -210,7 +210,7 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
                 kernel=kernel,
                 engine_residual=engine_residual,
                 residual=found,
-                strict=0.0 if strict.relative <= 2.0 * strict.floor else strict.relative,
+                strict=0.0 if strict.at_floor else strict.relative,
                 coulomb=coulomb,
                 prepare=prepare,
                 judge=judge,

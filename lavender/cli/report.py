@@ -109,10 +109,11 @@ def report(
     from lavender import bench
     from lavender.report.contents import engine_table
     from lavender.report.engine import ENGINES, contestants
+    from lavender.report.findings import Report
     from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.text import count
-    from lavender.report.write import write
+    from lavender.report.write import write_all
 
     for limit in time_budgets:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -137,18 +138,16 @@ def report(
         more = {"sequence": given["sequence"], "fresh": given["fresh"], "given": partial(was_given, context)}
         done = measure(files, asked, plan, path, **more)
     engines = [] if campaign else contestants(files, done.records.latest())
-    shown: dict[str, Any] = {"old": old, "times": time_budgets, "sweeps": sweeps}
-    print_report(done.records, console(), whole=tables, **shown)
+    found = Report(done.records, old, time_budgets, sweeps, engines)
+    print_report(found, console(), whole=tables)
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write(done.records, out, figures=not no_figures, engines=engines, **shown)
+    index = write_all(found, out, figures=not no_figures)
     if paper:
         from lavender.report.paper import write_paper
 
-        _say(
-            f"figures, tables and method of a paper: {write_paper(done.records, out / 'paper', time_budgets)}"
-        )
+        _say(f"figures, tables and method of a paper: {write_paper(found, out / 'paper')}")
     _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
     if done.note:
         _say(done.note)
@@ -168,7 +167,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
     """Every option that would be ignored is an error."""
     campaign = context.params["campaign"]
     if any(f.endswith(".jsonl") for f in files):
-        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "no_figures"}
+        kept = {"files", "out", "compare", "time_budgets", "budgets", "tables", "paper", "no_figures"}
         rest = [p.name for p in context.command.params if p.name and p.name not in kept]
         refuse_unused(context, rest, "where records are shown again and nothing is solved")
     elif campaign:

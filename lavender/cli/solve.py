@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +53,7 @@ def solve(
     """
     from lavender import bench
     from lavender.report.text import residual, seconds
+    from lavender.residuals import WRONG
     from lavender.solve import solve as solve_problem
 
     one_thread()
@@ -101,11 +101,10 @@ def solve(
     if solution.status.name == "INFEASIBLE" and not solution.contradicted:
         raise click.exceptions.Exit(EXIT_INFEASIBLE)
     judged = solution.residual
-    at_floor = math.isfinite(judged.floor) and judged.relative <= 2.0 * judged.floor
-    if judged.nothing_to_do:
+    if judged.nothing_to_do and judged.verdict != WRONG:
         click.echo(f"nothing to do: doing nothing is right; this moves by {judged.velocity:.1e} m/s")
         return
-    if tol > 0.0 and not (solution.success or at_floor):
+    if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)
 
 

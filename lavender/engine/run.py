@@ -20,7 +20,7 @@ from lavender.scene import Scene
 __all__ = ["Trace", "run", "run_scene"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Trace:
     """What a run measured, one row for each step."""
 

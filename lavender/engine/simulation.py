@@ -60,7 +60,8 @@ class Simulation(Stepping):
         `lavender.solve(problem, "sequential_impulses", tol=0, max_iter=n)` returns the impulses of that substep,
         bit for bit, n being `solver_iterations`; with the scene's `order`, unless that is `alternating`: the
         contacts of such a problem stand in the order in which they are swept. The step publishes the
-        impulses of its last substep.
+        impulses of its last substep. So it is with the stepper `impulses`; others solve no velocity problem, or
+        another one, and their impulses are not those of any solver of this.
         """
         state = self.state.copy()
         if self._restored:
@@ -134,7 +135,7 @@ class Simulation(Stepping):
         InputError
             A folder that cannot be written or that holds problems which this simulation did not write, another form.
         CapabilityError
-            FCLIB cannot hold these rows; nothing is stepped.
+            FCLIB cannot hold the rows of the next step, which is not done; files of the steps before it stay.
         """
         if form not in ("npz", "fclib"):
             raise UnknownName("form", form, ("npz", "fclib"))

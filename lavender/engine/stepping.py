@@ -125,6 +125,7 @@ class Stepping:
         self._over = ""  # why no step can follow
         self._recorded: Path | None = None  # where its steps were written last
         self._restored = False  # the list of pairs is somebody else's
+        self._before: State | None = None  # a copy of what a step that may be stopped inside began with
         self._last: Solution | _Pending | None = None
 
     # -- running --------------------------------------------------------------------------------
@@ -267,7 +268,9 @@ class Stepping:
             make_pairs_anew(first)
             self._restored = False
         if keeps:
-            first.kernel.keep()
+            if self._before is None or not np.array_equal(self._before.size, first.size):
+                self._before = State(first.size)
+            self._before.take(first)
         try:
             if self._own_sweeps:
                 self._sweep_substeps()
@@ -278,8 +281,9 @@ class Stepping:
             if done == substeps or self._lost_body():
                 self._steps += 1  # it was whole
                 raise
-            if done and keeps:
-                first.kernel.put_back()
+            if done and self._before is not None and keeps:
+                first.take(self._before)
+                first.head[HEAD["solved"]] = 0
                 self.state = first
             if done and not keeps:
                 self._over = HALF
@@ -367,8 +371,7 @@ class Stepping:
         if solution.status is Status.INTERRUPTED and "callback" not in p.solver_options:
             raise KeyboardInterrupt  # the front door has turned it into a result; half a solve is no step
         self._last = solution
-        judged = solution.residual
-        if solution.success or judged.relative <= 2.0 * judged.floor:
+        if solution.success or solution.residual.at_floor:
             return solution.impulse
         if p.on_failure == "raise":
             raise SolveFailed(f"{self.scene!r}, step {self._steps}: {solution}")

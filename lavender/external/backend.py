@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows
 from lavender.external.running import Answer, Call, Limits, proof, quiet
 from lavender.solution import Status

@@ -19,7 +19,7 @@ from lavender.deadline import Deadline
 from lavender.errors import InputError
 from lavender.external.as_qp import QP, target
 from lavender.problem import Problem
-from lavender.residuals import quick
+from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
 
 __all__ = [
@@ -114,7 +114,8 @@ def ask(
         left = max_iter - work.get("iterations", 0)
         if (
             last.status is not Status.CONVERGED
-            or relative <= max(tol, 2.0 * floor)
+            or relative <= tol
+            or at_floor(relative, floor)
             or left <= 0
             or deadline.passed()
         ):

@@ -102,7 +102,8 @@ def save(
     form : {"local", "global"}, optional
         FCLIB only: W and q, or M, H, f and w (problems with rows). Default: what the problem has.
     drop : names, optional
-        FCLIB only: "names", "key" may be left out; otherwise a problem that has them is refused.
+        FCLIB only: "names" (of blocks and velocities), "key" and "precision" (float32) may be left out; otherwise a
+        problem that has them is refused.
 
     Raises
     ------

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.io.stored import Budget
 from lavender.lu import sparse_lu

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, as_array
+from lavender._later import sparse as sp
 from lavender.cones import CONTACT_ROLLING, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
@@ -417,9 +417,11 @@ def contents(
         form = "local" if problem.matrix is not None or soft else "global"
     if form not in ("local", "global"):
         raise InputError(f"form is {form!r}; 'local' or 'global' is needed")
-    unknown = sorted(set(drop) - {"names", "key"})
+    unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
-        raise InputError(f"drop names {', '.join(unknown)}; only 'names' and 'key' may be left out")
+        raise InputError(
+            f"drop names {', '.join(unknown)}; only 'names', 'key' and 'precision' may be left out"
+        )
     reasons = _cannot_hold(problem, form, drop)
     if reasons:
         text = "; ".join(reasons)
@@ -492,6 +494,12 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         reasons.append("names of blocks (drop=('names',) leaves them out)")
     if problem.key is not None and "key" not in drop:
         reasons.append("keys of blocks (drop=('key',) leaves them out)")
+    if problem.generalized is not None and problem.generalized.names is not None and "names" not in drop:
+        reasons.append("names of velocities (drop=('names',) leaves them out)")
+    if problem.precision != "float64" and "precision" not in drop:
+        reasons.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
+    if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
+        reasons.append("half a surrogate pair in its name (give it another)")
     if form == "global":
         reasons += _no_global_form(problem)
     return reasons

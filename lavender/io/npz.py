@@ -21,8 +21,9 @@ from typing import IO, Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import issparse
+from lavender._later import sparse as sp
 from lavender.cones import CONTACT, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -234,7 +235,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
         arrays["general_v_free"] = general.v_free
         arrays["compliance"] = problem.compliance
         operator = "generalized"
-    elif sp.issparse(problem.matrix):
+    elif issparse(problem.matrix):
         a = problem.matrix
         arrays |= dict(zip(CSR, (a.data, a.indices, a.indptr, np.array(a.shape, np.int64)), strict=True))
         operator = "csr"

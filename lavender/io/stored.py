@@ -25,7 +25,7 @@ MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a te
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stored:
     """A problem as a file gives it, with the solution and guesses that came with it."""
 

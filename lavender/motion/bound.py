@@ -45,7 +45,7 @@ from lavender_ext.judge import measure
 __all__ = ["Witness", "difference", "witness"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Witness:
     """An impulse y, and how far the solution can be from it: equation (2)."""
 

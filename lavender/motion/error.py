@@ -26,7 +26,7 @@ NUMBERS = (
 __all__ = ["MotionError", "measure", "told"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MotionError:
     """Distance of one impulse to the solution. None where a number means nothing; `str()` is one line."""
 

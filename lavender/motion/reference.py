@@ -23,11 +23,11 @@ __all__ = ["Reference", "adopt", "reference"]
 
 SOLVER = "auto"
 ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
-ACCEPTED = 1e-10  # relative residual that makes a reference, or twice the floor
+ACCEPTED = 1e-10  # relative residual that makes a reference, as does the floor
 CONVEX = ("linear", "lcp", "cone")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Reference:
     """An impulse that stands for the solution, or the best that was found. `str()` is one line."""
 
@@ -39,8 +39,8 @@ class Reference:
 
     @property
     def accepted(self) -> bool:
-        """Near enough to a solution that distances to it are told: relative <= 1e-10, or twice the floor."""
-        return self.residual.relative <= max(ACCEPTED, 2.0 * self.residual.floor)
+        """Near enough to a solution that distances to it are told: relative <= 1e-10, or at the floor."""
+        return self.residual.relative <= ACCEPTED or self.residual.at_floor
 
     def __str__(self) -> str:
         quality = "" if self.accepted else ", no solution"
@@ -107,7 +107,7 @@ def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
     proof = None
     if not own.refusal and problem.law in CONVEX:
         proof = witness(problem, own.operator, impulse)
-    return Reference(impulse, residual(problem, impulse), solver, own.refusal, proof)
+    return Reference(impulse, residual(problem, impulse, "float64"), solver, own.refusal, proof)
 
 
 def as_reference(problem: Problem, given: Any) -> Reference:

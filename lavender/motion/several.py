@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, whole_number
+from lavender._later import sparse as sp
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
@@ -173,7 +173,7 @@ class Motions:
             except CapabilityError:
                 continue
             out[name] = None
-            if self.motions and found.residual.relative <= max(tol, 2.0 * found.residual.floor):
+            if self.motions and (found.success or found.residual.at_floor):
                 near = self.nearest(found.impulse)
                 off = distance(p, found.impulse, near.impulse)
                 out[name] = Pick(self.motions.index(near), off.speed)

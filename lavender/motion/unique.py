@@ -45,8 +45,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
 from lavender.problem import Problem

@@ -38,7 +38,7 @@ class Quantity:
     text: str  # what it is, and the reason of the bound
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Track:
     """What an engine did of a scene, looked at in equal times; bodies in the scene's order, static ones too."""
 

@@ -114,7 +114,8 @@ class Builders(Operators):
         """The arrays of engines (ODE, Bullet, DART), as they are: friction that follows its normal, tangent by tangent.
 
         Where the normals do not stand right before the rows that follow them, the rows of the problem are those of the
-        arrays in another order, `Problem.findex_order(findex)`.
+        arrays in another order, `Problem.findex_order(findex)`. A `guess` is in the order of the arrays; `key` and
+        `names` are of the problem's blocks.
 
         Parameters
         ----------
@@ -144,6 +145,8 @@ class Builders(Operators):
         order, cones = blocks_of(lower, upper, findex, len(b))
         if (order[1:] < order[:-1]).any():
             matrix = checked_matrix(A, len(b), True)
+            if more.get("guess") is not None:
+                more["guess"] = as_array("guess", more["guess"], (len(b),), unit="N s")[order]
             return cls(b[order], cones, matrix[order][:, order], **more)
         return cls(b, cones, A, **more)
 

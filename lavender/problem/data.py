@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import (
     ArrayLike,
     FloatArray,
@@ -21,6 +20,7 @@ from lavender._arrays import (
     table_of,
 )
 from lavender._derived import Derived
+from lavender._later import issparse
 from lavender.cones import ROUND, ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -115,7 +115,7 @@ class ProblemData:
             self._check_generalized(self.generalized, m)
         else:
             put(self, "matrix", checked_matrix(self.matrix, m, self.copy))
-            if sp.issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
+            if issparse(self.matrix):  # checked arrays; those of the object anybody may exchange
                 put(self, "_compressed", (self.matrix.indptr, self.matrix.indices, self.matrix.data))
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
@@ -251,7 +251,7 @@ class ProblemData:
         given = (f.name for f in fields(self) if f.init and f.name not in ("matrix", "copy"))
         if not all(equal(getattr(self, name), getattr(other, name)) for name in given):
             return False
-        if sp.issparse(self.matrix) and sp.issparse(other.matrix):
+        if issparse(self.matrix) and issparse(other.matrix):
             return all(
                 equal(getattr(self.matrix, n), getattr(other.matrix, n))
                 for n in ("indptr", "indices", "data")
@@ -265,7 +265,7 @@ class ProblemData:
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self) if f.init)
 
     def __repr__(self) -> str:
-        kind = self.operator if self.matrix is None else "CSR" if sp.issparse(self.matrix) else "dense"
+        kind = self.operator if self.matrix is None else "CSR" if issparse(self.matrix) else "dense"
         name = f"{self.name!r}, " if self.name else ""
         return (
             f"<Problem {name}{self.law}, {_many(self.m, 'row')} in {_many(self.n_blocks, 'block')}, {kind}>"
@@ -296,7 +296,7 @@ def _many(n: int, what: str) -> str:
 
 def checked_matrix(matrix: Any, m: int, copy: bool) -> Any:
     """A dense (m, m) array or canonical CSR of float64, read-only, every entry finite."""
-    if not sp.issparse(matrix):
+    if not issparse(matrix):
         return as_array("A", matrix, (m, m), unit="1/kg", copy=copy)
     if matrix.shape != (m, m):
         raise InputError(f"A has shape {matrix.shape}; ({m}, {m}) is needed, as b has {m} rows")

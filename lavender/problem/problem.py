@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender._derived import once
+from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.errors import InputError
 from lavender.generalized import Generalized
 from lavender.problem.builders import Builders
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VelocityForm:
     """min 1/2 |y|^2 + 1/2 z^T diag(theta) z over y [sqrt J], z = scaled impulse, in the metric of d.
 

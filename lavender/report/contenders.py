@@ -46,10 +46,11 @@ def subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     if cases:
         quick = tuple(tables.within(records, "all", cases, t) for t in times)
         found.append(Subject(cases, "call", tables.to_level(records, "all", cases, level), quick))
-    passes = tables.passes(records)
-    if passes:
-        (best,), by_time = tables.over_steps("all", passes, (level,), times)
-        found.append(Subject(tuple(dict.fromkeys(w.sequence for w in passes)), "steps", best, tuple(by_time)))
+    sequences = tables.steps_of(records)
+    if sequences:
+        steps = [step for some in sequences.values() for step in some]
+        quick = tuple(tables.within(records, "all", steps, t) for t in times)
+        found.append(Subject(tuple(sequences), "steps", tables.to_level(records, "all", steps, level), quick))
     return found
 
 

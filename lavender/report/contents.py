@@ -9,6 +9,7 @@ from lavender.bench.record import Record, Skip, file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
+from lavender.report.findings import Report
 from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name
 from lavender.report.table import WORDS, Cell, Table
 from lavender.report.tables import Advice, Line
@@ -64,17 +65,12 @@ def advised(advice: Advice, in_time: bool) -> Cell:
     return Cell(text, best.solver, after, more, title, mark=mark)
 
 
-def advice_table(
-    records: Records, lines: Sequence[Line], times: Sequence[float], links: Mapping[str, str] | None = None
-) -> Table:
+def advice_table(report: Report, links: Mapping[str, str] | None = None) -> Table:
     """Each structure and sequence: who gets to each level, and who serves most within each time [s].
 
     `links` are the parts of the page that a name leads to.
     """
-    heads = [
-        *(f"to {level_name(x)}" for x in tables.levels_of(records)),
-        *(f"in {seconds(t)}" for t in times),
-    ]
+    heads = [*(f"to {level_name(x)}" for x in report.levels), *(f"in {seconds(t)}" for t in report.times)]
     rows: Rows = [
         [
             Cell(
@@ -85,7 +81,7 @@ def advice_table(
             *(advised(a, False) for a in line.by_level.values()),
             *(advised(a, True) for a in line.by_time.values()),
         ]
-        for line in lines
+        for line in report.lines
     ]
     return Table(["structure", *heads], rows, folds=True)
 
@@ -158,10 +154,10 @@ def moved_table(records: Records) -> Table:
     """Each case and solver: time to each motion error, the smallest, relative, and its bound."""
     levels = speed_levels(records)
     rows: Rows = []
-    for m in moved(records, levels):
+    for m in moved(records):
         known = [
             f"{residual(x)}{unit}" if math.isfinite(x) else NONE
-            for x, unit in ((m.best, " m/s"), (m.relative, ""), (m.bound, " √J"))
+            for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))
         ]
         rows.append([m.case, who(m.solver, m.start), *(seconds(m.times[x]) for x in levels), *known])
     heads = [f"to {speed_name(x)}" for x in levels]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
@@ -43,6 +44,13 @@ class Curve:
     points: bool = False  # without a line between them
     low: tuple[float, ...] = ()  # of a band about the line, as `y`
     high: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any) -> Curve:
+        """Through points; a residual of exactly zero is drawn at `TINY`, what is not finite breaks the line."""
+        x, y = zip(*points, strict=True)
+        drawn = tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in y)
+        return cls(solver, label, tuple(map(float, x)), drawn, **more)
 
     @property
     def front(self) -> Curve:
@@ -83,16 +91,8 @@ def work_precision(records: Records, case: str) -> Figure:
     for (name, solver, start), group in sorted(tables.pairs(records).items()):
         runs = _in_order_of_work([r for r in group if r.usable]) if name == case else []
         if runs:
-            curves.append(
-                Curve(
-                    solver,
-                    who(solver, start),
-                    tuple(r.time_min for r in runs),
-                    tuple(max(r.relative, TINY) for r in runs),
-                    tuple(r.asked for r in runs),
-                    thin=start != "cold",
-                )
-            )
+            points, asked = [(r.time_min, r.relative) for r in runs], tuple(r.asked for r in runs)
+            curves.append(Curve.of(solver, who(solver, start), points, notes=asked, thin=start != "cold"))
     return Figure(
         "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=_floor(records, [case]),
@@ -184,15 +184,7 @@ def budget_figure(records: Records, case: str) -> Figure:
     curves = []
     for (name, solver, start), points in sorted(tables.budgets(records).items()):
         if name == case:
-            curves.append(
-                Curve(
-                    solver,
-                    who(solver, start),
-                    tuple(float(n) for n, _ in points),
-                    tuple(max(r, TINY) for _, r in points),
-                    thin=start != "cold",
-                )
-            )
+            curves.append(Curve.of(solver, who(solver, start), points, thin=start != "cold"))
     return Figure(
         "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=_floor(records, [case]),
@@ -207,15 +199,8 @@ def pass_figure(sequence: str, passes: list[tables.Pass]) -> Figure:
         for start, residuals in sorted(w.residuals.items()):
             values = w.times[start] if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
-            curves.append(
-                Curve(
-                    w.solver,
-                    f"{w.solver} (cold)" if cold else w.solver,
-                    tuple(float(i) for i in range(len(values))),
-                    tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in values),
-                    thin=cold,
-                )
-            )
+            label = f"{w.solver} (cold)" if cold else w.solver
+            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
     asked = passes[0].asked
     return Figure(
         f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
@@ -240,14 +225,7 @@ def profile_figure(profile: tables.Profile) -> Figure:
 
     shown = [name for name in sorted(profile.curves, key=standing) if standing(name)[0] < 0.0][:LINES]
     curves = [
-        Curve(
-            name,
-            name,
-            tuple(r for r, _ in profile.curves[name]),
-            tuple(100.0 * s for _, s in profile.curves[name]),
-            steps=True,
-        )
-        for name in shown
+        Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
     ]
     left = sum(bool(steps) and steps[-1][1] > 0.0 for steps in profile.curves.values()) - len(curves)
     return Figure(
@@ -258,33 +236,36 @@ def profile_figure(profile: tables.Profile) -> Figure:
     )  # fmt: skip
 
 
+Group = Mapping[str, tuple[Figure, ...]]  # by what they are of
+
+
 @dataclass(frozen=True)
 class Figures:
     """Every figure of a report, in the places where its page shows them; those without a curve are left out."""
 
-    cases: Mapping[str, tuple[Figure, ...]]  # error against time, residual against iterations
-    families: Mapping[str, Figure]
-    profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
-    sequences: Mapping[str, tuple[Figure, ...]]
-    over: tuple[Figure, ...] = ()  # the one over all cases
-    moved: Figures | None = (
-        None  # the same with motion errors [m/s] in place of residuals, where they are known
-    )
+    over: Group = field(default_factory=dict)  # "all": the one over all cases
+    families: Group = field(default_factory=dict)
+    profiles: Group = field(default_factory=dict)  # by law, one for each level
+    sequences: Group = field(default_factory=dict)
+    cases: Group = field(default_factory=dict)  # error against time, residual against iterations
+    moved: Figures | None = None  # the same with motion errors [m/s] in place of residuals, where known
+
+    @property
+    def places(self) -> dict[str, Group]:
+        """The groups by their names."""
+        return {name: group for name, group in vars(self).items() if name != "moved"}
 
     def __iter__(self) -> Iterator[Figure]:
-        yield from self.over
-        yield from self.families.values()
-        for group in (self.profiles, self.sequences, self.cases):
+        for group in self.places.values():
             for some in group.values():
                 yield from some
-        if self.moved is not None:
-            yield from self.moved
+        yield from self.moved or ()
 
 
 def figures(records: Records) -> Figures:
     """The figures of the records, by residual and, where it is known, by motion error; none of a campaign."""
     if tables.is_campaign(records):
-        return Figures({}, {}, {}, {})
+        return Figures()
     found = _figures(records)
     return replace(found, moved=_by_motion(_figures(by_speed(records)))) if speed_levels(records) else found
 
@@ -300,12 +281,11 @@ def _by_motion(found: Figures) -> Figures:
             y_title=figure.y_title.replace("relative residual [-]", "motion error [m/s]"),
         )
 
-    def group(some: Mapping[str, tuple[Figure, ...]]) -> dict[str, tuple[Figure, ...]]:
-        return {name: tuple(map(told, own)) for name, own in some.items()}
-
-    families = {name: told(figure) for name, figure in found.families.items()}
-    over = tuple(map(told, found.over))
-    return Figures(group(found.cases), families, group(found.profiles), group(found.sequences), over)
+    groups: dict[str, Any] = {
+        place: {name: tuple(map(told, own)) for name, own in group.items()}
+        for place, group in found.places.items()
+    }
+    return Figures(**groups)
 
 
 def _figures(records: Records) -> Figures:
@@ -313,17 +293,19 @@ def _figures(records: Records) -> Figures:
     for r in records:
         if r.step < 0:
             parts.setdefault(r.case, Records(records.runs)).add(r)
-    families = {f: family_figure(records, f, cs) for f, cs in tables.families(records).items() if len(cs) > 1}
     profiles: dict[str, list[Figure]] = {}
     for profile in tables.profiles(records):
         if profile.cases > 1:
             profiles.setdefault(profile.law, []).append(profile_figure(profile))
+    shared = {family: cases for family, cases in tables.families(records).items() if len(cases) > 1}
+    families = {family: _drawn(family_figure(records, family, cases)) for family, cases in shared.items()}
+    over = _drawn(overall_figure(records))
     return Figures(
-        {c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
-        {f: figure for f, figure in families.items() if figure.curves},
-        {law: _drawn(*some) for law, some in profiles.items()},
-        {name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
-        _drawn(overall_figure(records)),
+        over={"all": over} if over else {},
+        families={family: some for family, some in families.items() if some},
+        profiles={law: _drawn(*some) for law, some in profiles.items()},
+        sequences={name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
+        cases={c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
     )
 
 

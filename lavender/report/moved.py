@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.report.tables.advice import Advice, advice_by_level
 from lavender.report.tables.campaigns import Robustness, robustness
-from lavender.report.tables.cases import reaches
+from lavender.report.tables.cases import Reach, reaches
 
 __all__ = [
     "Idle",
-    "Moved",
     "advice_by_speed",
     "by_speed",
     "idle",
@@ -37,19 +35,6 @@ class Idle:
     solver: str  # of the largest velocity error
     velocity: float  # m/s
     energy: float  # sqrt J
-
-
-@dataclass(frozen=True)
-class Moved:
-    """How far and how fast one solver came on one case, by motion error."""
-
-    case: str
-    solver: str
-    start: str
-    times: dict[float, float]  # s to each speed level [m/s], inf where it was not reached
-    best: float  # m/s, smallest motion error of any run
-    relative: float  # -, of that run; nan where there is none
-    bound: float  # sqrt J, of that run; nan where nothing is proved
 
 
 def speed_name(level: float) -> str:
@@ -90,32 +75,10 @@ def robustness_by_speed(records: Records) -> list[Robustness]:
     return robustness(by_speed(records)) if speed_levels(records) else []
 
 
-def moved(records: Records, levels: Sequence[float] | None = None) -> list[Moved]:
-    """One row for each case, solver and start, in the order of the records; none without motion errors."""
-    levels = speed_levels(records) if levels is None else tuple(levels)
-    if not levels:
-        return []
-    runs: dict[tuple[str, str, str], tuple[float, Record]] = {}
-    for r in records:
-        if r.motion_speed is not None and r.order == "given" and r.step < 0:
-            key = (r.case, r.solver, r.start)
-            if key not in runs or r.motion_speed < runs[key][0]:
-                runs[key] = (r.motion_speed, r)
-    out = []
-    for reach in reaches(by_speed(records), levels):
-        best = runs.get((reach.case, reach.solver, reach.start), (0.0, None))[1]
-        out.append(
-            Moved(
-                case=reach.case,
-                solver=reach.solver,
-                start=reach.start,
-                times=dict(reach.times),
-                best=reach.best,
-                relative=math.nan if best is None or best.motion is None else best.motion,
-                bound=math.nan if best is None or best.bound is None else best.bound,
-            )
-        )
-    return out
+def moved(records: Records) -> list[Reach]:
+    """How far and how fast each solver came on each case by motion error [m/s]; none without motion errors."""
+    levels = speed_levels(records)
+    return reaches(by_speed(records), levels) if levels else []
 
 
 def working(records: Records) -> Records:

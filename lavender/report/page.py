@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import contents, tables
-from lavender.report.curves import Figure, Figures
-from lavender.report.moved import robustness_by_speed, speed_levels, working
+from lavender.report.curves import Figures
+from lavender.report.findings import Report
+from lavender.report.moved import robustness_by_speed
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
 from lavender.report.text import count, residual, seconds, suspicions
-from lavender.report.verdict import Verdict, verdict
-
-if TYPE_CHECKING:
-    from lavender.report.engine import Contestant
+from lavender.report.verdict import Verdict
 
 __all__ = ["page"]
 
@@ -43,78 +41,37 @@ def _environment() -> Any:
     return environment
 
 
-def page(
-    records: Records,
-    figures: Figures,
-    title: str = "lavender report",
-    *,
-    old: Records | None = None,
-    budgets: Sequence[float] = (),
-    sweeps: Sequence[int] = (),
-    saved: bool = True,
-    engines: Sequence[Contestant] = (),
-) -> str:
+def page(report: Report, figures: Figures, title: str = "lavender report", saved: bool = True) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
     Parameters
     ----------
-    records : Records
+    report : Report
     figures : Figures
-        Of these records: `curves.figures`.
-    old : Records, optional
-        An earlier run to compare with.
-    budgets : s, optional
-        Time budgets of the recommendation.
-    sweeps : int, optional
-        Budgets of sweeps of the recommendation.
+        Of its records: `curves.figures`.
+    title : str
     saved : bool
         The figures are beside the page as SVG and PNG.
-    engines : sequence of Contestant
-        Answers of the engines that recorded the steps.
     """
-    content = _content(records, figures, old, tuple(budgets), tuple(sweeps))
-    return (
-        _environment()
-        .get_template("index.html.j2")
-        .render(
-            title=title,
-            saved=saved,
-            engines=contents.engine_table(engines),
-            count=count,
-            inf=math.inf,
-            isfinite=math.isfinite,
-            **content,
-        )
-    )
+    return _environment().get_template("index.html.j2").render(
+        title=title, saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
+    )  # fmt: skip
 
 
-def _content(
-    records: Records,
-    figures: Figures,
-    old: Records | None,
-    budgets: Sequence[float],
-    sweeps: Sequence[int],
-) -> dict[str, Any]:
+def _content(report: Report, figures: Figures) -> dict[str, Any]:
     """Everything that the template names."""
-    still = contents.idle_table(records)
-    records = working(records)
-    failures, spreads = (
-        tables.failures(records),
-        sorted(tables.spreads(records), key=lambda s: -s.factor),
-    )
-    found = verdict(records, budgets, sweeps)
-    budgets = budgets or tables.time_budgets(records)
-    levels = tables.levels_of(records)
-    campaign = tables.is_campaign(records)
-    lines = [] if campaign else tables.advice(records, budgets)
+    records, found, levels, campaign = report.records, report.verdict, report.levels, report.is_campaign
+    failures = tables.failures(records)
+    spreads = sorted(tables.spreads(records), key=lambda s: -s.factor)
     return {
         **_drawings(records, figures, found),
-        **_cases(records, figures, levels),
-        **_changes(old, records),
+        **_cases(records, levels),
+        **_changes(report.before, records),
         "verdict": found,
-        "others": [] if campaign else _others(records, lines, found, levels, budgets),
-        "idle": still,
+        "others": _others(report),
+        "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
+        "engines": contents.engine_table(report.engines),
         "moved": None if campaign else contents.moved_table(records),
         "speed_advice": None if campaign else contents.speed_table(records),
         "noise": NOISE,
@@ -122,9 +79,8 @@ def _content(
         "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
-        "budgets_of_time": budgets,
-        "advice": contents.advice_table(records, lines, budgets, _links(lines, figures)),
-        "swept": contents.sweeps_table(lines),
+        "advice": contents.advice_table(report, _links(report.lines, figures)),
+        "swept": contents.sweeps_table(report.lines),
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
@@ -144,7 +100,7 @@ def _content(
         "campaign": campaign,
         "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
         "robustness_by_speed": contents.robustness_table(
-            robustness_by_speed(records) if campaign else [], speed_levels(records), " m/s"
+            robustness_by_speed(records) if campaign else [], report.speeds, " m/s"
         ),
         "sequences": {
             name: contents.pass_table(passes).without("sequence", "steps")
@@ -161,11 +117,8 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
     # Under the heading of a case or a family its name says nothing new.
-    titles = {f.name: "" for some in figures.cases.values() for f in some} | {
-        f.name: "" for f in figures.families.values()
-    }
-    titles |= {f"motion {name}": "" for name in titles}
-    other = figures.moved or Figures({}, {}, {}, {})
+    own = [f.name for group in (figures.cases, figures.families) for some in group.values() for f in some]
+    titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
         "drawings": {  # each escapes what it holds
             file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
@@ -174,24 +127,24 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
         "solvers": names,
         "number": number,
         "by_motion": figures.moved is not None,
-        "over": _keys(figures.over),
-        "moved_over": _keys(other.over),
-        "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
-        "moved_families": {f: file_name(figure.name) for f, figure in other.families.items()},
-        "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
-        "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
-        "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
-        "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
+        "drawn": _keys(figures),
+        "moved_drawn": _keys(figures.moved or Figures()),
     }
 
 
-def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[str, Any]:
+def _keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
+    return {
+        place: {name: [file_name(figure.name) for figure in some] for name, some in group.items()}
+        for place, group in figures.places.items()
+    }
+
+
+def _cases(records: Records, levels: Sequence[float]) -> dict[str, Any]:
     """Each case with its solvers; none of a campaign: of thousands the tables over all of them say it."""
     by_case: dict[str, list[tables.Reach]] = {}
     if not tables.is_campaign(records):
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
-    moved_figures = {} if figures.moved is None else figures.moved.cases
     level = levels[len(levels) // 2]
     fastest = {name: _fastest(rows, level) for name, rows in by_case.items()}
     stored = any(math.isfinite(x.stored) for x in records.cases.values())
@@ -199,8 +152,6 @@ def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[
         {
             "info": records.cases[name],
             "reaches": contents.reach_table(rows, levels).without("case"),
-            "figures": _keys(figures.cases.get(name, ())),
-            "moved": _keys(moved_figures.get(name, ())),
         }
         for name, rows in by_case.items()
     ]
@@ -231,14 +182,9 @@ def _changes(old: Records | None, records: Records) -> dict[str, Any]:
 MOST_OTHERS = 6
 
 
-def _others(
-    records: Records,
-    lines: Sequence[tables.Line],
-    found: Verdict,
-    levels: Sequence[float],
-    budgets: Sequence[float],
-) -> list[str]:
+def _others(report: Report) -> list[str]:
     """What would change the choice: other levels and times, single structures, each with who is first there."""
+    records, levels, found, lines = report.records, report.levels, report.verdict, report.lines
     if not found.leaders or not lines:
         return []
     cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
@@ -248,7 +194,7 @@ def _others(
         asked |= {
             f"to {level_name(x)}": tables.to_level(records, "all", cases, x) for x in levels if x != middle
         }
-        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in budgets}
+        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in report.times}
     asked |= {f"on {line.name}": line.by_level[middle] for line in lines if len(lines) > 1}
     by_solver: dict[str, list[str]] = {}
     for where, advice in asked.items():
@@ -266,7 +212,3 @@ def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
     """Who brings a case to the level first, from a cold start, with claims that hold."""
     honest = [r for r in rows if r.start == "cold" and not r.contradicted and math.isfinite(r.times[level])]
     return min(honest, key=lambda r: r.times[level], default=None)
-
-
-def _keys(some: Iterable[Figure]) -> list[str]:
-    return [file_name(figure.name) for figure in some]

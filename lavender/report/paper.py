@@ -19,29 +19,26 @@ from lavender.errors import InputError
 from lavender.report import contents, tables
 from lavender.report.curves import LINES, Figure, figures
 from lavender.report.draw import matplotlib_figure
-from lavender.report.moved import working
+from lavender.report.findings import Report
 from lavender.report.style import looks
 from lavender.report.table import Cell, Table, latex, tex
 from lavender.report.tables.advice import NOISE
 from lavender.report.text import count, seconds
-from lavender.report.verdict import verdict
 
 __all__ = ["write_paper"]
 
 INCH = (5.5, 3.4)  # of a figure: a page's width of text
 
 
-def write_paper(records: Records, folder: str | Path, times: Sequence[float] = ()) -> Path:
+def write_paper(report: Report, folder: str | Path) -> Path:
     """Write the figures, tables and the method of a paper.
 
     Parameters
     ----------
-    records : Records
-        Of the newest run; nothing is solved.
+    report : Report
+        Nothing is solved.
     folder : path
         Made if it does not exist.
-    times : s, optional
-        Time budgets of the recommendations; `tables.time_budgets` if none are given.
 
     Returns
     -------
@@ -53,13 +50,12 @@ def write_paper(records: Records, folder: str | Path, times: Sequence[float] = (
     InputError
         No runs with times (a campaign), or the folder cannot be written.
     """
-    found = working(records.latest())
-    if not len(found) or tables.is_campaign(found):
+    found = report.records
+    if not len(found) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    times = tuple(times) or tables.time_budgets(found)
     folder = Path(folder)
     drawn = figures(found)
-    some = [_leading(figure, found, times) for figure in drawn.over]
+    some = [_leading(figure, report.verdict.leaders) for figure in drawn.over.get("all", ())]
     some += [
         figure for group in (drawn.profiles, drawn.sequences) for own in group.values() for figure in own
     ]
@@ -70,43 +66,39 @@ def write_paper(records: Records, folder: str | Path, times: Sequence[float] = (
             canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
             path = folder / (file_name(figure.name.replace(" ", "-")) + ".pdf")
             canvas.savefig(path, metadata={"CreationDate": None, "Producer": None})
-        (folder / "tables.tex").write_text(_tables(found, times), encoding="utf-8")
+        (folder / "tables.tex").write_text(_tables(report), encoding="utf-8")
         (folder / "method.tex").write_text(_method(found), encoding="utf-8")
     except OSError as error:
         raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
     return folder
 
 
-def _leading(figure: Figure, records: Records, times: Sequence[float]) -> Figure:
+def _leading(figure: Figure, leaders: Sequence[str]) -> Figure:
     """The five curves to tell apart: the leaders of the verdict, then whoever ends lowest; bands of the first two."""
-    leaders = [
-        *verdict(records, times).leaders,
-        *(c.solver for c in sorted(figure.curves, key=lambda c: c.y[-1])),
-    ]
-    order = sorted(figure.curves, key=lambda c: leaders.index(c.solver))[:LINES]
+    names = [*leaders, *(c.solver for c in sorted(figure.curves, key=lambda c: c.y[-1]))]
+    order = sorted(figure.curves, key=lambda c: names.index(c.solver))[:LINES]
     return replace(figure, curves=(*order[:2], *(replace(c, low=(), high=()) for c in order[2:])))
 
 
 # -- LaTeX ------------------------------------------------------------------------------------------------
 
 
-def _tables(records: Records, times: Sequence[float]) -> str:
-    shift = seconds(tables.SHIFT)
+def _tables(report: Report) -> str:
+    records, shift = report.records, seconds(tables.SHIFT)
     caption = (
         "Recommended solver, its mean time, and the cases that it brings to the level where that is not all. Within "
         f"{NOISE:g} times of each other solvers count as equal."
     )
-    lines = tables.advice(records, times)
-    advice = contents.advice_table(records, lines, ())
+    advice, last = contents.advice_table(report), 1 + len(report.levels)
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
             str(line.size),
-            *(replace(c, after="") for c in row[1 : len(advice.heads)] if isinstance(c, Cell)),
+            *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
         ]
-        for row, line in zip(advice.rows, lines, strict=True)
+        for row, line in zip(advice.rows, report.lines, strict=True)
     ]
-    made = [latex(Table(["structure", "cases", *advice.heads[1:]], rows), caption, "recommended")]
+    made = [latex(Table(["structure", "cases", *advice.heads[1:last]], rows), caption, "recommended")]
     for law, by_level in tables.geometric_means(records).items():
         caption = (
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 from lavender.bench.record import printable
 from lavender.bench.store import Records
 from lavender.report import contents, tables
-from lavender.report.moved import idle, robustness_by_speed, speed_levels, working
+from lavender.report.findings import Report
+from lavender.report.moved import idle, robustness_by_speed
 from lavender.report.table import print_table
 from lavender.report.text import count, residual, suspicions
-from lavender.report.verdict import verdict
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -22,49 +22,38 @@ BY_MOTION = "\n[bold]By motion error[/] (how wrong the body moves that is furthe
 SHORT = 20  # lines: a report that has no more is printed whole
 
 
-def print_report(
-    records: Records,
-    console: Console,
-    old: Records | None = None,
-    times: Sequence[float] = (),
-    sweeps: Sequence[int] = (),
-    whole: bool = False,
-) -> None:
+def print_report(report: Report, console: Console, whole: bool = False) -> None:
     """What the terminal shows after a run: the recommendation first; every case and sequence where `whole`.
 
     A report of few lines is shown whole anyhow.
     """
-    still = idle(records)
-    records = working(records)
-    levels = tables.levels_of(records)
-    campaign = tables.is_campaign(records)
-    if campaign:
+    records, still = report.records, idle(report.every)
+    if report.is_campaign:
         console.print(
             "[bold]Campaign[/] (no times; share of cases brought to a level, residual at each budget)"
         )
-        print_table(console, contents.robustness_table(tables.robustness(records), levels), grouped=True)
+        by_residual = contents.robustness_table(tables.robustness(records), report.levels)
+        print_table(console, by_residual, grouped=True)
         if by_speed := robustness_by_speed(records):
             console.print(BY_MOTION, highlight=False)
-            by_motion = contents.robustness_table(by_speed, speed_levels(records), " m/s")
+            by_motion = contents.robustness_table(by_speed, report.speeds, " m/s")
             print_table(console, by_motion, grouped=True)
     elif len(records):
-        found = verdict(records, times, sweeps)
-        console.print(found.text, style="bold", highlight=False, markup=False)
-        for line in found.code:
+        console.print(report.verdict.text, style="bold", highlight=False, markup=False)
+        for line in report.verdict.code:
             console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
         console.print(
             "\n[bold]By structure[/] (to a level: mean time, share of cases that get there, budget; in a time or with "
             "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise)",
             highlight=False,
         )
-        asked = tuple(times) or tables.time_budgets(records)
-        advice = tables.advice(records, asked)
-        print_table(console, contents.advice_table(records, advice, asked))
-        swept = contents.sweeps_table(advice)
+        print_table(console, contents.advice_table(report))
+        swept = contents.sweeps_table(report.lines)
         if swept.rows:
             console.print("\n[bold]By sweeps[/]", highlight=False)
             print_table(console, swept)
-        _print_motion(records, console, whole)
+        if report.speeds:
+            _print_motion(records, console, whole)
     for case in still[:SHORT]:
         console.print(
             f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
@@ -76,11 +65,13 @@ def print_report(
         console.print(f"and {len(still) - SHORT} more with nothing to do", highlight=False, style="dim")
     _print_lost(records, console)
     _print_suspicions(records, console)
-    if not campaign:
-        _print_tables(records, console, levels, whole)
-    if old is not None:
-        changed = contents.change_table(old, records)
-        said = f"\nAgainst {printable(old.source)}{'' if changed.rows else ': nothing beyond noise'}"
+    if not report.is_campaign:
+        _print_tables(records, console, report.levels, whole)
+    if report.before is not None:
+        changed = contents.change_table(report.before, records)
+        said = (
+            f"\nAgainst {printable(report.before.source)}{'' if changed.rows else ': nothing beyond noise'}"
+        )
         console.print(said, highlight=False, markup=False, style="bold")
         if changed.rows:
             print_table(console, changed)
@@ -95,8 +86,6 @@ def print_report(
 
 def _print_motion(records: Records, console: Console, whole: bool) -> None:
     """Who gets to each motion error, by structure; each case where that is asked for or few."""
-    if not speed_levels(records):
-        return
     console.print(BY_MOTION, highlight=False)
     print_table(console, contents.speed_table(records))
     moved = contents.moved_table(records)

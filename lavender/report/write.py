@@ -13,8 +13,9 @@ from lavender.io.stored import write_text
 if TYPE_CHECKING:
     from lavender.report.curves import Figures
     from lavender.report.engine import Contestant
+    from lavender.report.findings import Report
 
-__all__ = ["write"]
+__all__ = ["write", "write_all"]
 
 
 def write(
@@ -55,37 +56,29 @@ def write(
     InputError
         The folder cannot be written.
     """
+    from lavender.report.findings import Report
+
+    return write_all(Report(records, old, times, sweeps, engines), folder, figures=figures)
+
+
+def write_all(report: Report, folder: str | Path, *, figures: bool = True) -> Path:
+    """As `write`."""
     from lavender.report.curves import figures as figures_of
     from lavender.report.markdown import summary
-    from lavender.report.moved import working
     from lavender.report.page import page
 
     folder = Path(folder)
-    shown = records.latest()
-    busy = working(shown)
-    drawn = figures_of(busy)
+    drawn = figures_of(report.records)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_csv(records, folder / "records.csv")
-        write_json(records, folder / "records.json")
+        write_csv(report.given, folder / "records.csv")
+        write_json(report.given, folder / "records.json")
         index = folder / "index.html"
-        before = None if old is None else old.latest()
         # Whole or not at all: on a full disk the page of the last time stays.
-        write_text(
-            index,
-            page(
-                shown,
-                drawn,
-                old=before,
-                budgets=times,
-                sweeps=sweeps,
-                saved=figures,
-                engines=engines,
-            ),
-        )
-        write_text(folder / "summary.md", summary(busy, times, engines, sweeps))
+        write_text(index, page(report, drawn, saved=figures))
+        write_text(folder / "summary.md", summary(report))
         if figures and list(drawn):
-            _save(drawn, {r.solver for r in shown}, folder / "figures")
+            _save(drawn, {r.solver for r in report.every}, folder / "figures")
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or folder} ({error.strerror or error}): make room, or give a folder that "

@@ -44,7 +44,7 @@ class Box:
         return np.diag([y + z, x + z, x + y]) * (mass / 12.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Body:
     """One rigid body; `mass` 0 means static."""
 
@@ -77,7 +77,7 @@ class Body:
 DISTANCE, BALL, HINGE = "distance", "ball", "hinge"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Joint:
     """One joint between bodies a and b (-1: the world); anchors and axes in the bodies' frames."""
 

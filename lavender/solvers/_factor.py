@@ -17,10 +17,10 @@ import warnings
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.linalg import lapack
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import lapack
+from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.factor.narrow import narrow_order

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import InputError
 from lavender.problem import Problem

@@ -31,7 +31,7 @@ from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import at_floor, judged, remember
+from lavender.residuals import FLOOR_MOST, at_floor, judged, remember
 from lavender.solution import Claim, Status
 from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
@@ -41,7 +41,6 @@ from lavender_ext.pivot.direct import PASSED, SPENT
 from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
 
 GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
-RUNAWAY = 1e-6
 PATIENCE = 6  # passes without halving the best residual
 BATCH = 32  # rounds between two looks at the clock and the judge
 
@@ -201,8 +200,10 @@ class _Run:
             remember(self.problem, self.kept)
 
     def good(self) -> bool:
-        # A floor above 1e-6 belongs to an impulse that ran away, not to the problem.
-        return self.best <= max(self.least, min(self.floor, RUNAWAY))
+        return self.best <= max(self.least, min(self.floor, FLOOR_MOST))
+
+    def at_floor(self) -> bool:
+        return at_floor(self.best, self.floor)
 
     @property
     def left(self) -> int:
@@ -233,7 +234,7 @@ class _Run:
         """What the best iterate deserves, when nothing is left to do."""
         if self.best <= self.tol:
             return self.claim(Status.CONVERGED)
-        if at_floor(self.best, self.floor):
+        if self.at_floor():
             return self.claim(Status.FLOOR)
         return self.claim(Status.STALLED)
 
@@ -261,7 +262,7 @@ class _Run:
                 break
             previous = relative
         if isinstance(factor, PanelsLU):
-            rounded = self.good() or at_floor(self.best, min(self.floor, RUNAWAY))
+            rounded = self.good() or self.at_floor()
             if not rounded and not self.out_of_time:
                 return self.general(f"{self.notes[0]}; LU by panels did not refine")
         elif not self.good() and singular:
@@ -359,7 +360,7 @@ class _Run:
             return self.circling()
         if code == INDEFINITE and self.patient:
             return self.general("A is indefinite") if linear else self.indefinite(pivot.symmetric)
-        if linear and self.best > max(self.tol, 2.0 * self.floor) and not self.out_of_time:
+        if linear and not (self.best <= self.tol or self.at_floor()) and not self.out_of_time:
             return self.general("A is indefinite")
         return self.verdict()
 

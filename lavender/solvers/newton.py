@@ -33,7 +33,7 @@ from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
-from lavender.residuals import quick
+from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
@@ -142,7 +142,7 @@ class Newton:
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
         best, floor = quick(problem, impulse, w, e, True)
-        if best <= 2.0 * floor:
+        if at_floor(best, floor):
             return claim
         before = impulse.copy()
         if not best <= WARM:

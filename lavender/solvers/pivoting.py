@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import lapack
 from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
 from lavender.residuals import reference
@@ -118,8 +119,6 @@ class PivotState:
         """
         if self.form != "dense":
             return int(self.rows.rank)
-        from scipy.linalg import lapack
-
         scale = 1.0 / np.sqrt(self.problem.csr_data.d)
         return int(lapack.dpstrf(scale[:, None] * self.problem.dense() * scale, tol=TINY)[2])
 

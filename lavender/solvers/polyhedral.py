@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.certificates import check_certificate
 from lavender.cones import ROW, project
 from lavender.deadline import Deadline

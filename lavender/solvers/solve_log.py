@@ -11,7 +11,7 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
-from lavender.residuals import at_floor, known, quick, reference, remember
+from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
 from lavender.solvers.small import told
@@ -120,7 +120,7 @@ class SolveLog:
         )
 
     def at_floor(self) -> bool:
-        if self.best > 1e-5:
+        if self.best > FLOOR_MOST:
             return False
         return at_floor(*quick(self.problem, self.impulse, *self._room, True))
 

@@ -14,8 +14,8 @@ inertia (spheres, cubes) needs (1) alone.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.rows cimport dot3
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
+from lavender_ext.engine.vectors cimport copy3, plus3, times3
 
 
 cdef inline void rotation(const double* q, double* r) noexcept nogil:
@@ -34,9 +34,7 @@ cdef inline void rotation(const double* q, double* r) noexcept nogil:
 
 cdef inline void to_world(const double* r, const double* a, double* out) noexcept nogil:
     # R a
-    cdef int32_t k
-    for k in range(3):
-        out[k] = r[3 * k] * a[0] + r[3 * k + 1] * a[1] + r[3 * k + 2] * a[2]
+    times3(r, a, out)
 
 
 cdef inline void to_body(const double* r, const double* a, double* out) noexcept nogil:
@@ -88,10 +86,8 @@ cdef inline void world_times(const double* r, const double* body, const double* 
     # R T R^T a
     cdef double s[3]
     cdef double t[3]
-    cdef int32_t k
     to_body(r, a, s)
-    for k in range(3):
-        t[k] = dot3(body + 3 * k, s)
+    times3(body, s, t)
     to_world(r, t, out)
 
 
@@ -130,7 +126,7 @@ cdef inline int32_t is_lost(const engine_t* e, int32_t body) noexcept nogil:
 
 cdef inline void start_bodies(engine_t* e) noexcept nogil:
     """Frames, world inverse inertia and v* = v + h g of the coming substep."""
-    cdef int32_t i, k, b
+    cdef int32_t i, b
     cdef double h = e.setting[S_H]
     cdef const double* g = e.setting + S_GRAVITY
     if e.size[N_FRAME] > 0:
@@ -140,18 +136,21 @@ cdef inline void start_bodies(engine_t* e) noexcept nogil:
         b = e.body_of[i]
         if e.uneven[b]:
             world_tensor(e.rot + 9 * b, e.inv_inertia_body + 9 * b, e.inv_inertia + 9 * i)
-        for k in range(3):
-            e.v_free[6 * i + k] = e.v[6 * b + k] + h * g[k]
-            e.v_free[6 * i + 3 + k] = e.v[6 * b + 3 + k]
+        plus3(e.v + 6 * b, h, g, e.v_free + 6 * i)
+        copy3(e.v + 6 * b + 3, e.v_free + 6 * i + 3)
 
 
-cdef inline int32_t drift_bodies(engine_t* e, int32_t shifted) noexcept nogil:
-    """v = v* + dv, then poses over h, then the shift of the position projection.
+cdef inline int32_t drift_bodies(engine_t* e, const double* by, int32_t shifted) noexcept nogil:
+    """v = v* + dv, then poses over h by v* + `by` (nd, 6), then the shift of the position projection.
 
-    Returns the first body whose state is not finite, or -1.
+    Where `by` is not dv a turning body keeps the momentum of v; NULL: the poses are there already. Returns the first
+    body whose state is not finite, or -1.
     """
     cdef int32_t i, k, b, lost = -1
     cdef double h = e.setting[S_H]
+    cdef double moving[6]
+    cdef double r[9]
+    cdef double momentum[3]
     cdef double* v
     cdef double* x
     cdef double* q
@@ -162,15 +161,22 @@ cdef inline int32_t drift_bodies(engine_t* e, int32_t shifted) noexcept nogil:
         q = e.q + 4 * b
         for k in range(6):
             v[k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
-        for k in range(3):
-            x[k] += h * v[k]
-        if e.uneven[b]:
-            drift_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-        elif v[3] != 0.0 or v[4] != 0.0 or v[5] != 0.0:
-            turn(q, v + 3, h)
+        if by != NULL:
+            for k in range(6):
+                moving[k] = e.v_free[6 * i + k] + by[6 * i + k]
+            plus3(x, h, moving, x)
+            if e.uneven[b] and by == e.dv:
+                drift_rotation(q, v + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+            elif e.uneven[b]:
+                rotation(q, r)
+                world_times(r, e.inertia + 9 * b, v + 3, momentum)
+                drift_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
+                rotation(q, r)
+                world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
+            elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
+                turn(q, moving + 3, h)
         if shifted:
-            for k in range(3):
-                x[k] += e.shift[6 * i + k]
+            plus3(x, 1.0, e.shift + 6 * i, x)
             turn(q, e.shift + 6 * i + 3, 1.0)
         if lost < 0 and is_lost(e, b):
             lost = b

@@ -37,6 +37,7 @@ from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_
                                          S_BETA, S_BOUNCE, S_H, S_MARGIN, S_MATCH, S_ROLLING, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport to_body
 from lavender_ext.engine.narrow_phase cimport collide, manifold_t
+from lavender_ext.engine.vectors cimport both3, copy3, minus3
 
 
 cdef inline uint64_t contact_key(int32_t a, int32_t b, int32_t feature) noexcept nogil:
@@ -131,6 +132,10 @@ cdef inline void guess_contact(engine_t* e, int32_t c, int32_t entry, int32_t nt
         e.push[e.size[N_JOINT_ROW] + c] = p[4]
 
 
+cdef inline double restitution_of(const engine_t* e, int32_t a, int32_t b) noexcept nogil:
+    return e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+
+
 cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int32_t c) noexcept nogil:
     # closing speed of a contact with the velocities before the substep, static bodies at rest
     cdef double u[3]
@@ -142,12 +147,10 @@ cdef inline double normal_velocity(const engine_t* e, int32_t a, int32_t b, int3
 
 cdef inline void local_arm(const engine_t* e, int32_t body, const double* arm, double* out) noexcept nogil:
     # a sphere's contact does not turn with it; a box's does
-    cdef int32_t k
     if e.kind_of_shape[body] == BOX:
         to_body(e.rot + 9 * body, arm, out)
     else:
-        for k in range(3):
-            out[k] = arm[k]
+        copy3(arm, out)
 
 
 cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t row, int32_t a, int32_t b,
@@ -164,16 +167,14 @@ cdef inline void make_contact(engine_t* e, const rows_t* r, int32_t c, int32_t r
     e.contact_body[2 * c + 1] = db
     e.key[c] = contact_key(a, b, m.feature[at])
     e.gap[c] = m.gap[at]
-    for k in range(3):
-        e.point[3 * c + k] = m.point[3 * at + k]
-        e.normal[3 * c + k] = m.normal[k]
-        e.arm_a[3 * c + k] = m.point[3 * at + k] - e.x[3 * a + k]
-        e.arm_b[3 * c + k] = m.point[3 * at + k] - e.x[3 * b + k]
+    copy3(m.point + 3 * at, e.point + 3 * c)
+    copy3(m.normal, e.normal + 3 * c)
+    minus3(m.point + 3 * at, e.x + 3 * a, e.arm_a + 3 * c)
+    minus3(m.point + 3 * at, e.x + 3 * b, e.arm_b + 3 * c)
     local_arm(e, a, e.arm_a + 3 * c, e.local + 6 * c)
     local_arm(e, b, e.arm_b + 3 * c, e.local + 6 * c + 3)
     if nt > 0:
-        for k in range(3):
-            e.tangent[3 * c + k] = tangent[k]
+        copy3(tangent, e.tangent + 3 * c)
     # the common kind with its size as constants, so that a compiler unrolls it
     if nt == 2 and not turns:
         contact_diagonal(e.normal + 3 * c, e.tangent + 3 * c, e.arm_a + 3 * c, e.arm_b + 3 * c, 2, 0, da, db,
@@ -249,7 +250,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             c += m.n                                    # only counted from here on
             continue
         mu = sqrt(e.friction[a] * e.friction[b])
-        bounce = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+        bounce = restitution_of(e, a, b)
         patch = e.patch[a] if e.patch[a] < e.patch[b] else e.patch[b]
         nt = 2 if mu > 0.0 else 0
         turns = 0 if not mu > 0.0 else (1 if patch > 0.0 else 0) + (2 if e.setting[S_ROLLING] > 0.0 else 0)
@@ -307,17 +308,16 @@ cdef inline void store_contacts(engine_t* e) noexcept nogil:
         p[0] = e.impulse[row]
         if nt > 0:
             cross(e.normal + 3 * c, e.tangent + 3 * c, t2)
-            for k in range(3):
-                p[1 + k] = e.impulse[row + 1] * e.tangent[3 * c + k] + e.impulse[row + 2] * t2[k]
+            both3(e.impulse[row + 1], e.tangent + 3 * c, e.impulse[row + 2], t2, p + 1)
         else:
-            for k in range(3):
-                p[1 + k] = 0.0
+            p[1] = p[2] = p[3] = 0.0
         size = e.ptr[e.size[N_JOINT] + c + 1] - row
         p[4] = e.impulse[row + 3] if size == 4 or size == 6 else 0.0
-        if e.size[ROWS_PER_CONTACT] > 4:
+        if size > 4:
+            both3(e.impulse[row + size - 2], e.tangent + 3 * c, e.impulse[row + size - 1], t2, e.cache_roll + 3 * at)
+        elif e.size[ROWS_PER_CONTACT] > 4:
             for k in range(3):
-                e.cache_roll[3 * at + k] = (e.impulse[row + size - 2] * e.tangent[3 * c + k]
-                                            + e.impulse[row + size - 1] * t2[k]) if size > 4 else 0.0
+                e.cache_roll[3 * at + k] = 0.0
         if e.head[H_STEPPER] == AVBD:                   # which has no spin: the stiffness of the contact
             p[4] = e.push[e.size[N_JOINT_ROW] + c]
         for k in range(6):

@@ -22,14 +22,13 @@ from lavender_ext.engine.arrays cimport (BALL, DISTANCE, HINGE, H_WARM_START, J_
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, J_SIDE_A, J_SPEED,
                                          J_TORQUE, N_JOINT, N_JOINT_REAL, ROWS_PER_CONTACT, S_H, engine_t)
 from lavender_ext.engine.bodies cimport to_world
+from lavender_ext.engine.vectors cimport copy3, minus3, plus3, scale3
 
 
 cdef inline void direction(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
     # of a body's frame in the world; body -1 is the world
-    cdef int32_t k
     if body < 0:
-        for k in range(3):
-            out[k] = local[k]
+        copy3(local, out)
     else:
         to_world(e.rot + 9 * body, local, out)
 
@@ -37,25 +36,21 @@ cdef inline void direction(const engine_t* e, int32_t body, const double* local,
 cdef inline void anchor(const engine_t* e, int32_t body, const double* local, double* arm,
                         double* point) noexcept nogil:
     # arm from the centre and point, world
-    cdef int32_t k
     direction(e, body, local, arm)
-    for k in range(3):
-        point[k] = arm[k] if body < 0 else e.x[3 * body + k] + arm[k]
+    if body < 0:
+        copy3(arm, point)
+    else:
+        plus3(e.x + 3 * body, 1.0, arm, point)
 
 
 cdef inline void point_row(double* jac, const double* axis, const double* arm_a,
                            const double* arm_b) noexcept nogil:
     # axis.(v_b + omega_b x arm_b - v_a - omega_a x arm_a)
-    cdef double l[3]
-    cdef int32_t k
-    cross(arm_a, axis, l)
-    for k in range(3):
-        jac[k] = -axis[k]
-        jac[3 + k] = -l[k]
-        jac[6 + k] = axis[k]
-    cross(arm_b, axis, l)
-    for k in range(3):
-        jac[9 + k] = l[k]
+    scale3(-1.0, axis, jac)
+    cross(arm_a, axis, jac + 3)
+    scale3(-1.0, jac + 3, jac + 3)
+    copy3(axis, jac + 6)
+    cross(arm_b, axis, jac + 9)
 
 
 cdef inline void turn_row(double* jac, const double* axis) noexcept nogil:
@@ -83,8 +78,7 @@ cdef inline void joint_geometry(engine_t* e, int32_t i) noexcept nogil:
     anchor(e, a, p + J_ANCHOR_A, arm_a, pa)
     anchor(e, b, p + J_ANCHOR_B, arm_b, pb)
     if e.joint_kind[i] == DISTANCE:
-        for k in range(3):
-            axis[k] = pb[k] - pa[k]
+        minus3(pb, pa, axis)
         length = sqrt(dot3(axis, axis))
         if length > 1e-150:
             for k in range(3):

@@ -21,6 +21,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.rows cimport cross, dot3
 from lavender_ext.engine.arrays cimport BOX, PLANE, SPHERE, engine_t
 from lavender_ext.engine.bodies cimport to_body, to_world
+from lavender_ext.engine.vectors cimport column3, copy3, minus3, plus3, scale3
 
 
 cdef struct manifold_t:
@@ -36,8 +37,7 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
     cdef double d[3]
     cdef double s, f
     cdef int32_t k
-    for k in range(3):
-        d[k] = xb[k] - xa[k]
+    minus3(xb, xa, d)
     s = dot3(d, d)
     if s > (ra + rb + margin) * (ra + rb + margin):
         return
@@ -51,8 +51,7 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
         m.normal[1] = 0.0
         m.normal[2] = 1.0
     f = 0.5 * (ra - rb + s)                             # halfway between the surfaces
-    for k in range(3):
-        m.point[k] = xa[k] + f * m.normal[k]
+    plus3(xa, f, m.normal, m.point)
     m.gap[0] = s - ra - rb
     m.feature[0] = 0
     m.n = 1
@@ -61,12 +60,10 @@ cdef inline void sphere_sphere(const double* xa, double ra, const double* xb, do
 cdef inline void plane_sphere(const double* plane, const double* x, double r, double margin,
                               manifold_t* m) noexcept nogil:
     cdef double gap = dot3(plane, x) - plane[3] - r
-    cdef int32_t k
     if gap > margin:
         return
-    for k in range(3):
-        m.normal[k] = plane[k]
-        m.point[k] = x[k] - (r + 0.5 * gap) * plane[k]
+    copy3(plane, m.normal)
+    plus3(x, -(r + 0.5 * gap), plane, m.point)
     m.gap[0] = gap
     m.feature[0] = 0
     m.n = 1
@@ -88,8 +85,7 @@ cdef inline void plane_box(const double* plane, const double* x, const double* r
         return
     for i in range(8):
         gap[i] = g + (p[0] if i & 1 else -p[0]) + (p[1] if i & 2 else -p[1]) + (p[2] if i & 4 else -p[2])
-    for k in range(3):
-        m.normal[k] = plane[k]
+    copy3(plane, m.normal)
     for _j in range(4):
         best = -1
         for i in range(8):
@@ -118,8 +114,7 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
     cdef double near[3]
     cdef double s, best
     cdef int32_t k, axis = -1
-    for k in range(3):
-        d[k] = xb[k] - xa[k]
+    minus3(xb, xa, d)
     to_body(rot, d, c)
     s = 0.0
     for k in range(3):
@@ -145,11 +140,9 @@ cdef inline void box_sphere(const double* xa, const double* rot, const double* h
         s = best
     m.gap[0] = s - r
     to_world(rot, d, m.normal)
-    for k in range(3):
-        c[k] = near[k] + 0.5 * m.gap[0] * d[k]
+    plus3(near, 0.5 * m.gap[0], d, c)
     to_world(rot, c, m.point)
-    for k in range(3):
-        m.point[k] += xa[k]
+    plus3(xa, 1.0, m.point, m.point)
     m.feature[0] = 0
     m.n = 1
 
@@ -159,22 +152,22 @@ cdef inline int32_t clip_side(int32_t n, const double* p, const int32_t* code, i
                               int32_t* out_code) noexcept nogil:
     # Polygon p (n, 3), edge code[i] from point i to i + 1, against sign * p[axis] <= bound. A corner within
     # tol of the side counts as inside: a pair that lies edge on edge keeps its corners.
-    cdef int32_t i, j, k, kept = 0
+    cdef int32_t i, j, kept = 0
     cdef double a, b, t
+    cdef double edge[3]
     for i in range(n):
         j = i + 1 if i + 1 < n else 0
         a = sign * p[3 * i + axis] - bound
         b = sign * p[3 * j + axis] - bound
         if a <= tol:
-            for k in range(3):
-                out[3 * kept + k] = p[3 * i + k]
+            copy3(p + 3 * i, out + 3 * kept)
             out_code[kept] = code[i]
             kept += 1
         if (a <= tol) != (b <= tol):
             t = a / (a - b)
             t = 0.0 if t < 0.0 else (1.0 if t > 1.0 else t)
-            for k in range(3):
-                out[3 * kept + k] = p[3 * i + k] + t * (p[3 * j + k] - p[3 * i + k])
+            minus3(p + 3 * j, p + 3 * i, edge)
+            plus3(p + 3 * i, t, edge, out + 3 * kept)
             # the polygon goes on along the side where it leaves, along its own edge where it comes back
             out_code[kept] = line if a <= tol else code[i]
             kept += 1
@@ -219,6 +212,14 @@ cdef inline void pick_four(const double* p, int32_t kept, double margin, int32_t
         pick[other] = at
 
 
+cdef inline void to_face(const double* along_x, const double* along_y, const double* along_z, const double* a,
+                         double* out) noexcept nogil:
+    # a vector of the world in the frame of a face
+    out[0] = dot3(a, along_x)
+    out[1] = dot3(a, along_y)
+    out[2] = dot3(a, along_z)
+
+
 cdef inline void face_points(const double* xr, const double* rr, const double* hr, int32_t axis, double sign,
                              const double* xo, const double* ro, const double* ho, int32_t on_b,
                              double margin, manifold_t* m) noexcept nogil:
@@ -227,8 +228,9 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     cdef double more[36]
     cdef int32_t code[12]
     cdef int32_t more_code[12]
+    cdef double x[3]
+    cdef double y[3]
     cdef double n[3]
-    cdef double d[3]
     cdef double c[3]
     cdef double u[3]
     cdef double w[3]
@@ -238,35 +240,31 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
     cdef int32_t pick[4]
     hx = hr[ax]
     hy = hr[ay]
-    for k in range(3):
-        n[k] = sign * rr[3 * k + axis]
-        d[k] = xo[k] - xr[k]
+    column3(rr, ax, x)
+    column3(rr, ay, y)
+    column3(rr, axis, n)
+    scale3(sign, n, n)
     # the other box's face that looks most against n
+    to_body(ro, n, u)
     best = -1.0
     for i in range(3):
-        s = n[0] * ro[i] + n[1] * ro[3 + i] + n[2] * ro[6 + i]
-        u[i] = s
-        if fabs(s) > best:
-            best = fabs(s)
+        if fabs(u[i]) > best:
+            best = fabs(u[i])
             face = i
     fx = face + 1 if face < 2 else 0
     fy = face - 1 if face > 0 else 2
     s = -ho[face] if u[face] > 0.0 else ho[face]
     # its centre and half edges in the frame of the reference face
-    for k in range(3):
-        c[k] = d[k] + s * ro[3 * k + face]
-    w[0] = c[0] * rr[ax] + c[1] * rr[3 + ax] + c[2] * rr[6 + ax]
-    w[1] = c[0] * rr[ay] + c[1] * rr[3 + ay] + c[2] * rr[6 + ay]
-    w[2] = dot3(c, n) - hr[axis]
+    minus3(xo, xr, u)
+    column3(ro, face, c)
+    plus3(u, s, c, c)
+    to_face(x, y, n, c, w)
+    w[2] -= hr[axis]
     for i in range(2):
         j = fx if i == 0 else fy
-        for k in range(3):
-            c[k] = ho[j] * ro[3 * k + j]
-        u[0] = c[0] * rr[ax] + c[1] * rr[3 + ax] + c[2] * rr[6 + ax]
-        u[1] = c[0] * rr[ay] + c[1] * rr[3 + ay] + c[2] * rr[6 + ay]
-        u[2] = dot3(c, n)
-        for k in range(3):
-            more[3 * i + k] = u[k]
+        column3(ro, j, c)
+        scale3(ho[j], c, c)
+        to_face(x, y, n, c, more + 3 * i)
     for k in range(3):
         poly[k] = w[k] - more[k] - more[3 + k]
         poly[3 + k] = w[k] + more[k] - more[3 + k]
@@ -291,16 +289,14 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         count = kept
         for j in range(count):
             code[j] = more_code[j]
-            for at in range(3):
-                poly[3 * j + at] = more[3 * j + at]
+            copy3(more + 3 * j, poly + 3 * j)
     # points above the margin go; a point is the crossing of the lines before and after it
     kept = 0
     for i in range(count):
         if poly[3 * i + 2] <= margin:
             j = code[i - 1] if i > 0 else code[count - 1]
             more_code[kept] = j * 8 + code[i]
-            for k in range(3):
-                more[3 * kept + k] = poly[3 * i + k]
+            copy3(poly + 3 * i, more + 3 * kept)
             kept += 1
     if kept > 4:
         pick_four(more, kept, margin, pick)
@@ -325,14 +321,29 @@ cdef inline void face_points(const double* xr, const double* rr, const double* h
         if at < 0:
             continue
         s = hr[axis] + 0.5 * more[3 * at + 2]
-        for k in range(3):
-            m.point[3 * m.n + k] = (xr[k] + more[3 * at] * rr[3 * k + ax] + more[3 * at + 1] * rr[3 * k + ay]
-                                    + s * n[k])
+        plus3(xr, more[3 * at], x, u)
+        plus3(u, more[3 * at + 1], y, u)
+        plus3(u, s, n, m.point + 3 * m.n)
         m.gap[m.n] = more[3 * at + 2]
         m.feature[m.n] = feature + more_code[at]
         m.n += 1
-    for k in range(3):
-        m.normal[k] = -n[k] if on_b else n[k]
+    scale3(-1.0 if on_b else 1.0, n, m.normal)
+
+
+cdef inline int32_t edge_centre(const double* x, const double* rot, const double* half, int32_t axis, const double* n,
+                                double sign, double* out) noexcept nogil:
+    # centre of the edge along `axis` that is furthest along sign n; returns two bits that name it
+    cdef double side[3]
+    cdef double u[3]
+    cdef int32_t r, bits = 0
+    to_body(rot, n, u)
+    copy3(x, out)
+    for r in range(3):
+        if r != axis:
+            bits = bits * 2 + (u[r] > 0.0)
+            column3(rot, r, side)
+            plus3(out, sign * (half[r] if u[r] > 0.0 else -half[r]), side, out)
+    return bits
 
 
 cdef inline void edge_point(const double* xa, const double* ra, const double* ha, int32_t i, const double* xb,
@@ -342,40 +353,27 @@ cdef inline void edge_point(const double* xa, const double* ra, const double* ha
     cdef double p[3]
     cdef double q[3]
     cdef double d[3]
-    cdef double u, v, w, s, t, f
-    cdef int32_t k, r, bits = 0
-    for k in range(3):
-        p[k] = xa[k]
-        q[k] = xb[k]
-    for r in range(3):
-        if r != i:
-            s = n[0] * ra[r] + n[1] * ra[3 + r] + n[2] * ra[6 + r]
-            bits = bits * 2 + (s > 0.0)
-            f = ha[r] if s > 0.0 else -ha[r]
-            for k in range(3):
-                p[k] += f * ra[3 * k + r]
-    for r in range(3):
-        if r != j:
-            s = n[0] * rb[r] + n[1] * rb[3 + r] + n[2] * rb[6 + r]
-            bits = bits * 2 + (s > 0.0)
-            f = -hb[r] if s > 0.0 else hb[r]
-            for k in range(3):
-                q[k] += f * rb[3 * k + r]
-    u = 0.0
-    v = 0.0
-    w = 0.0
-    for k in range(3):
-        d[k] = q[k] - p[k]
-        u += ra[3 * k + i] * rb[3 * k + j]
-        v += ra[3 * k + i] * d[k]
-        w += rb[3 * k + j] * d[k]
+    cdef double along_a[3]
+    cdef double along_b[3]
+    cdef double u, v, w, s, t
+    cdef int32_t bits
+    bits = 4 * edge_centre(xa, ra, ha, i, n, 1.0, p)
+    bits += edge_centre(xb, rb, hb, j, n, -1.0, q)
+    minus3(q, p, d)
+    column3(ra, i, along_a)
+    column3(rb, j, along_b)
+    u = dot3(along_a, along_b)
+    v = dot3(along_a, d)
+    w = dot3(along_b, d)
     s = (v - u * w) / (1.0 - u * u)
     t = (u * v - w) / (1.0 - u * u)
     s = -ha[i] if s < -ha[i] else (ha[i] if s > ha[i] else s)
     t = -hb[j] if t < -hb[j] else (hb[j] if t > hb[j] else t)
-    for k in range(3):
-        m.point[k] = 0.5 * (p[k] + s * ra[3 * k + i] + q[k] + t * rb[3 * k + j])
-        m.normal[k] = n[k]
+    plus3(p, s, along_a, p)
+    plus3(p, 1.0, q, p)
+    plus3(p, t, along_b, p)
+    scale3(0.5, p, m.point)
+    copy3(n, m.normal)
     m.gap[0] = gap
     m.feature[0] = 8192 + (i * 3 + j) * 16 + bits
     m.n = 1
@@ -392,8 +390,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
     cdef double l[3]
     cdef double s, t, length, face_a = -1.0 / 0.0, face_b = -1.0 / 0.0, edge = -1.0 / 0.0, tol, best, small
     cdef int32_t i, j, k, i1, i2, j1, j2, axis_a = 0, axis_b = 0, edge_i = -1, edge_j = -1, parallel = 0
-    for k in range(3):
-        d[k] = xb[k] - xa[k]
+    minus3(xb, xa, d)
     to_body(ra, d, ta)
     to_body(rb, d, tb)
     for i in range(3):
@@ -445,14 +442,12 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
                     edge_i = i
                     edge_j = j
     if edge_i >= 0 and edge > best + tol + 0.05 * fabs(best):
-        for k in range(3):
-            n[k] = ra[3 * k + edge_i]
-            l[k] = rb[3 * k + edge_j]
+        column3(ra, edge_i, n)
+        column3(rb, edge_j, l)
         cross(n, l, m.normal)
         length = sqrt(dot3(m.normal, m.normal))
         s = 1.0 / length if dot3(m.normal, d) >= 0.0 else -1.0 / length
-        for k in range(3):
-            n[k] = s * m.normal[k]
+        scale3(s, m.normal, n)
         edge_point(xa, ra, ha, edge_i, xb, rb, hb, edge_j, n, edge, m)
     elif face_b > face_a + tol + 0.05 * fabs(face_a):
         face_points(xb, rb, hb, axis_b, -1.0 if tb[axis_b] > 0.0 else 1.0, xa, ra, ha, 1, margin, m)
@@ -463,7 +458,7 @@ cdef inline void box_box(const double* xa, const double* ra, const double* ha, c
 cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
                          manifold_t* m) noexcept nogil:
     """Manifold of bodies a < b; n = 0 where they are further apart than the margin."""
-    cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], k, flip = 0
+    cdef int32_t ka = e.kind_of_shape[a], kb = e.kind_of_shape[b], flip = 0
     cdef const double* xa = e.x + 3 * a
     cdef const double* xb = e.x + 3 * b
     cdef const double* sa = e.shape + 4 * a
@@ -488,5 +483,4 @@ cdef inline void collide(const engine_t* e, int32_t a, int32_t b, double margin,
     elif ka == BOX and kb == SPHERE:
         box_sphere(xa, e.rot + 9 * a, sa, xb, sb[0], margin, m)
     if flip:
-        for k in range(3):
-            m.normal[k] = -m.normal[k]
+        scale3(-1.0, m.normal, m.normal)

@@ -17,6 +17,7 @@ from lavender_ext.core.rows cimport dot3, joint_push, joint_velocity, push_bodie
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
+from lavender_ext.engine.vectors cimport scale3
 
 
 cdef inline int32_t rigid_row(const engine_t* e, int32_t i, int32_t row) noexcept nogil:
@@ -32,6 +33,22 @@ cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) n
     return dot3(e.normal + 3 * c, u)
 
 
+cdef inline void push_contact(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:
+    # velocities v (nd, 6) by an impulse (3) [N s] at a contact
+    push_bodies(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
+                e.arm_b + 3 * c, impulse, NULL)
+
+
+cdef inline void push_normal(engine_t* e, int32_t c, double impulse) noexcept nogil:
+    # another normal impulse of a contact [N s], 0 where it would pull; dv follows
+    cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
+    cdef double p[3]
+    impulse = impulse if impulse > 0.0 else 0.0
+    scale3(impulse - e.impulse[row], e.normal + 3 * c, p)
+    e.impulse[row] = impulse
+    push_contact(e, e.dv, c, p)
+
+
 cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     """Fill e.shift; returns 1 where there is any. Writes S_DEPTH, S_JOINT_ERROR as the substep began."""
     cdef int32_t n = e.head[H_CONTACTS], mj = e.size[N_JOINT_ROW], _sweep, i, j, c, a, b, due = 0
@@ -39,7 +56,6 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
     cdef double most = e.setting[S_MAX_PUSH]
     cdef double depth = 0.0, off = 0.0, x, y, p
     cdef double impulse[3]
-    cdef const double* normal
     # free after the solve: J s wanted, by contact and joint row
     cdef double* goal = e.target
     e.head[H_PROJECTED] = 0
@@ -84,16 +100,13 @@ cdef inline int32_t project_positions(engine_t* e) noexcept nogil:
                     p = (goal[j] - joint_velocity(e.jac + 12 * j, e.shift, a, b)) * e.step[j]      # (2)
                     joint_push(e.minv_jac + 12 * j, p, e.shift, a, b)
         for c in range(n):
-            normal = e.normal + 3 * c
             y = relax_normal(e.push[mj + c], normal_speed(e, e.shift, c) - goal[mj + c],
                              e.step[e.ptr[e.size[N_JOINT] + c]])                                   # (1)
             p = y - e.push[mj + c]
             if p == 0.0:
                 continue
             e.push[mj + c] = y
-            for i in range(3):
-                impulse[i] = p * normal[i]
-            push_bodies(e.shift, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
-                        e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
+            scale3(p, e.normal + 3 * c, impulse)
+            push_contact(e, e.shift, c, impulse)
     e.head[H_PROJECTED] = e.head[H_POSITION_ITERATIONS]
     return 1

@@ -19,12 +19,11 @@ a2 / (1 + a2) and impulse scale 1 / (1 + a2). The substep:
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.rows cimport joint_velocity, push_bodies, reciprocal
+from lavender_ext.core.rows cimport joint_velocity, reciprocal
 from lavender_ext.engine.arrays cimport (H_CONTACTS, N_DYNAMIC, N_JOINT, S_BOUNCE, S_H, S_HERTZ, S_PUSH, S_RATIO,
                                          engine_t)
-from lavender_ext.engine.bodies cimport drift_rotation, is_lost, rotation, turn, world_times
-from lavender_ext.engine.contacts cimport normal_velocity
-from lavender_ext.engine.projection cimport normal_speed, rigid_row
+from lavender_ext.engine.contacts cimport normal_velocity, restitution_of
+from lavender_ext.engine.projection cimport normal_speed, push_normal, rigid_row
 
 
 cdef inline void soft(double hertz, double ratio, double h, double* rate, double* a2) noexcept nogil:
@@ -101,13 +100,12 @@ cdef inline void relax(engine_t* e) noexcept nogil:
 
 cdef inline void restitute(engine_t* e) noexcept nogil:
     """Stage 4, contact by contact; e.v are the velocities before the substep."""
-    cdef int32_t c, j, k, a, b
+    cdef int32_t c, j, a, b
     cdef double e_ab, before, y
-    cdef double impulse[3]
     for c in range(e.head[H_CONTACTS]):
         a = e.contact_pair[2 * c]
         b = e.contact_pair[2 * c + 1]
-        e_ab = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
+        e_ab = restitution_of(e, a, b)
         j = e.ptr[e.size[N_JOINT] + c]
         if e_ab == 0.0 or e.impulse[j] <= 0.0:
             continue
@@ -115,46 +113,4 @@ cdef inline void restitute(engine_t* e) noexcept nogil:
         if before > -e.setting[S_BOUNCE]:
             continue
         y = normal_speed(e, e.v_free, c) + normal_speed(e, e.dv, c) + e_ab * before
-        y = e.impulse[j] - y * e.step[j]
-        y = y if y > 0.0 else 0.0
-        for k in range(3):
-            impulse[k] = (y - e.impulse[j]) * e.normal[3 * c + k]
-        e.impulse[j] = y
-        push_bodies(e.dv, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia,
-                    e.arm_a + 3 * c, e.arm_b + 3 * c, impulse, NULL)
-
-
-cdef inline int32_t drift_relaxed(engine_t* e) noexcept nogil:
-    """Poses over h by v* + shift, velocities v* + dv; a turning body keeps the momentum of the latter.
-
-    Returns the first body whose state is not finite, or -1.
-    """
-    cdef int32_t i, k, b, lost = -1
-    cdef double h = e.setting[S_H]
-    cdef double r[9]
-    cdef double moving[6]
-    cdef double momentum[3]
-    cdef double* v
-    cdef double* x
-    cdef double* q
-    for i in range(e.size[N_DYNAMIC]):
-        b = e.body_of[i]
-        v = e.v + 6 * b
-        x = e.x + 3 * b
-        q = e.q + 4 * b
-        for k in range(6):
-            moving[k] = e.v_free[6 * i + k] + e.shift[6 * i + k]
-            v[k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
-        for k in range(3):
-            x[k] += h * moving[k]
-        if e.uneven[b]:
-            rotation(q, r)
-            world_times(r, e.inertia + 9 * b, v + 3, momentum)
-            drift_rotation(q, moving + 3, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
-            rotation(q, r)
-            world_times(r, e.inv_inertia_body + 9 * b, momentum, v + 3)
-        elif moving[3] != 0.0 or moving[4] != 0.0 or moving[5] != 0.0:
-            turn(q, moving + 3, h)
-        if lost < 0 and is_lost(e, b):
-            lost = b
-    return lost
+        push_normal(e, c, e.impulse[j] - y * e.step[j])

@@ -22,10 +22,10 @@ from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_le
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CACHED,
-                                         H_CONTACTS, H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
+from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,
+                                         H_CONTACT_ROWS, H_ITERATIONS, H_LOST, H_MATCHES, H_RELAXING, H_STEPPER,
                                          H_NEED_CONTACTS, H_NEED_PAIRS, H_ORDER, H_SEED, H_SOLVED, H_STEP,
-                                         H_WARM_START, NEED_ROOM, NOT_FINITE, N_DYNAMIC, N_HEAD, N_JOINT,
+                                         H_WARM_START, NEED_ROOM, NOT_FINITE, N_DYNAMIC, N_JOINT,
                                          N_JOINT_ROW, OK, REVERSED, ROWS_PER_CONTACT, SOFT_STEP, SYMMETRICALLY, S_OUT,
                                          TOP_DOWN, XPBD, bind, engine_t)
 from lavender_ext.engine.avbd cimport descend_all
@@ -33,11 +33,10 @@ from lavender_ext.engine.bodies cimport drift_bodies, start_bodies
 from lavender_ext.engine.broad_phase cimport update_pairs
 from lavender_ext.engine.contacts cimport make_contacts, store_contacts
 from lavender_ext.engine.joints cimport make_joints
-from lavender_ext.engine.kept cimport keep, kept_reals, put_back
 from lavender_ext.engine.projection cimport normal_speed, project_positions
-from lavender_ext.engine.soft_step cimport drift_relaxed, relax, restitute, soften
+from lavender_ext.engine.soft_step cimport relax, restitute, soften
 from lavender_ext.engine.view cimport view
-from lavender_ext.engine.xpbd cimport correct_all, keep_velocities
+from lavender_ext.engine.xpbd cimport correct_all
 from lavender_ext.judge.measure cimport rows_slack
 from lavender_ext.judge.score cimport score_rows, score_t
 from lavender_ext.sweep.packed cimport MOST, room_for, sweep_packed
@@ -239,6 +238,7 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
 
 cdef int32_t finish(engine_t* e) noexcept nogil:
     cdef int32_t i, shifted, unsolved
+    cdef const double* by = e.dv
     cdef double* out = e.setting + S_OUT
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
@@ -246,15 +246,14 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     out[3] = e.head[H_MATCHES]
     for i in range(e.size[N_JOINT_ROW]):
         e.joint_impulse[i] = e.impulse[i]
+    if e.head[H_STEPPER] == SOFT_STEP:
+        by = e.shift
+    elif e.head[H_STEPPER] == XPBD:
+        by = NULL
     unsolved = unsolved_body(e)
     store_contacts(e)
     shifted = project_positions(e)
-    if e.head[H_STEPPER] == SOFT_STEP:
-        e.head[H_LOST] = drift_relaxed(e)
-    elif e.head[H_STEPPER] == XPBD:
-        e.head[H_LOST] = keep_velocities(e)
-    else:
-        e.head[H_LOST] = drift_bodies(e, shifted)
+    e.head[H_LOST] = drift_bodies(e, by, shifted)
     if e.head[H_LOST] < 0:
         e.head[H_LOST] = unsolved
     e.head[H_SOLVED] = 1
@@ -335,9 +334,6 @@ cdef class Buffers:
     cdef int32_t[::1] index
     cdef uint64_t[::1] keys
     cdef double[::1] room
-    cdef double[::1] kept_real
-    cdef int32_t[::1] kept_index
-    cdef uint64_t[::1] kept_keys
 
     def __init__(self, const int32_t[::1] size, double[::1] real, int32_t[::1] index, uint64_t[::1] keys):
         self.size = size
@@ -349,7 +345,6 @@ cdef class Buffers:
         cdef int64_t contacts = min(<int64_t>size[CAP_CONTACT], MOST), joints = size[N_JOINT]
         self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MOST else 1)
-        self.kept_real, self.kept_index, self.kept_keys = np.empty(1), np.empty(N_HEAD, np.int32), np.empty(1, np.uint64)
 
     def pairs(self):
         """Run the broad phase; returns the number of pairs needed."""
@@ -397,18 +392,6 @@ cdef class Buffers:
         with nogil:
             status = substeps(&self.e, n, &self.room[0], &done)
         return status, done
-
-    def keep(self):
-        """Copy what the next substep starts from; `put_back` returns to it."""
-        cdef int64_t c = self.e.head[H_CACHED], n = kept_reals(self.e.size, c)
-        if n > self.kept_real.shape[0] or c > self.kept_keys.shape[0]:
-            self.kept_real = np.empty(n + n // 4)
-            self.kept_keys = np.empty(c + c // 4 + 1, np.uint64)
-        keep(&self.e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
-
-    def put_back(self):
-        """The state that `keep` has copied."""
-        put_back(&self.e, &self.kept_real[0], &self.kept_index[0], &self.kept_keys[0])
 
     def arrays(self):
         """Name -> writable view of one of the buffers, with the shape that engine/arrays.pyx gives."""

@@ -23,22 +23,21 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity, push_bodies
+from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity
 from lavender_ext.engine.arrays cimport (BOX, DISTANCE, HINGE, H_CONTACTS, H_ITERATIONS, J_ANCHOR_A, J_ANCHOR_B,
                                          J_AXIS_A, J_AXIS_B, J_DAMPING, J_HERTZ, J_LENGTH, N_DYNAMIC, N_JOINT,
                                          N_JOINT_REAL, S_BOUNCE, S_H, engine_t)
-from lavender_ext.engine.bodies cimport drift_rotation, is_lost, rotation, to_world, turn
-from lavender_ext.engine.contacts cimport normal_velocity
-from lavender_ext.engine.projection cimport normal_speed
+from lavender_ext.engine.bodies cimport drift_rotation, rotation, to_world, turn
+from lavender_ext.engine.contacts cimport normal_velocity, restitution_of
+from lavender_ext.engine.projection cimport normal_speed, push_contact, push_normal
+from lavender_ext.engine.vectors cimport copy3, minus3, normalise3, plus3, scale3, times3
 
 
 cdef inline void turned(const engine_t* e, int32_t body, const double* local, double* out) noexcept nogil:
     # a vector of a body's frame at its present pose; body -1 is the world
     cdef double r[9]
-    cdef int32_t k
     if body < 0:
-        for k in range(3):
-            out[k] = local[k]
+        copy3(local, out)
     else:
         rotation(e.q + 4 * body, r)
         to_world(r, local, out)
@@ -48,16 +47,13 @@ cdef inline double weight(const engine_t* e, int32_t dyn, const double* arm, con
     # one body's part of (1); arm NULL: of a turn about n alone
     cdef double l[3]
     cdef double k[3]
-    cdef int32_t i
     if dyn < 0:
         return 0.0
     if arm == NULL:
-        for i in range(3):
-            l[i] = n[i]
+        copy3(n, l)
     else:
         cross(arm, n, l)
-    for i in range(3):
-        k[i] = dot3(e.inv_inertia + 9 * dyn + 3 * i, l)
+    times3(e.inv_inertia + 9 * dyn, l, k)
     return dot3(l, k) + (0.0 if arm == NULL else e.inv_mass[dyn] * dot3(n, n))
 
 
@@ -66,25 +62,22 @@ cdef inline void displace(engine_t* e, int32_t body, int32_t dyn, const double* 
     # a body by p [kg m] at an arm; arm NULL: a turn by p [kg m^2]
     cdef double l[3]
     cdef double k[3]
-    cdef int32_t i
     if dyn < 0:
         return
     if arm == NULL:
-        for i in range(3):
-            l[i] = p[i]
+        copy3(p, l)
     else:
         cross(arm, p, l)
-        for i in range(3):
-            e.x[3 * body + i] += sign * e.inv_mass[dyn] * p[i]
-    for i in range(3):
-        k[i] = sign * dot3(e.inv_inertia + 9 * dyn + 3 * i, l)
+        plus3(e.x + 3 * body, sign * e.inv_mass[dyn], p, e.x + 3 * body)
+    times3(e.inv_inertia + 9 * dyn, l, k)
+    scale3(sign, k, k)
     turn(e.q + 4 * body, k, 1.0)
 
 
 cdef inline double correct(engine_t* e, int32_t i, const double* arm_a, const double* arm_b, const double* n,
                            double error, double before, double lam) noexcept nogil:
     """(2) of joint i along n, b against a; returns lambda. `before`: the error at the start of the substep."""
-    cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1], k
+    cdef int32_t a = e.joint_bodies[2 * i], b = e.joint_bodies[2 * i + 1]
     cdef double w = weight(e, e.joint_body[2 * i], arm_a, n) + weight(e, e.joint_body[2 * i + 1], arm_b, n)
     cdef double h = e.setting[S_H], alpha = 0.0, g = 0.0, omega, x
     cdef double p[3]
@@ -96,8 +89,7 @@ cdef inline double correct(engine_t* e, int32_t i, const double* arm_a, const do
         g = alpha * 2.0 * e.joint[N_JOINT_REAL * i + J_DAMPING] * omega / w / h
         alpha = alpha / (h * h)
     x = (-error - alpha * lam - g * (error - before)) / ((1.0 + g) * w + alpha)
-    for k in range(3):
-        p[k] = x * n[k]
+    scale3(x, n, p)
     displace(e, a, e.joint_body[2 * i], arm_a, p, -1.0)
     displace(e, b, e.joint_body[2 * i + 1], arm_b, p, 1.0)
     return lam + x
@@ -110,36 +102,29 @@ cdef inline void correct_joint(engine_t* e, int32_t i) noexcept nogil:
     cdef double arm_a[3]
     cdef double arm_b[3]
     cdef double n[3]
-    cdef double other[3]
     cdef double size, begun = 0.0
     turned(e, a, p + J_ANCHOR_A, arm_a)
     turned(e, b, p + J_ANCHOR_B, arm_b)
     for k in range(3):
         n[k] = (e.x[3 * b + k] if b >= 0 else 0.0) + arm_b[k] - (e.x[3 * a + k] if a >= 0 else 0.0) - arm_a[k]
-    size = sqrt(dot3(n, n))
+    size = normalise3(n)
     if e.joint_kind[i] == DISTANCE:
         if size > 0.0:
-            for k in range(3):
-                n[k] /= size
             e.impulse[row] = correct(e, i, arm_a, arm_b, n, size - p[J_LENGTH], e.joint_error[row], e.impulse[row])
         return
     if size > 0.0:
         for k in range(3):
-            n[k] /= size
             begun += n[k] * e.joint_error[row + k]
         # the multipliers of a direction that turns are summed by axis
         size = correct(e, i, arm_a, arm_b, n, size, begun, dot3(e.impulse + row, n)) - dot3(e.impulse + row, n)
-        for k in range(3):
-            e.impulse[row + k] += size * n[k]
+        plus3(e.impulse + row, size, n, e.impulse + row)
     if e.joint_kind[i] != HINGE:
         return
     turned(e, a, p + J_AXIS_A, arm_a)
     turned(e, b, p + J_AXIS_B, arm_b)
-    cross(arm_a, arm_b, other)                          # turns axis_a to axis_b: what b has turned too far
-    size = sqrt(dot3(other, other))
+    cross(arm_a, arm_b, n)                              # turns axis_a to axis_b: what b has turned too far
+    size = normalise3(n)
     if size > 0.0:
-        for k in range(3):
-            n[k] = other[k] / size
         correct(e, i, NULL, NULL, n, size, 0.0, 0.0)
 
 
@@ -171,28 +156,23 @@ cdef inline void moved(const engine_t* e, int32_t body, int32_t dyn, const doubl
     if material and e.kind_of_shape[body] != BOX:
         turned_by(e.q + 4 * body, e.dv + 6 * dyn, turn_)
         cross(turn_, arm, l)
-        for k in range(3):
-            by[k] += l[k]
+        plus3(by, 1.0, l, by)
 
 
 cdef inline void relative_move(const engine_t* e, int32_t c, int32_t material, double* arm_a, double* arm_b,
                                double* by) noexcept nogil:
     # arms now, and how far b's point of a contact has come against a's
     cdef double by_a[3]
-    cdef int32_t k
     moved(e, e.contact_pair[2 * c], e.contact_body[2 * c], e.local + 6 * c, e.arm_a + 3 * c, material, arm_a, by_a)
     moved(e, e.contact_pair[2 * c + 1], e.contact_body[2 * c + 1], e.local + 6 * c + 3, e.arm_b + 3 * c, material,
           arm_b, by)
-    for k in range(3):
-        by[k] -= by_a[k]
+    minus3(by, by_a, by)
 
 
 cdef inline void displace_contact(engine_t* e, int32_t c, const double* arm_a, const double* arm_b, const double* n,
                                   double size) noexcept nogil:
     cdef double p[3]
-    cdef int32_t k
-    for k in range(3):
-        p[k] = size * n[k]
+    scale3(size, n, p)
     displace(e, e.contact_pair[2 * c], e.contact_body[2 * c], arm_a, p, -1.0)
     displace(e, e.contact_pair[2 * c + 1], e.contact_body[2 * c + 1], arm_b, p, 1.0)
 
@@ -219,7 +199,7 @@ cdef inline void correct_normal(engine_t* e, int32_t c) noexcept nogil:
 
 
 cdef inline void correct_tangents(engine_t* e, int32_t c) noexcept nogil:
-    cdef int32_t row = e.ptr[e.size[N_JOINT] + c], k
+    cdef int32_t row = e.ptr[e.size[N_JOINT] + c]
     cdef const double* t1 = e.tangent + 3 * c
     cdef double r = e.mu[e.size[N_JOINT] + c] * e.impulse[row], w, x, s, t
     cdef double arm_a[3]
@@ -276,8 +256,7 @@ cdef inline void take_velocities(engine_t* e) noexcept nogil:
         for k in range(4):
             p[k] = e.dv[6 * i + k]
         if e.uneven[b]:
-            for k in range(3):
-                spin[k] = e.v[6 * b + 3 + k]
+            copy3(e.v + 6 * b + 3, spin)
             drift_rotation(p, spin, e.inertia + 9 * b, e.inv_inertia_body + 9 * b, h)
         turned_by(e.q + 4 * b, p, by)
         for k in range(3):
@@ -299,28 +278,18 @@ cdef inline double tangent_speed(const engine_t* e, const double* v, int32_t c, 
     return s
 
 
-cdef inline void push_contact(engine_t* e, int32_t c, const double* impulse) noexcept nogil:
-    push_bodies(e.dv, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.inv_mass, e.inv_inertia, e.arm_a + 3 * c,
-                e.arm_b + 3 * c, impulse, NULL)
-
-
 cdef inline void bounce_contact(engine_t* e, int32_t c) noexcept nogil:
     """Stage 4 of the normal; the multipliers of the contact become impulses [N s]."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c], a = e.contact_pair[2 * c], b = e.contact_pair[2 * c + 1], k
-    cdef double before, goal, x, e_ab = e.restitution[a] if e.restitution[a] > e.restitution[b] else e.restitution[b]
-    cdef double p[3]
+    cdef double before, goal
     for k in range(row, e.ptr[e.size[N_JOINT] + c + 1]):
         e.impulse[k] = e.impulse[k] / e.setting[S_H]
     if e.impulse[row] <= 0.0:
         return
     before = normal_velocity(e, a, b, c)
-    goal = -e_ab * before if before < -e.setting[S_BOUNCE] else 0.0
-    x = e.impulse[row] + (goal - normal_speed(e, e.v_free, c) - normal_speed(e, e.dv, c)) / e.d[row]
-    x = x if x > 0.0 else 0.0
-    for k in range(3):
-        p[k] = (x - e.impulse[row]) * e.normal[3 * c + k]
-    e.impulse[row] = x
-    push_contact(e, c, p)
+    goal = -restitution_of(e, a, b) * before if before < -e.setting[S_BOUNCE] else 0.0
+    goal = goal - normal_speed(e, e.v_free, c) - normal_speed(e, e.dv, c)
+    push_normal(e, c, e.impulse[row] + goal / e.d[row])
 
 
 cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
@@ -346,11 +315,10 @@ cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
         p[k] = (s * t1[k] + t * t2[k]) / x
     x = x / weight_of(e, c, e.arm_a + 3 * c, e.arm_b + 3 * c, p)
     left = x if x < left else left
-    for k in range(3):
-        p[k] = -left * p[k]
+    scale3(-left, p, p)
     lam[1] += dot3(p, t1)
     lam[2] += dot3(p, t2)
-    push_contact(e, c, p)
+    push_contact(e, e.dv, c, p)
 
 
 cdef inline void correct_all(engine_t* e) noexcept nogil:
@@ -380,15 +348,3 @@ cdef inline void correct_all(engine_t* e) noexcept nogil:
         bounce_contact(e, e.order[i] - kj)
     for i in range(kj, n):
         brake_contact(e, e.order[i] - kj)
-
-
-cdef inline int32_t keep_velocities(engine_t* e) noexcept nogil:
-    """v = v* + dv, poses as they are. Returns the first body whose state is not finite, or -1."""
-    cdef int32_t i, k, b, lost = -1
-    for i in range(e.size[N_DYNAMIC]):
-        b = e.body_of[i]
-        for k in range(6):
-            e.v[6 * b + k] = e.v_free[6 * i + k] + e.dv[6 * i + k]
-        if lost < 0 and is_lost(e, b):
-            lost = b
-    return lost

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from random_problems import spd, touching
 from stacks import chain, moving_stack, stack
 
 import lavender as lv
@@ -312,19 +313,9 @@ def test_levels_are_written_as_people_do(level, name):
 
 def two_bodies(copies, ratio=1.0):
     """A light ball on the ground, a heavy one on it, each pair touching at `copies` equal contacts."""
-    n = 2 * copies
-    up, side = np.tile([0.0, 0.0, 1.0], (n, 1)), np.tile([1.0, 0.0, 0.0], (n, 1))
-    rows = lv.Rows(
-        inv_mass=np.array([1.0, 1.0 / ratio]),
-        inv_inertia=np.stack([np.eye(3), np.eye(3) / ratio]),
-        v_free=np.zeros((2, 6)),
-        normal=up,
-        tangent=side,
-        arm_a=np.zeros((n, 3)),
-        arm_b=np.zeros((n, 3)),
-        contact_body=np.repeat(np.array([[-1, 0], [0, 1]], np.int32), copies, axis=0),
-    )
-    return rows
+    inverse = np.array([1.0, 1.0 / ratio])
+    pairs = np.repeat([[-1, 0], [0, 1]], copies, axis=0)
+    return touching(pairs, inv_mass=inverse, inv_inertia=inverse[:, None, None] * np.eye(3))
 
 
 def a_pile_among_separate_rows():
@@ -334,10 +325,22 @@ def a_pile_among_separate_rows():
     return lv.Problem.lcp(np.maximum(a, a.T), np.ones(106))
 
 
+def each_coupled_to_a_few():
+    rng = np.random.default_rng(3)
+    graph = np.zeros((30, 30))
+    for i in range(30):
+        for j in rng.choice(30, 4):
+            graph[i, j] = graph[j, i] = -0.1
+    np.fill_diagonal(graph, 2.0)
+    return lv.Problem.lcp(graph, np.ones(30))
+
+
 @pytest.mark.parametrize(
     ("problem", "words"),
     [
         (chain(6), ("chain",)),
+        (lv.Problem.linear(*spd(20)), ("dense",)),
+        (each_coupled_to_a_few(), ("pile",)),
         (stack(6), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1)), ("stack",)),
         (lv.Problem.from_rows(two_bodies(1, 1e4)), ("stack", "large mass ratio")),
@@ -355,21 +358,6 @@ def test_structure_is_recognised(problem, words):
     assert bench.structure_of(problem) == words
 
 
-def test_a_dense_matrix_is_no_chain():
-    a = np.random.default_rng(0).standard_normal((20, 20))
-    assert bench.structure_of(lv.Problem.linear(a @ a.T + np.eye(20), np.ones(20))) == ("dense",)
-
-
-def test_what_couples_everywhere_is_a_pile():
-    rng = np.random.default_rng(3)
-    graph = np.zeros((30, 30))
-    for i in range(30):
-        for j in rng.choice(30, 4):
-            graph[i, j] = graph[j, i] = -0.1
-    np.fill_diagonal(graph, 2.0)
-    assert bench.structure_of(lv.Problem.lcp(graph, np.ones(30))) == ("pile",)
-
-
 def test_a_fingerprint_sees_every_number():
     p = stack(5)
     variants = [
@@ -380,6 +368,15 @@ def test_a_fingerprint_sees_every_number():
         lv.Problem.lcp(2 * p.matrix, p.b),
         lv.Problem.contact(p.matrix, p.b, np.zeros(5)),
     ]
+    jac, mass, v = (
+        np.array([[1.0, 0.2], [0.0, 1.0]]),
+        np.array([[2.0, 0.3], [0.3, 1.0]]),
+        np.array([-1.0, 0.5]),
+    )
+    cones = lv.Cones.contacts(0.5, 1)
+    for s in (1.0, 2.0):  # one A and one b
+        variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
+    variants.append(dataclasses.replace(variants[-1], precision="float32"))
     prints = [bench_cases.fingerprint(v) for v in variants]
     assert len(set(prints)) == len(variants)
     assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]

@@ -19,6 +19,7 @@ from lavender.bench import machine
 from lavender.bench.line import c_of, code_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import KINDS, file_name, printable, to_json
+from lavender.report.findings import Report
 from lavender.report.terminal import print_report
 
 POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
@@ -65,8 +66,8 @@ def test_files_of_any_name_are_reported(lavender, tmp_path):
         with contextlib.suppress(OSError):  # a file system that takes no such name has none to report
             os.rename(tmp_path / "plain.npz", os.path.join(os.fsencode(folder), name))
     assert os.listdir(folder)
-    for _ in range(2):  # measured, and read again
-        code, out, err = lavender("report", folder, "--out", "out", *QUICK)
+    for more in ((), ("--no-figures",)):  # measured and drawn, and read again
+        code, out, err = lavender("report", folder, "--out", "out", *QUICK, *more)
         assert (code, err.strip()) == (0, "")
         assert "Traceback" not in out
         out.encode("utf-8")
@@ -106,7 +107,7 @@ def test_names_within_a_file_are_shown_and_change_nothing(lavender, tmp_path, na
     shown = text_io.StringIO()
     from rich.console import Console
 
-    print_report(records, Console(file=shown, width=140))
+    print_report(Report(records), Console(file=shown, width=140))
     assert printable(name)[:20] in shown.getvalue()
 
 
@@ -195,14 +196,14 @@ def show_all(records, figure=True):
     from lavender.report.page import page
     from lavender.report.style import looks
 
-    print_report(records, Console(file=text_io.StringIO(), width=140), old=records)
+    print_report(Report(records, records), Console(file=text_io.StringIO(), width=140))
     shown = records.latest()
     for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
         assert code_of(record)
         c_of(record)
     drawn = figures(shown)
-    page(shown, drawn, old=shown).encode("utf-8")
-    summary(shown).encode("utf-8")
+    page(Report(shown, shown), drawn).encode("utf-8")
+    summary(Report(shown)).encode("utf-8")
     drawn = list(drawn) if figure else []
     return matplotlib_figure(drawn[0], looks({r.solver for r in records})) if drawn else None
 

@@ -116,10 +116,12 @@ def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monke
     bench.run([path], ["pgs"], bench.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
     before = (tmp_path / "r.jsonl").read_bytes()
     monkeypatch.setattr(bench, "run", None)
-    code, out, _ = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again", "--no-figures")
+    out_to = ("--out", tmp_path / "again", "--no-figures", "--paper")
+    code, out, _ = lavender("report", tmp_path / "r.jsonl", *out_to)
     assert code == 0
     assert "stack8" in out
     assert (tmp_path / "again" / "index.html").exists()
+    assert "lcp" in (tmp_path / "again" / "paper" / "tables.tex").read_text(encoding="utf-8")
     assert (tmp_path / "r.jsonl").read_bytes() == before
 
 
@@ -379,6 +381,12 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
     io.save(impossible, tmp_path / "impossible.npz")
     code, out, _ = lavender("solve", tmp_path / "impossible.npz", "--solver", "direct")
     assert ("INFEASIBLE" in out, code) == (True, cli.EXIT_INFEASIBLE)
+    # An impulse that ran away is accepted nowhere, nor is one that moves where nothing was to do.
+    away = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
+    idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0], guess=[1e6, 0.0])
+    for wrong, more in ((away, ()), (idle, ("--max-iter", 0))):
+        io.save(wrong, tmp_path / "wrong.npz")
+        assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
 def test_the_nearest_name_is_found_whatever_its_case(lavender):

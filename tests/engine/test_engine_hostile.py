@@ -3,34 +3,21 @@
 import _thread
 import os
 import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import python
 
 import lavender as lv
 from lavender.engine import check
 from lavender.engine.layout import HEAD
-from lavender.engine.state import KEPT
+from lavender.engine.state import KEPT, State
 from lavender.registry import specs
 
 HERE = Path(__file__).resolve().parent.parent
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
-
-
-def run_apart(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """A process of its own: what crashes or hangs there fails this test alone."""
-    return subprocess.run(
-        [sys.executable, "-X", "faulthandler", "-c", code, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=600.0,  # what hangs; nothing takes so long on a loaded machine
-        check=False,
-        cwd=HERE,
-    )
 
 
 def trajectory(sim, steps):
@@ -84,9 +71,11 @@ def test_fields_of_a_snapshot_have_their_types(field, value, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["pile", "bridge"])
-def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name):
-    sim = lv.Simulation(lv.Scene(name))
+@pytest.mark.parametrize(
+    ("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})]
+)
+def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name, solver):
+    sim = lv.Simulation(lv.Scene(name, **solver))
     for _ in range(30):
         sim.step()
     shot = sim.snapshot()
@@ -128,8 +117,7 @@ assert open(sys.argv[1], "rb").read() == old
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit on the size of a file here")
 def test_a_full_disk_leaves_the_old_snapshot(tmp_path):
     path = tmp_path / "state"
-    done = run_apart(FULL_DISK, str(path))
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", FULL_DISK, str(path))
     lv.Simulation("stack").load(path)
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
 
@@ -168,10 +156,8 @@ assert sim.steps == 180, sim.steps
 def test_threads_that_share_a_simulation_take_turns():
     # Without turns: a crash in eight of eight. restore(snapshot()) of one thread may undo a step of another
     # between the two calls, so the bits are compared where each thread only steps.
-    done = run_apart(SHARED.replace("if i % 10 == 0:", "if False:"))
-    assert done.returncode == 0, done.stderr
-    done = run_apart(SHARED.replace("assert sim.steps == 180, sim.steps", ""))
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", SHARED.replace("if i % 10 == 0:", "if False:"))
+    python("-X", "faulthandler", "-c", SHARED.replace("assert sim.steps == 180, sim.steps", ""))
 
 
 def test_steps_of_threads_are_the_steps_of_one():
@@ -241,7 +227,8 @@ def caller(register):
     def make(now, at, resumable=False):
         solver = type("Now", (Caller,), {"now": staticmethod(now), "at": at, "runs": 0})
         laws = {"linear", "lcp", "coulomb", "cone"}
-        register(lv.SolverSpec("caller", solver, laws=laws, summary="calls", resumable=resumable))
+        spec = {"laws": laws, "rolling": True, "summary": "calls", "resumable": resumable}
+        register(lv.SolverSpec("caller", solver, **spec))
         return solver
 
     return make
@@ -296,19 +283,21 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
         np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
 
 
-def test_what_a_stopped_step_puts_back_holds_the_impulses_of_rolling():
-    scene = lv.Scene(rolling_radius=0.02, substeps=2)
+def test_a_stopped_step_leaves_every_number_of_the_state_as_it_was(caller):
+    caller(lambda: None, 0)
+    scene = lv.Scene(rolling_radius=0.02, solver="caller", substeps=2)
     scene.add_plane()
     scene.add_sphere(0.5, position=(0.0, 0.0, 0.5), velocity=(1.0, 0.0, 0.0))
     sim = lv.Simulation(scene)
     trajectory(sim, 3)
-    kernel, rolling = sim.state.kernel, sim.state.a["cache_roll"]
-    before = rolling[0].copy()  # of the one contact
-    assert before.any()
-    kernel.keep()
-    rolling[0] = 7.0  # as a substep writes its own
-    kernel.put_back()
-    np.testing.assert_array_equal(rolling[0], before)
+    before = sim.state.copy()
+    solver = sim_solver(scene)
+    solver.now, solver.at = staticmethod(stop), solver.runs + 2
+    with pytest.raises(KeyboardInterrupt):
+        sim.step()
+    before.head[HEAD["solved"]] = 0
+    for name, x in before.a.items():
+        assert sim.state.a[name].tobytes() == x.tobytes(), name
 
 
 def sim_solver(scene):
@@ -363,8 +352,7 @@ else:
 
 def test_one_real_signal_ends_the_step():
     # the budget of one substep alone would take hours
-    done = run_apart(SIGNAL)
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", SIGNAL)
 
 
 def test_the_state_is_copied_only_where_a_registered_solver_may_stop_half_way(monkeypatch):
@@ -376,11 +364,11 @@ def test_the_state_is_copied_only_where_a_registered_solver_may_stop_half_way(mo
         ({"solver": "pgs", "substeps": 1}, 0),
         ({"solver": "pgs", "substeps": 4}, 1),
     ):
-        kept.clear()
         sim = lv.Simulation(lv.Scene("stack", n=2, **more))
-        keep = sim.state.kernel.keep
-        sim.state.kernel = Watched(sim.state.kernel, keep=lambda keep=keep: kept.append(keep()))
-        sim.step()
+        kept.clear()
+        with monkeypatch.context() as patch:
+            patch.setattr(State, "take", lambda self, other: kept.append(other))
+            sim.step()
         assert len(kept) == copies, more
 
 
@@ -408,8 +396,7 @@ for n in (60, 65_537, 92_682):
 def test_coincident_spheres_touch_or_are_refused():
     # 65,537 of them are 2,147,516,416 pairs, 92,682 are 2^32 and some: beyond int32, then beyond uint32
     pytest.importorskip("resource")
-    done = run_apart(COINCIDENT)
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", COINCIDENT)
 
 
 def test_room_for_more_contacts_than_memory_is_refused():

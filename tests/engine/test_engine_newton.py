@@ -135,15 +135,3 @@ def test_another_newton_is_asked_itself():
     finally:
         registry.register(spec, replace=True)
     assert asked == [24, 24, 24]
-
-
-def test_snapshots_carry_on_bit_for_bit_with_newton():
-    sim = lv.Simulation(lv.Scene("pyramid", base=5, solver="newton"))
-    for _ in range(20):
-        sim.step()
-    state = sim.snapshot()
-    first = [sim.step()[0]["positions"] for _ in range(10)]
-    sim.restore(state)
-    assert sim.last_solution is None
-    for expected in first:
-        np.testing.assert_array_equal(sim.step()[0]["positions"], expected)

@@ -390,6 +390,16 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     with pytest.raises(lv.CapabilityError):  # joints
         chain.record(tmp_path / "joints", 1, form="fclib")
     assert chain.steps == 0
+    mixed = lv.Scene(friction=0.5)
+    mixed.add_plane()
+    mixed.add_box((1, 1, 1), mass=1, position=(0, 0, 0.5))
+    mixed.add_sphere(
+        0.3, mass=1.0, position=(5, 0, 0.42), friction=0.0
+    )  # falls: a contact of one row beside those of three
+    later = lv.Simulation(mixed)
+    with pytest.raises(lv.CapabilityError, match="contacts of 1, 3 rows"):
+        later.record(tmp_path / "later", 60, form="fclib")
+    assert later.steps == len(list((tmp_path / "later").iterdir())) > 0  # that step is not done
     (tmp_path / "file").write_text("")
     with pytest.raises(lv.InputError, match="cannot make or clear the folder"):
         sim.record(tmp_path / "file", 1)

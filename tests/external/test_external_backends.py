@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem, spd
+from random_problems import random_contact_problem, spd, touching
 
 import lavender as lv
 from lavender import registry, suite
@@ -92,11 +92,7 @@ def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
 def test_contradicting_rows_are_proved_in_the_velocity_form(name):
     if name not in BACKENDS:
         pytest.skip(f"{name} is not installed")
-    rows = lv.Rows(
-        np.ones(1), np.eye(3)[None], np.zeros((1, 6)), normal=np.array([[0.0, 0, 1], [0, 0, -1.0]]),
-        tangent=np.array([[1.0, 0, 0], [1.0, 0, 0]]), arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)),
-        contact_body=np.array([[-1, 0], [-1, 0]], np.int32),
-    )  # fmt: skip
+    rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0, 1], [0, 0, -1.0]]))
     problem = lv.Problem.from_rows(rows, [1.0, 1.0])  # up and down at 1 m/s
     solution = lv.solve(problem, name, form="velocity")
     assert solution.status is lv.Status.INFEASIBLE, str(solution)
@@ -222,6 +218,12 @@ def test_no_time_limit_is_said(name):
     solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=600.0)
     stoppable = backend is None or backend.stoppable
     assert ("takes no time limit" in solution.message) == (not stoppable)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("limit", [1e10, np.inf])
+def test_a_limit_that_no_clock_holds_is_one_that_never_comes(name, limit):
+    assert lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=limit).success
 
 
 APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACKENDS]
@@ -450,11 +452,8 @@ def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
 
 def test_cone_program_of_a_sliding_block():
     # A block pushed sideways at 1 m/s on the ground, mu = 0.5: it keeps sliding, the relaxation lifts it by mu |u_t|.
-    rows = lv.Rows(
-        np.ones(1), np.zeros((1, 3, 3)), np.array([[1.0, 0, -0.2, 0, 0, 0]]), normal=np.array([[0.0, 0, 1]]),
-        tangent=np.array([[1.0, 0, 0]]), arm_a=np.zeros((1, 3)), arm_b=np.zeros((1, 3)),
-        contact_body=np.array([[-1, 0]], np.int32),
-    )  # fmt: skip
+    moving = np.array([[1.0, 0, -0.2, 0, 0, 0]])
+    rows = touching([[-1, 0]], inv_inertia=np.zeros((1, 3, 3)), v_free=moving)
     problem = lv.Problem.from_rows(rows, mu=0.5, tangents=2, friction="cone")
     solution = lv.solve(problem, "clarabel_cone", tol=1e-8)
     # Projection of (0.2, -1) on {|t| <= n / 2}: n = (0.2 + 0.5) / 1.25.

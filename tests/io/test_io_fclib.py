@@ -1,5 +1,6 @@
 """FCLIB files: what they hold is kept to the bit, what they cannot hold is named."""
 
+import dataclasses
 import os
 import sys
 
@@ -8,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, seeds
+from random_problems import random_contact_problem, seeds, side_by_side, touching
 
 import lavender as lv
 import lavender.io
@@ -271,26 +272,20 @@ def test_both_forms_are_read_as_local(tmp_path):
 # -- refused --------------------------------------------------------------------------------------
 
 
-def one_body(inv_mass=1.0, inv_inertia=None):
+def one_body(**given):
     """One contact of one body with the ground."""
-    arm = np.zeros((1, 3))
-    rows = lv.Rows(
-        inv_mass=[inv_mass],
-        inv_inertia=np.array([np.eye(3) if inv_inertia is None else inv_inertia]),
-        v_free=np.zeros((1, 6)),
-        normal=[[0.0, 0.0, 1.0]],
-        tangent=[[1.0, 0.0, 0.0]],
-        arm_a=arm,
-        arm_b=arm,
-        contact_body=[[-1, 0]],
-    )
-    return lv.Problem.from_rows(rows, tangents=2)
+    return lv.Problem.from_rows(touching([[-1, 0]], **given), tangents=2)
 
 
 def test_what_fclib_cannot_hold_is_named(tmp_path):
     rows = soft(global_problem())
     named = lv.Problem(rows.b, rows.cones, rows=rows.rows, names=["x"] * 8, key=range(8))
-    heavy, pinned = one_body(inv_mass=0.0), one_body(inv_inertia=np.diag([1.0, 0.0, 1.0]))
+    single = np.eye(3, dtype=np.float32)
+    moved = lv.Problem.from_jacobian(
+        single, single, single[0], cones=lv.Cones.contacts(0.5),
+        dof_names=["x", "y", "z"], name="\ud800",
+    )  # fmt: skip
+    heavy, pinned = one_body(inv_mass=[0.0]), one_body(inv_inertia=[np.diag([1.0, 0.0, 1.0])])
     cases = [
         (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 bounded rows"]),
         (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 free rows"]),
@@ -301,6 +296,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (lv.Problem.contact(np.zeros((0, 0)), [], []), {}, ["without contacts"]),
         (named, {}, ["names of blocks", "keys of blocks"]),
         (named, {"drop": ["names"]}, ["keys of blocks"]),
+        (moved, {}, ["names of velocities", "precision 'float32'", "surrogate"]),
         (soft(rows, 0.5), {}, ["compliance"]),
         (heavy, {}, ["infinite mass"]),
         (pinned, {}, ["infinite inertia"]),
@@ -313,9 +309,11 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
     assert os.listdir(tmp_path) == []
     lavender.io.save(named, tmp_path / "p.hdf5", drop=["names", "key"])
     lavender.io.save(heavy, tmp_path / "p.hdf5", form="local")
+    plain = dataclasses.replace(moved, name="plain")
+    lavender.io.save(plain, tmp_path / "p.hdf5", drop=["names", "precision"])
     with pytest.raises(lv.InputError, match="'local' or 'global'"):
         lavender.io.save(rows, tmp_path / "p.hdf5", form="middle")
-    with pytest.raises(lv.InputError, match="only 'names' and 'key'"):
+    with pytest.raises(lv.InputError, match="only 'names', 'key' and 'precision'"):
         lavender.io.save(rows, tmp_path / "p.hdf5", drop=["compliance"])
     with pytest.raises(lv.InputError, match="cannot write"):
         lavender.io.save(rows, tmp_path / "nowhere" / "p.hdf5")
@@ -375,11 +373,8 @@ def test_files_that_mix_kinds_or_miss_a_moment_are_told(tmp_path):
         lambda file: file["fclib_local_rolling/spacedim"].write_direct(np.array([3], np.int32)),
         "spacedim is 3",
     )
-    both = lv.Problem(
-        np.concatenate([plain.b, rolls.b]), plain.cones + rolls.cones, sp.block_diag([plain.csr, rolls.csr])
-    )
     with pytest.raises(lv.CapabilityError, match="rolling beside others"):
-        lavender.io.save(both, path)
+        lavender.io.save(side_by_side([plain, rolls]), path)
     with_spin = random_contact_problem(5, rolling=True, joints=0)
     with pytest.raises(lv.CapabilityError, match="spin rows"):
         lavender.io.save(with_spin, path)

@@ -70,16 +70,18 @@ def test_findex_comes_back_in_any_order(seed):
     given_ = np.array([-1 if index[i] < 0 else back[index[i]] for i in order], int)
     low, high = np.array(low)[order], np.array(high)[order]
     a, b = np.eye(m) * rng.uniform(1, 2, m) + 0.1, rng.normal(size=m)
-    problem = lv.Problem.from_findex(a, b, low, high, given_)
+    guess = rng.uniform(0.0, 1.0, m)
+    problem = lv.Problem.from_findex(a, b, low, high, given_, guess=guess)
     rows = lv.Problem.findex_order(given_)
     a2, b2, low2, high2, findex = problem.to_findex()
     np.testing.assert_array_equal(a2, a[np.ix_(rows, rows)])
     np.testing.assert_array_equal(b2, b[rows])
+    np.testing.assert_array_equal(problem.guess, guess[rows])
     np.testing.assert_allclose(high2, high[rows], rtol=1e-15)
     np.testing.assert_allclose(low2, low[rows], rtol=1e-15)
     named = np.where(findex < 0, -1, rows[findex]) if m else findex
     np.testing.assert_array_equal(named, given_[rows])
-    again = lv.Problem.from_findex(a2, b2, low2, high2, findex)
+    again = lv.Problem.from_findex(a2, b2, low2, high2, findex, guess=problem.guess)
     assert again == problem
 
 

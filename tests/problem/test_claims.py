@@ -263,16 +263,6 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
 
 
-def test_ctrl_c_leaves_what_a_plug_in_has_come_to(plug_in):
-    def run(problem, impulse):
-        impulse[:] = 3.0
-        raise KeyboardInterrupt
-
-    solution = lv.solve(random_lcp(14), plug_in(run))
-    assert solution.status is lv.Status.INTERRUPTED
-    np.testing.assert_array_equal(solution.impulse, 3.0)
-
-
 def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
     class Few:
         def solve(self, problem, impulse, tol):
@@ -284,3 +274,44 @@ def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register
     assert lv.solve(random_lcp(15), "few", max_iter=2000).success
     assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
     assert lv.solve(random_lcp(15), "few").iterations > 0
+
+
+# -- the floor is no excuse for an impulse that ran away ------------------------------------------------
+
+RAY = np.array([[-0.2], [-0.7], [0.6], [2.0]])
+#: Two contacts along one ray: no impulse meets both, and larger ones only cost more digits.
+NO_MOTION = lv.Problem.contact(RAY @ RAY.T, [0.2, -1.1, 1.4, -1.9], [0.3, 0.6])
+
+
+@pytest.mark.parametrize("name", lv.available(NO_MOTION, external=False))
+def test_an_impulse_that_ran_away_is_at_no_floor(name):
+    solution = lv.solve(NO_MOTION, name)
+    assert solution.status not in (lv.Status.FLOOR, lv.Status.CONVERGED)
+    assert not solution.residual.at_floor
+    assert not solution.contradicted
+    if solution.status is not lv.Status.INFEASIBLE:
+        with pytest.raises(lv.errors.SolveFailed):
+            solution.raise_for_status()
+    assert lv.cross_check(NO_MOTION, [name])[name].verdict in ("not solved", "no solution, as proved")
+    assert not lv.motion.reference(NO_MOTION).accepted
+
+
+def test_an_impulse_no_better_than_none_is_excused_by_nobody():
+    problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
+    assert lv.residual(problem, problem.guess).floor > 1.0
+    reference = lv.motion.adopt(problem, problem.guess)
+    assert not reference.accepted
+    assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
+    assert len(lv.motions(problem)) == 0
+    assert lv.cross_check(problem, ["pgs"]).agreed == ()
+
+
+def test_cross_check_does_not_pass_an_impulse_that_is_wrong_where_nothing_was_to_do(plug_in):
+    idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0])
+
+    def run(problem, impulse):
+        impulse[0] = 1e6
+        return says(lv.Status.STALLED)
+
+    name = plug_in(run)
+    assert lv.cross_check(idle, [name])[name].verdict == "not solved"

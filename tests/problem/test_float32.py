@@ -100,6 +100,20 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         assert f"stopped early, {off.excess:.2g} times its floor" in str(off)
 
 
+def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
+    rng = np.random.default_rng(0)
+    b = rng.normal(size=(40, 40))
+    p = lv.Problem.lcp(b @ b.T / 40 + 0.3 * np.eye(40), rng.normal(size=40) + 1.0, precision="float32")
+    exact = lv.solve(p, tol=1e-13)
+    early = lv.solve(p, "pgs", tol=1e-13, impulse=exact.impulse.astype(np.float32), max_iter=1)
+    assert lv.residual(p, early.impulse).at_floor  # of an answer made in float32
+    assert early.status is lv.Status.MAX_ITERATIONS
+    assert not early.residual.at_floor
+    assert not lv.motion.adopt(p, early.impulse).accepted
+    for solution in (exact, lv.solve(p, max_iter=1000)):  # by a compiled call, and step by step
+        assert solution.residual.precision == "float64"
+
+
 def test_an_answer_that_is_no_better_than_none_is_wrong():
     p = robot(3)
     exact = lv.solve(p, tol=1e-10).impulse

@@ -2,24 +2,16 @@
 
 import numpy as np
 import pytest
+from random_problems import touching
 
 import lavender as lv
 from lavender import bench
 
-UP, SIDE = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
-
-
-def rows(body, inertia=None, mass=(1.0, 0.5)):
-    """Bodies that touch at their centres."""
-    c, n = len(body), len(mass)
-    return lv.Rows(
-        inv_mass=mass, inv_inertia=[np.eye(3)] * n if inertia is None else inertia, v_free=np.full((n, 6), -1.0),
-        normal=[UP] * c, tangent=[SIDE] * c, arm_a=np.zeros((c, 3)), arm_b=np.zeros((c, 3)), contact_body=body,
-    )  # fmt: skip
+TWO = {"inv_mass": [1.0, 0.5]}
 
 
 def test_mu_alone_means_two_tangents_and_a_mu_that_nothing_feels_is_refused():
-    made = rows([[-1, 0], [0, 1]])
+    made = touching([[-1, 0], [0, 1]], **TWO)
     problem = lv.Problem.from_rows(made, mu=0.5)
     assert (problem.m, problem.law) == (6, "coulomb")
     mixed = lv.Problem.from_rows(made, mu=[0.0, 0.5])
@@ -51,13 +43,13 @@ def test_one_mu_for_each_contact_and_a_scalar_for_all():
 )
 def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
     with pytest.raises(lv.InputError, match=rf"inv_inertia\[1\] is {sign}"):
-        rows([[-1, 0]], np.stack([np.eye(3), tensor]))
+        touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), tensor]), **TWO)
     with pytest.raises(lv.InputError, match="both are static"):
-        rows([[-1, 0], [-1, -1]])
+        touching([[-1, 0], [-1, -1]], **TWO)
     for fine in (np.zeros((3, 3)), np.diag([1.0, 0.0, 0.0]), 1e-300 * np.eye(3), 1e300 * np.eye(3)):
-        rows([[-1, 0]], np.stack([np.eye(3), fine]))
+        touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), fine]), **TWO)
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    rows([[-1, 0]], np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]))
+    touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)
 
 
 def test_a_problem_is_saved_and_loaded_where_it_is_at_hand(tmp_path):

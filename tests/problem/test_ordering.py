@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, touching
 
 import lavender as lv
 from lavender.ordering import ORDERS, block_order, body_ranks, colors, levels
@@ -49,13 +49,7 @@ def test_colors_of_a_matrix_share_no_entry(seed):
 def test_more_than_63_colors_are_found():
     """100 contacts of one body with 100 others: every one needs its own colour."""
     n = 100
-    rng = np.random.default_rng(0)
-    normal = np.tile([0.0, 0.0, 1.0], (n, 1))
-    rows = lv.Rows(
-        inv_mass=np.ones(n + 1), inv_inertia=np.tile(np.eye(3), (n + 1, 1, 1)), v_free=rng.normal(size=(n + 1, 6)),
-        normal=normal, tangent=np.tile([1.0, 0.0, 0.0], (n, 1)), arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)),
-        contact_body=np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1),
-    )  # fmt: skip
+    rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))
     assert sorted(colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
 
 
@@ -63,11 +57,7 @@ def test_levels_count_from_the_ground():
     n = 6
     body = np.stack([np.arange(-1, n - 1), np.arange(n)], axis=1)
     shuffled = np.random.default_rng(3).permutation(n)
-    rows = lv.Rows(
-        inv_mass=np.ones(n), inv_inertia=np.tile(np.eye(3), (n, 1, 1)), v_free=np.zeros((n, 6)),
-        normal=np.tile([0.0, 0.0, 1.0], (n, 1)), tangent=np.tile([1.0, 0.0, 0.0], (n, 1)),
-        arm_a=np.zeros((n, 3)), arm_b=np.zeros((n, 3)), contact_body=body[shuffled],
-    )  # fmt: skip
+    rows = touching(body[shuffled])
     problem = lv.Problem.from_rows(rows)
     np.testing.assert_array_equal(levels(problem), shuffled)
     np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
@@ -104,12 +94,7 @@ def test_ranks_are_a_permutation_that_brings_neighbours_near():
     rng = np.random.default_rng(0)
     chain = rng.permutation(n)
     body = np.stack([chain[:-1], chain[1:]], axis=1)
-    c = n - 1
-    rows = lv.Rows(
-        inv_mass=np.ones(n), inv_inertia=np.zeros((n, 3, 3)), v_free=np.zeros((n, 6)),
-        normal=np.tile([0.0, 0.0, 1.0], (c, 1)), tangent=np.tile([1.0, 0.0, 0.0], (c, 1)),
-        arm_a=np.zeros((c, 3)), arm_b=np.zeros((c, 3)), contact_body=body,
-    )  # fmt: skip
+    rows = touching(body, inv_inertia=np.zeros((n, 3, 3)))
     rank = body_ranks(lv.Problem.from_rows(rows))
     assert np.array_equal(np.sort(rank), np.arange(n))
     assert np.abs(np.diff(rank[body], axis=1)).max() == 1

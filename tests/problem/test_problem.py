@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 import warnings
 from dataclasses import fields, replace
 
@@ -19,7 +17,9 @@ from random_problems import (
     random_lcp,
     random_rows,
     seeds,
+    touching,
 )
+from worked import python
 
 import lavender as lv
 
@@ -137,10 +137,8 @@ def test_rows_have_names():
 
 def test_pinned_bodies_are_legal():
     """A body of infinite mass gives empty rows of A."""
-    rows = lv.Rows(
-        inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)), v_free=np.ones((1, 6)), normal=[[0, 0, 1.0]] * 2,
-        tangent=[[1.0, 0, 0]] * 2, arm_a=np.zeros((2, 3)), arm_b=np.zeros((2, 3)), contact_body=[[-1, 0], [0, -1]],
-    )  # fmt: skip
+    still = {"inv_mass": [0.0], "inv_inertia": np.zeros((1, 3, 3)), "v_free": np.ones((1, 6))}
+    rows = touching([[-1, 0], [0, -1]], **still)
     problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
     assert not problem.csr.toarray().any()
     np.testing.assert_array_equal(problem.d, [1.0, 1.0])
@@ -317,7 +315,7 @@ def test_ctrl_c_from_a_real_signal(tmp_path):
         "assert solution.status is lv.Status.INTERRUPTED, solution\n"
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
+    python("-c", code)
 
 
 # -- what is given stays the giver's ---------------------------------------------------------------------

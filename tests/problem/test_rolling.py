@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, random_contact_problem
+from random_problems import as_matrix, random_contact_problem, touching
 
 import lavender as lv
 from lavender import registry
@@ -26,10 +26,9 @@ def test_a_ball_that_rolls_loses_what_the_moment_takes(speed, held):
     """In a step h: held where mu_r N h is enough, else the spin falls by mu_r N h / (7/5 m R^2) and v follows it."""
     radius, mass, h, reach, g = 0.5, 2.0, 1 / 120, 0.02, 9.81
     inertia = 0.4 * mass * radius**2
-    rows = lv.Rows(
-        inv_mass=[1 / mass], inv_inertia=[np.eye(3) / inertia],
-        v_free=[[speed, 0.0, -g * h, 0.0, speed / radius, 0.0]], contact_body=[(-1, 0)], normal=[(0.0, 0.0, 1.0)],
-        tangent=[(1.0, 0.0, 0.0)], arm_a=[(0.0, 0.0, 0.0)], arm_b=[(0.0, 0.0, -radius)],
+    rows = touching(
+        [[-1, 0]], inv_mass=[1 / mass], inv_inertia=[np.eye(3) / inertia], arm_b=[(0.0, 0.0, -radius)],
+        v_free=[[speed, 0.0, -g * h, 0.0, speed / radius, 0.0]],
     )  # fmt: skip
     problem = lv.Problem.from_rows(rows, mu=0.5, rolling=reach)
     for name in TAKES:

@@ -17,6 +17,7 @@ from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run
 from lavender.report import curves, tables
 from lavender.report.curves import overall_figure
+from lavender.report.findings import Report
 from lavender.report.paper import write_paper
 from lavender.report.terminal import print_report
 from lavender.report.text import residual, seconds, times
@@ -391,7 +392,7 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_tables_stay_within_the_terminal_and_nothing_is_cut(real, width):
     out = io.StringIO()
-    print_report(real[0], Console(width=width, file=out), whole=True)
+    print_report(Report(real[0]), Console(width=width, file=out), whole=True)
     lines = [
         line for line in out.getvalue().splitlines() if not line.startswith(("    lv.", "    # in C"))
     ]  # to copy
@@ -417,13 +418,13 @@ def test_the_first_screen_has_the_choice_and_the_picture(real, tmp_path):
 
 def test_a_paper_is_written_from_records_alone(real, tmp_path):
     records = real[0]
-    folder = write_paper(records, tmp_path / "paper")
+    folder = write_paper(Report(records), tmp_path / "paper")
     pdf = {p.name for p in folder.glob("*.pdf")}
     assert "over-all.pdf" in pdf
     assert any(name.startswith("profile-") for name in pdf)
     assert all(p.read_bytes().startswith(b"%PDF") for p in folder.glob("*.pdf"))
     before = {p.name: p.read_bytes() for p in folder.iterdir()}
-    write_paper(records, folder)
+    write_paper(Report(records), folder)
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before  # no clock in it
     text, method = ((folder / name).read_text(encoding="utf-8") for name in ("tables.tex", "method.tex"))
     assert (
@@ -442,7 +443,7 @@ def test_a_paper_is_written_from_records_alone(real, tmp_path):
     for number in (len(records), len({r.solver for r in records}), len({r.case for r in records})):
         assert re.search(rf"\b{number} ", method)
     with pytest.raises(lv.InputError, match="runs with times"):
-        write_paper(records_of(), tmp_path / "none")
+        write_paper(Report(records_of()), tmp_path / "none")
 
 
 def test_built_in_problems_are_not_called_yours():
@@ -473,6 +474,21 @@ def test_a_frame_has_the_rows(real):
     assert isinstance(frame, pandas.DataFrame)
     assert len(frame) == len(real[0])
     assert frame["relative"].tolist() == [r.relative for r in real[0]]
+
+
+def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_name_of_a_structure():
+    made = [record(f"stack[{i}]", "x", 1e-3, 1e-8, step=i) for i in range(2)]
+    found = records_of(record("a", "x", 1e-5, 1e-8), *made)
+    for i in range(3):  # the pass ended after two of three steps
+        found.add(dataclasses.replace(info(f"stack[{i}]"), sequence="stack", step=i))
+    lines = report.advice(found, [1.0])
+    assert [(x.name, x.size, x.sequence) for x in lines] == [("stack", 1, False), ("stack", 3, True)]
+    for line, solved in zip(lines, (1, 2), strict=True):
+        for best in (line.by_level[1e-6].best, line.by_time[1.0].best):
+            assert (best.solved, best.cases) == (solved, line.size)
+    # charged the time limit of 2 s, as a case is
+    score = lines[1].by_level[1e-6].best.score
+    assert score == pytest.approx((1e-3**2 * 2.0) ** (1 / 3), rel=0.05)
 
 
 def test_sequences_are_compared_carried_against_cold(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import random_contact_problem, random_lcp
+from random_problems import random_contact_problem, random_lcp, side_by_side
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -59,14 +59,7 @@ def test_every_factorisation_gives_the_same(law):
     assert lu.solver.form == "sparse LU"
     results.append(lu)
     # Eight of them side by side make a matrix that is sparse enough.
-    big = sp.block_diag([a] * 8, format="csr")
-    ptr = np.concatenate([cones.ptr[:-1] + k * base.m for k in range(8)] + [[8 * base.m]])
-    many = lv.Cones(
-        ptr, *(np.tile(getattr(cones, n), 8) for n in ("kind", "lower", "upper", "mu", "patch_radius"))
-    )
-    eight = lv.solve(
-        lv.Problem(np.tile(base.b, 8), many, big, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
-    )
+    eight = lv.solve(side_by_side([problem] * 8), "admm", tol=1e-10, max_iter=20_000)
     assert eight.solver.form == "sparse Cholesky"
     for solution in results:
         assert solution.success

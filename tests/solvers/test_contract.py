@@ -10,7 +10,7 @@ import pytest
 from enumeration import enumerate_lcp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, touching
 from random_trees import random_general
 
 import lavender as lv
@@ -357,11 +357,7 @@ def test_time_limit_returns_the_iterate(name):
 
 def soft_static_contacts():
     """Two contacts of a body that nothing moves: compliance alone makes A = diag(1, 2, 1, 2)."""
-    z, x, o = np.tile([0.0, 0.0, 1.0], (2, 1)), np.tile([1.0, 0.0, 0.0], (2, 1)), np.zeros((2, 3))
-    rows = lv.Rows(
-        np.zeros(1), np.zeros((1, 3, 3)), np.zeros((1, 6)), normal=z, tangent=x, arm_a=o, arm_b=o,
-        contact_body=[[-1, 0], [-1, 0]],
-    )  # fmt: skip
+    rows = touching([[-1, 0], [-1, 0]], inv_mass=[0.0], inv_inertia=np.zeros((1, 3, 3)))
     return lv.Problem.from_rows(
         rows, [1.0, 2.0, 1.0, -2.0], mu=0.5, tangents=1, compliance=[1.0, 2.0, 1.0, 2.0]
     )

@@ -30,6 +30,7 @@ REFUSED = {
     "a start too short": (lambda: lv.solve(TINY, "pgs", impulse=[1.0]), lv.InputError, "shape"),
     "a start not finite": (lambda: lv.solve(TINY, "pgs", impulse=[1.0, np.inf]), lv.InputError, "impulse"),
     "a start of words": (lambda: lv.solve(TINY, "pgs", impulse=["a", "b"]), lv.InputError, "impulse"),
+    "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
     "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
     "history of a finite solver": (
         lambda: lv.solve(TINY, "direct", history=True),
@@ -55,27 +56,25 @@ def test_nothing_ran_where_a_request_is_refused(register):
     assert ran == []
 
 
+def test_what_is_found_can_be_compared_and_kept_in_a_set():
+    for found in (
+        lambda: lv.solve(TINY, "pgs", history=True),
+        lambda: lv.solve(TINY, "pgs", history=True).history,
+        lambda: lv.solve(TINY).residual,
+        lambda: lv.redundancy(TINY),
+        lambda: lv.motion_error(dataclasses.replace(TINY), [0.0, 0.0]),
+        lambda: lv.Simulation("stack").scene.bodies[1],
+    ):
+        one, two = found(), found()
+        assert one == one and one != two and len({one, two}) == 2
+
+
 def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():
     problem = lv.Problem.lcp(np.eye(2), [5.0, 5.0], lower=1.0, upper=9.0, guess=[2.0, 3.0])
     at_start = lambda p, **more: lv.solve(p, "pgs", max_iter=0, tol=0.0, **more).impulse.tolist()  # noqa: E731
     assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
     assert at_start(problem) == [2.0, 3.0]
     assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
-
-
-def test_history_and_callback_fall_at_the_same_counts_and_change_no_bit():
-    problem = suite.granular(3).problem
-    seen = []
-    plain = lv.solve(problem, "pgs", tol=1e-9, max_iter=5000)
-    told = lv.solve(
-        problem, "pgs", tol=1e-9, max_iter=5000, history=True,
-        callback=lambda n, impulse, residual: seen.append((n, residual.relative)) and None,
-    )  # fmt: skip
-    assert plain.impulse.tobytes() == told.impulse.tobytes()
-    assert [n for n, _ in seen] == told.history.iterations.tolist()[-len(seen) :]
-    assert told.history.relative[-1] == told.residual.relative
-    assert np.all(np.diff(told.history.iterations) > 0)
-    assert np.all(np.diff(told.history.time) >= 0.0)
 
 
 def test_what_a_callback_raises_comes_through():
@@ -115,23 +114,8 @@ def test_ctrl_c_is_a_result(register):
     problem = lv.Problem.lcp(np.eye(2), [50.0, 50.0])
     solution = lv.solve(problem, "interrupted", tol=1e-9, max_iter=10**6)
     assert solution.status is Status.INTERRUPTED
-    assert np.isfinite(solution.impulse).all()
+    np.testing.assert_array_equal(solution.impulse, 2.0)  # what it had come to
     assert not solution.success
-    with pytest.raises(lv.SolveFailed):
-        solution.raise_for_status()
-
-
-def test_a_claim_above_tol_is_contradicted_and_no_success(register):
-    class Boasts(Interrupted):
-        def run(self, state, impulse, n, tol, time_limit=None):
-            return Claim(Status.CONVERGED, 1)
-
-    spec = dataclasses.replace(registry.get("pgs"), name="boasts", factory=Boasts, options={})
-    register(spec)
-    solution = lv.solve(TINY, "boasts")
-    assert solution.status is Status.CONVERGED  # what it says,
-    assert solution.contradicted  # what we say of that,
-    assert not solution.success  # and what counts
     with pytest.raises(lv.SolveFailed):
         solution.raise_for_status()
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.running import Answer, Limits, at_least

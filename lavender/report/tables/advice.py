@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
 from lavender.bench.record import Record
 from lavender.bench.store import Records
-from lavender.report.tables.groups import families, levels_of, pairs
+from lavender.report.tables.groups import families, levels_of
 from lavender.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
-from lavender.report.tables.sequences import Pass, by_sequence
+from lavender.report.tables.sequences import by_sequence
 
 __all__ = [
     "Advice",
@@ -25,8 +25,8 @@ __all__ = [
     "advice_by_sweeps",
     "advice_by_time",
     "counts_sweeps",
-    "over_steps",
     "quantile",
+    "steps_of",
     "time_budgets",
     "to_level",
     "within",
@@ -38,7 +38,6 @@ __all__ = [
 NOISE, RESIDUAL_NOISE = 1.25, 2.0
 HALF = 0.5  # of the start's residual: a case is served where at most that is left
 QUANTILE = 0.9  # of the residuals in a time or with sweeps, over the cases: misses cannot be averaged away
-Groups = Mapping[tuple[str, str], Sequence[Record]]  # usable runs by (case, solver)
 FIRST = "auto"  # among equals: the only name that needs no choice
 
 
@@ -93,15 +92,16 @@ class Advice:
         return tuple(c.solver for c in self.ranking[1 : self.equal]) if self.best else ()
 
 
-def ranked(
-    family: str, target: float, places: Iterable[tuple[tuple[float, ...], Choice]], noise: float
-) -> Advice:
+Place = tuple[tuple[float, ...], Choice]  # a smaller key is better whatever the score
+
+
+def ranked(family: str, target: float, places: Iterable[Place], noise: float) -> Advice:
     """Order of merit: by key, then by score; who is within noise of the best, by name, so that a rerun agrees.
 
     Parameters
     ----------
     family, target : of the advice
-    places : (key, choice); a smaller key is better whatever the score
+    places : (key, choice)
     noise : factor within which scores are equal
     """
     order = sorted(places, key=lambda place: (place[0], place[1].score, place[1].solver))
@@ -129,18 +129,19 @@ class Line:
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget."""
     times = tuple(times) or time_budgets(records)
-    steps = {name: passes[0].steps for name, passes in by_sequence(records).items()}
-    sizes = {name: len(cases) for name, cases in families(records).items()}
-    steps_level, steps_time = advice_by_sequence(records, times)
-    found: dict[str, list[dict[float, Advice]]] = defaultdict(lambda: [{}, {}, {}])
-    by_level, by_time = (
-        [*advice_by_level(records), *steps_level],
-        [*advice_by_time(records, times), *steps_time],
-    )
-    for i, some in enumerate((by_level, by_time, advice_by_sweeps(records))):
-        for a in some:
-            found[a.family][i][a.target] = a
-    return [Line(name, size, of is steps, *found[name]) for of in (sizes, steps) for name, size in of.items()]
+    ways, swept = _ways(records), _swept(records)
+    return [
+        Line(
+            name=name,
+            size=len(cases),
+            sequence=is_sequence,
+            by_level={x: to_level(records, name, cases, x, ways) for x in levels_of(records)},
+            by_time={t: within(records, name, cases, t, ways) for t in times},
+            by_sweeps={float(n): _with_sweeps(records, name, cases, n, some) for n, some in swept.items()},
+        )
+        for is_sequence, groups in ((False, families(records)), (True, steps_of(records)))
+        for name, cases in groups.items()
+    ]
 
 
 def advice_by_level(records: Records) -> list[Advice]:
@@ -148,41 +149,182 @@ def advice_by_level(records: Records) -> list[Advice]:
 
     A solver whose claim was wrong on a case of the family at any level comes after all that were not.
     """
-    groups = _cold(records)
+    ways = _ways(records)
     return [
-        to_level(records, family, cases, level, groups)
+        to_level(records, family, cases, level, ways)
         for family, cases in families(records).items()
         for level in levels_of(records)
     ]
 
 
+def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
+    """For each structure and time budget: who serves most cases in that time, then the residual at the 90th percentile.
+
+    A case is served where at most half of the start's residual is left. A solver with nothing to show in the time
+    scores 1 on that case: doing nothing. `times` [s]; `time_budgets` if none are given.
+    """
+    times, ways = tuple(times) or time_budgets(records), _ways(records)
+    return [
+        within(records, family, cases, limit, ways)
+        for family, cases in families(records).items()
+        for limit in times
+    ]
+
+
+def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
+    """For each sequence, by level and by time of a step: which solver and budget, carried or cold."""
+    times, ways, sequences = tuple(times) or time_budgets(records), _ways(records), steps_of(records)
+    return (
+        [to_level(records, s, c, x, ways) for s, c in sequences.items() for x in levels_of(records)],
+        [within(records, s, c, t, ways) for s, c in sequences.items() for t in times],
+    )
+
+
+def advice_by_sweeps(records: Records) -> list[Advice]:
+    """For each structure and sequence and each budget: who serves most cases with so many sweeps, ranked as in a time.
+
+    Solvers whose iterations are sweeps: the others' cost nobody can compare by number.
+    """
+    groups = [*families(records).items(), *steps_of(records).items()]
+    swept = _swept(records)
+    return [_with_sweeps(records, name, cases, n, swept[n]) for name, cases in groups for n in swept]
+
+
+def _with_sweeps(records: Records, name: str, cases: Sequence[str], n: int, ways: Ways) -> Advice:
+    return replace(within(records, name, cases, math.inf, ways), target=float(n))
+
+
+def _swept(records: Records) -> dict[int, Ways]:
+    """By budget, the solvers whose iterations are sweeps."""
+    ways: dict[int, dict[tuple[str, str, str], _Way]] = defaultdict(dict)
+    for r in records:
+        plain = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
+        if plain and r.mode == "budget" and counts_sweeps(r):
+            start = "" if r.step < 0 else r.start
+            way = ways[r.max_iter].setdefault((r.solver, "", start), _Way(r.solver, start, r.max_iter))
+            way.runs[r.case] = [r]
+    return {n: ways[n] for n in sorted(ways)}
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A solver with all of its runs on single cases, or with those of one line over the steps of sequences."""
+
+    solver: str
+    how: str = ""  # the line; of single cases the sweeps of the runs that count, where they count sweeps
+    iterations: int = 0
+    tol: float = 0.0  # that a line asks for
+    runs: dict[str, list[Record]] = field(default_factory=dict)  # by case
+
+    def budget(self, runs: Sequence[Record]) -> dict[str, Any]:
+        """What a choice says of it, with these of its runs."""
+        if self.how or self.iterations:
+            return {"how": self.how, "iterations": self.iterations}
+        sweeps = [r.work["sweeps"] for r in runs if "sweeps" in r.work]
+        middle = round(median(sweeps)) if runs and len(sweeps) == len(runs) else 0
+        return {"how": f"{middle} sweeps" if middle else "", "iterations": middle}
+
+
+Ways = Mapping[tuple[str, str, str], _Way]
+
+
+def _ways(records: Records) -> Ways:
+    """From a cold start on single cases; over sequences each budget and level, cold and carried."""
+    found: dict[tuple[str, str, str], _Way] = {}
+    for r in records:
+        if r.order != "given" or r.turns or (r.step < 0 and r.start != "cold"):
+            continue
+        if r.step < 0:
+            way = found.setdefault((r.solver, "", ""), _Way(r.solver))
+        else:
+            tol, budget = (r.tol, 0) if r.mode == "tol" else (0.0, r.max_iter)
+            line = _Way(r.solver, f"{r.asked}, {r.start}", budget, tol)
+            way = found.setdefault((r.solver, r.asked, r.start), line)
+        way.runs.setdefault(r.case, []).extend([r] if r.usable else [])
+    return found
+
+
+def steps_of(records: Records) -> dict[str, list[str]]:
+    """The steps of each sequence, those that nobody was asked for, too."""
+    ran = {r.case for r in records if r.step >= 0}
+    found: dict[str, list[str]] = {}
+    for name, info in records.cases.items():
+        if info.sequence:
+            found.setdefault(info.sequence, []).append(name)
+    return {name: steps for name, steps in found.items() if not ran.isdisjoint(steps)}
+
+
 def to_level(
-    records: Records, family: str, cases: Sequence[str], level: float, groups: Groups | None = None
+    records: Records, family: str, cases: Sequence[str], level: float, ways: Ways | None = None
 ) -> Advice:
-    """Who brings these cases to a level; see `advice_by_level`. `groups` spares another pass over the records."""
-    limit, groups = limit_of(records), groups or _cold(records)
-    liars = {(r.case, r.solver) for r in records if r.contradicted}
-    places: list[tuple[tuple[float, ...], Choice]] = []
-    for solver in sorted({s for c, s in groups if c in cases}):
-        runs = {c: _quickest(groups.get((c, solver), ()), level) for c in cases}
+    """Who brings these cases, or steps, to a level; see `advice_by_level`. `ways` spares a pass over the records.
+
+    Steps of several sequences count together, by the lines that were asked for the level or have a budget.
+    """
+    limit, liars = limit_of(records), _liars(records, cases)
+    places: list[Place] = []
+    for way in _taking(cases, _ways(records) if ways is None else ways):
+        if way.tol > level:
+            continue
+        runs = {c: _quickest(way.runs.get(c, ()), level) for c in cases}
         solved = [r for r in runs.values() if r is not None]
         times = {c: math.inf if r is None else r.time_min for c, r in runs.items()}
-        charged = [min(t, limit) if math.isinf(t) else t for t in times.values()]
-        choice = Choice.of(solver, times, len(solved), geometric_mean(charged, SHIFT), **_budget(solved))
-        lies = any((c, solver) in liars for c in cases)
-        places.append(((lies, -len(solved)), choice))
-    return ranked(family, level, places, NOISE)
+        score = geometric_mean([t if math.isfinite(t) else limit for t in times.values()], SHIFT)
+        choice = Choice.of(way.solver, times, len(solved), score, **way.budget(solved))
+        places.append(((way.solver in liars, -len(solved)), choice))
+    return ranked(family, level, _best_of_each(places), NOISE)
+
+
+def within(
+    records: Records, family: str, cases: Sequence[str], limit: float, ways: Ways | None = None
+) -> Advice:
+    """Who comes closest on these cases, or steps, within a time [s]; see `advice_by_time`.
+
+    A run that takes the time within noise may be in it or not the next time: who would be the best with it is
+    as good as the best.
+    """
+    taking, liars = _taking(cases, _ways(records) if ways is None else ways), _liars(records, cases)
+
+    def standing(way: _Way, most: float) -> Place:
+        runs = {c: _closest(way.runs.get(c, ()), most) for c in cases}
+        left = {c: 1.0 if r is None else min(max(r.relative, 1e-17), 1.0) for c, r in runs.items()}
+        served = sum(x <= HALF for x in left.values())
+        budget = way.budget([r for r in runs.values() if r is not None])
+        choice = Choice.of(way.solver, left, served, quantile(list(left.values()), QUANTILE), **budget)
+        return (way.solver in liars, -served), choice
+
+    places = _best_of_each(standing(way, limit) for way in taking)
+    found = ranked(family, limit, places, RESIDUAL_NOISE)
+    if found.best is None or math.isinf(limit):
+        return found
+    late = {c.solver: (key, c.score) for key, c in _best_of_each(standing(w, NOISE * limit) for w in taking)}
+    first = min(key for key, _ in places)
+    best = min(c.score for c in found.ranking[: found.equal])
+    rest = found.ranking[found.equal :]
+    near = [c for c in rest if late[c.solver][0] <= first and late[c.solver][1] <= RESIDUAL_NOISE * best]
+    others = [c for c in rest if all(c is not n for n in near)]
+    return Advice(
+        found.family, found.target, (*found.ranking[: found.equal], *near, *others), found.equal + len(near)
+    )
+
+
+def _liars(records: Records, cases: Sequence[str]) -> set[str]:
+    """Solvers with a false claim on any of these."""
+    held = set(cases)
+    return {r.solver for r in records if r.contradicted and r.case in held}
+
+
+def _taking(cases: Sequence[str], ways: Ways) -> list[_Way]:
+    held = set(cases)
+    return [way for _, way in sorted(ways.items()) if not held.isdisjoint(way.runs)]
 
 
 def _quickest(runs: Iterable[Record], level: float) -> Record | None:
     return min((r for r in runs if r.relative <= level), key=lambda r: r.time_min, default=None)
 
 
-def _cold(records: Records) -> dict[tuple[str, str], list[Record]]:
-    # Usable runs from a cold start by (case, solver); a pair that has none is there, with none.
-    return {
-        (c, s): [r for r in g if r.usable] for (c, s, start), g in pairs(records).items() if start == "cold"
-    }
+def _closest(runs: Iterable[Record], limit: float) -> Record | None:
+    return min((r for r in runs if r.time_min <= limit), key=lambda r: r.relative, default=None)
 
 
 def time_budgets(records: Records) -> tuple[float, ...]:
@@ -203,178 +345,14 @@ def time_budgets(records: Records) -> tuple[float, ...]:
     return tuple(10.0**k for k in (middle - 1, middle, middle + 1))
 
 
-def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
-    """For each structure and time budget: who serves most cases in that time, then the residual at the 90th percentile.
-
-    A case is served where at most half of the start's residual is left. A solver with nothing to show in the time
-    scores 1 on that case: doing nothing. `times` [s]; `time_budgets` if none are given.
-    """
-    times, groups = tuple(times) or time_budgets(records), _cold(records)
-    return [
-        within(records, family, cases, limit, groups)
-        for family, cases in families(records).items()
-        for limit in times
-    ]
-
-
-def within(
-    records: Records, family: str, cases: Sequence[str], limit: float, groups: Groups | None = None
-) -> Advice:
-    """Who comes closest on these cases within a time [s]; see `advice_by_time`.
-
-    A run that takes the time within noise may be in it or not the next time: who would be the best with it is
-    as good as the best.
-    """
-    groups = groups or _cold(records)
-    liars = {(r.case, r.solver) for r in records if r.contradicted}
-    places: list[tuple[tuple[float, ...], Choice]] = []
-    hopes: dict[str, tuple[tuple[float, ...], float]] = {}
-    for solver in sorted({s for c, s in groups if c in cases}):
-        lies = any((c, solver) in liars for c in cases)
-        got = {c: _closest(groups.get((c, solver), ()), limit) for c in cases}
-        hoped = _residuals({c: _closest(groups.get((c, solver), ()), NOISE * limit) for c in cases})
-        hopes[solver] = ((lies, -_served(hoped)), quantile(list(hoped.values()), QUANTILE))
-        done = [r for r in got.values() if r is not None]
-        choice = _by_residual(solver, _residuals(got), **_budget(done))
-        places.append(((lies, -choice.solved), choice))
-    found = ranked(family, limit, places, RESIDUAL_NOISE)
-    if found.best is None:
-        return found
-    best = min(c.score for c in found.ranking[: found.equal])
-    first = min(key for key, _ in places)
-    near = [
-        c
-        for c in found.ranking[found.equal :]
-        if hopes[c.solver][0] <= first and hopes[c.solver][1] <= RESIDUAL_NOISE * best
-    ]
-    rest = [c for c in found.ranking[found.equal :] if all(c is not n for n in near)]
-    return Advice(family, limit, (*found.ranking[: found.equal], *near, *rest), found.equal + len(near))
-
-
-def _residuals(runs: Mapping[str, Record | None]) -> dict[str, float]:
-    return {c: 1.0 if r is None else _score(r.relative) for c, r in runs.items()}
-
-
-def _served(residuals: Mapping[str, float]) -> int:
-    return sum(r <= HALF for r in residuals.values())
-
-
-def _by_residual(solver: str, residuals: Mapping[str, float], **more: Any) -> Choice:
-    """A standing by what is left on each case."""
-    score = quantile(list(residuals.values()), QUANTILE)
-    return Choice.of(solver, residuals, _served(residuals), score, **more)
-
-
-def _budget(runs: Sequence[Record]) -> dict[str, Any]:
-    """The median of the sweeps of these runs, where all of them count sweeps."""
-    sweeps = [r.work["sweeps"] for r in runs if "sweeps" in r.work]
-    middle = round(median(sweeps)) if runs and len(sweeps) == len(runs) else 0
-    return {"how": f"{middle} sweeps" if middle else "", "iterations": middle}
-
-
-def _steps(values: Sequence[float]) -> dict[str, float]:
-    return {f"step {i}": x for i, x in enumerate(values)}
-
-
 def counts_sweeps(r: Record) -> bool:
     """A budget whose iterations are sweeps, so that it bounds what a solve takes."""
     return 0 < r.work.get("sweeps", 0) <= r.max_iter
 
 
-def advice_by_sweeps(records: Records) -> list[Advice]:
-    """For each structure and sequence and each budget: who serves most cases with so many sweeps, ranked as in a time.
-
-    Solvers whose iterations are sweeps: the others' cost nobody can compare by number.
-    """
-    liars = {(r.case, r.solver) for r in records if r.contradicted}
-    runs: dict[tuple[str, int, str], dict[str, Record]] = {}
-    for r in records:
-        plain = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
-        if plain and r.mode == "budget" and counts_sweeps(r):
-            runs.setdefault((r.solver, r.max_iter, "" if r.step < 0 else r.start), {})[r.case] = r
-    steps: dict[str, list[str]] = {}
-    for name, info in records.cases.items():
-        if info.sequence:
-            steps.setdefault(info.sequence, []).append(name)
-    out = []
-    for family, cases in [*families(records).items(), *steps.items()]:
-        for n in sorted({n for _, n, _ in runs}):
-            places: list[tuple[tuple[float, ...], Choice]] = []
-            for (solver, budget, start), by_case in runs.items():
-                if budget != n or not any(c in by_case for c in cases):
-                    continue
-                residuals = _residuals({c: by_case.get(c) for c in cases})
-                choice = _by_residual(solver, residuals, how=start, iterations=n)
-                places.append(((any((c, solver) in liars for c in cases), -choice.solved), choice))
-            out.append(ranked(family, float(n), _best_of_each(places), RESIDUAL_NOISE))
-    return out
-
-
-def _closest(runs: Iterable[Record], limit: float) -> Record | None:
-    return min((r for r in runs if r.time_min <= limit), key=lambda r: r.relative, default=None)
-
-
-def _score(residual: float) -> float:
-    # What counts in a geometric mean: nothing is better than exact, or worse than doing nothing.
-    return min(max(residual, 1e-17), 1.0) if residual == residual else 1.0
-
-
-def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
-    """For each sequence, by level and by time of a step: which solver and budget, carried or cold; see `over_steps`."""
-    times = tuple(times) or time_budgets(records)
-    found = [
-        over_steps(name, passes, levels_of(records), times) for name, passes in by_sequence(records).items()
-    ]
-    return [a for some, _ in found for a in some], [a for _, some in found for a in some]
-
-
-def over_steps(
-    name: str, passes: Sequence[Pass], levels: Sequence[float], times: Sequence[float]
-) -> tuple[list[Advice], list[Advice]]:
-    """Who brings the steps of these passes to each level, and who comes closest in each time [s] of a step.
-
-    To a level, by those that were asked for it or have a budget: who brings most steps there, then the geometric mean
-    of their times. In a time: who serves most steps, then the residual at the 90th percentile; a step that was not
-    solved or took longer counts 1. A false claim on any step comes last. Steps of several sequences count together.
-    """
-    whole = sum({w.sequence: w.steps for w in passes}.values())
-    ways: dict[tuple[str, str, str], list[Pass]] = defaultdict(list)
-    for w in passes:
-        for start in w.residuals:
-            ways[w.solver, w.asked, start].append(w)
-    by_level: list[Advice] = []
-    by_time: list[Advice] = []
-    for target, timed in [*((x, False) for x in levels), *((t, True) for t in times)]:
-        places: list[tuple[tuple[float, ...], Choice]] = []
-        for (solver, asked, start), some in ways.items():
-            taken = [t for w in some for t in w.times[start]]
-            left = [r for w in some for r in w.residuals[start]]
-            first, wrong = some[0], any(w.wrong[start] for w in some)
-            budget = {
-                "how": f"{asked}, {start}",
-                "iterations": first.max_iter if first.mode == "budget" else 0,
-            }
-            if timed:
-                got = [_score(r) if t <= target else 1.0 for t, r in zip(taken, left, strict=True)]
-                got += [1.0] * (whole - len(got))
-                choice = _by_residual(solver, _steps(got), **budget)
-            elif first.mode == "tol" and first.tol > target:
-                continue
-            else:
-                solved = sum(r <= target for r in left)
-                score = geometric_mean(taken, SHIFT)
-                choice = Choice.of(solver, _steps(taken), solved, score, cases=whole, **budget)
-            places.append(((wrong, -choice.solved), choice))
-        found = ranked(name, target, _best_of_each(places), RESIDUAL_NOISE if timed else NOISE)
-        (by_time if timed else by_level).append(found)
-    return by_level, by_time
-
-
-def _best_of_each(
-    places: Iterable[tuple[tuple[float, ...], Choice]],
-) -> list[tuple[tuple[float, ...], Choice]]:
+def _best_of_each(places: Iterable[Place]) -> list[Place]:
     # The best way of each solver.
-    first: dict[str, tuple[tuple[float, ...], Choice]] = {}
+    first: dict[str, Place] = {}
     for place in sorted(places, key=lambda pair: (pair[0], pair[1].score)):
         first.setdefault(place[1].solver, place)
     return list(first.values())

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.report.tables.groups import DIED, levels_of, pairs
+from lavender.residuals import at_floor
 
 __all__ = ["Claims", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
 
@@ -34,11 +35,13 @@ class Reach:
     message: str
     worst_name: str
     form: str
+    motion: float  # -, relative motion error of the best run; nan where there is none
+    bound: float  # sqrt J, proved bound of it; nan where nothing is proved
 
     @property
     def at_floor(self) -> bool:
         """No better residual can be asked of float64."""
-        return self.best <= 2.0 * self.floor
+        return at_floor(self.best, self.floor)
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,8 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
                 message=last.message,
                 worst_name=last.worst_name,
                 form=last.form,
+                motion=math.nan if best is None or best.motion is None else best.motion,
+                bound=math.nan if best is None or best.bound is None else best.bound,
             )
         )
     return out
@@ -113,7 +118,7 @@ def failures(records: Records) -> list[Record]:
     for r in records:
         if r.turns:
             continue  # the same runs again, in turns
-        missed = r.mode == "tol" and not r.success and not r.relative <= 2.0 * r.floor
+        missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
         if (missed and not proven) or lost or r.contradicted:

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender_ext.newton.solve import WHATS
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender import _sparse as sp
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored

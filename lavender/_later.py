@@ -1,0 +1,35 @@
+"""Parts of SciPy that are loaded when something of them is first used: they would be half of `import lavender`.
+
+`from lavender._later import sparse as sp` stands where one would write `import scipy.sparse as sp`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__all__ = ["issparse", "lapack", "sparse"]
+
+
+class _Later:
+    """A module, imported at its first attribute."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(import_module(self._name), name)
+        setattr(self, name, value)
+        return value
+
+
+if TYPE_CHECKING:
+    from scipy import sparse
+    from scipy.linalg import lapack
+else:
+    sparse, lapack = _Later("scipy.sparse"), _Later("scipy.linalg.lapack")
+
+
+def issparse(value: object) -> bool:
+    """Whether `value` is a sparse array or matrix of SciPy; what cannot be one loads nothing."""
+    return hasattr(value, "tocsr") and bool(sparse.issparse(value))

@@ -1,0 +1,85 @@
+"""What a report says of records, worked out once: its page, the terminal, the summary and a paper show it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from lavender.bench.store import Records
+from lavender.report import tables
+from lavender.report.engine import Contestant
+from lavender.report.moved import speed_levels, working
+from lavender.report.verdict import Verdict, verdict
+
+__all__ = ["Report"]
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """Records, and what is asked of them.
+
+    Parameters
+    ----------
+    given : Records
+        Times are compared within the newest run alone.
+    old : Records, optional
+        An earlier run to compare with.
+    asked : s, optional
+        Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
+    sweeps : int, optional
+        Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
+    engines : sequence of Contestant
+        Answers of the engines that recorded the steps: `lavender.report.engine.contestants`.
+    """
+
+    given: Records
+    old: Records | None = None
+    asked: Sequence[float] = ()
+    sweeps: Sequence[int] = ()
+    engines: Sequence[Contestant] = ()
+
+    @cached_property
+    def every(self) -> Records:
+        """The newest run."""
+        return self.given.latest()
+
+    @cached_property
+    def records(self) -> Records:
+        """The newest run without cases where doing nothing is right."""
+        return working(self.every)
+
+    @cached_property
+    def before(self) -> Records | None:
+        """The newest run of the earlier records."""
+        return None if self.old is None else self.old.latest()
+
+    @cached_property
+    def is_campaign(self) -> bool:
+        """Times were left out on purpose."""
+        return tables.is_campaign(self.records)
+
+    @cached_property
+    def levels(self) -> tuple[float, ...]:
+        """Residuals to reach, loosest first."""
+        return tables.levels_of(self.records)
+
+    @cached_property
+    def speeds(self) -> tuple[float, ...]:
+        """Motion errors to reach [m/s]; empty without motion errors."""
+        return speed_levels(self.records)
+
+    @cached_property
+    def times(self) -> tuple[float, ...]:
+        """Times [s] in which a solver is recommended."""
+        return tuple(self.asked) or tables.time_budgets(self.records)
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """What the whole comes to."""
+        return verdict(self.records, tuple(self.asked), tuple(self.sweeps))
+
+    @cached_property
+    def lines(self) -> list[tables.Line]:
+        """Recommendations by structure and sequence; none of a campaign."""
+        return [] if self.is_campaign else tables.advice(self.records, self.times)
