@@ -84,7 +84,7 @@ class Auto:
         problem, state.log = state.problem, None
         deadline = Deadline(time_limit)
         if max_iter >= ONE_CALL and state.call:
-            made = AUTO.solve(problem, impulse, tol)
+            made = AUTO.solve(problem, impulse, tol, time_limit is not None)
             claim = None if made is None else AUTO.claim(problem, made[1], impulse, made[0].relative)
             if made is not None and claim is not None and claim.iterations <= max_iter:
                 impulse[:] = made[0].impulse

@@ -110,8 +110,11 @@ class Few:
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
 
-    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
-        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, capped: bool = False) -> Any:
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left.
+
+        capped: under a time limit, with no more factors than `call_ends_within` counts.
+        """
         kept = problem.derived
         if not tol > 0.0 or problem.m == 0:
             return None
@@ -129,8 +132,8 @@ class Few:
                 small = prepared(problem)
             if not small or not (self.pivots if small.pivots else self.hands_over):
                 return None
-            found = small.run(impulse, tol, self.hands_over, WARM)
-        if found is None:  # the steps of who solves it the long way need not come twice before
+            found = small.run(impulse, tol, self.hands_over, WARM, capped)
+        if found is None and not capped:  # the steps of who solves it the long way need not come twice before
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found
 

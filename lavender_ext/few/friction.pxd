@@ -150,12 +150,12 @@ cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
 
 
 cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
-    """From where sweeps gave way."""
-    cdef double now
+    """From where sweeps gave way; no more, once there are as many factors as there may be."""
+    cdef double now, cubed = <double>t.s.v.p.n_rows ** 3
     if not begin_newton(t):
         return 1.0 / 0.0
     now = step_newton(t, SHORT)
-    if now > t.o.tol:
+    if now > t.o.tol and t.o.factored + t.said.factorisations * cubed < t.o.most_factored:
         now = sweep_on(t, AGAIN * t.o.most, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, STEPS)

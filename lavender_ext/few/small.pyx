@@ -67,13 +67,13 @@ cdef class Small:
     def __init__(self, Data data, start, Data matrix):
         self.data, self.start, self.matrix = data, start, matrix
 
-    def run(self, impulse, double tol, bint look, double warm):
+    def run(self, impulse, double tol, bint look, double warm, bint capped=False):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
         look: something else comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
         nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
         with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
-        None where `impulse` is the solution.
+        None where `impulse` is the solution. capped: no more factors than `most_factored` counts.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
@@ -90,13 +90,13 @@ cdef class Small:
             if not before <= (warm if self.pivots else 1.0):
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
-        counts = self.solve(own, tol, look)
+        counts = self.solve(own, tol, look, capped)
         if counts is None:
             return None
         found = Judged(self.data, own)
         return (found, counts) if self.pivots or found.relative <= tol else None
 
-    cdef solve(self, own, double tol, bint follow):
+    cdef solve(self, own, double tol, bint follow, bint capped):
         """`own` (m,) N s in place; counts, or None."""
 
 
@@ -144,7 +144,7 @@ cdef class Bounded(Small):
         Small.__init__(self, data, start, matrix)
         self.band, self.linear, self.symmetric, self.pivots = band, linear, symmetric, True
 
-    cdef solve(self, own, double tol, bint follow):
+    cdef solve(self, own, double tol, bint follow, bint capped):
         cdef double[::1] start = own
         cdef view_t v = self.data.view()
         cdef int64_t n = direct_real(&v, self.band)
@@ -392,8 +392,8 @@ cdef class Friction(Small):
             self.size = np.array(size, np.int32).T.copy()
             self.most_factored = SHORT * float(size[0] @ size[0]**2)
 
-    cdef solve(self, own, double tol, bint follow):
-        cdef double most = PATIENT * self.most_factored if self.count > 1 else 1.0 / 0.0
+    cdef solve(self, own, double tol, bint follow, bint capped):
+        cdef double most = self.most_factored if capped else PATIENT * self.most_factored if self.count > 1 else 1.0 / 0.0
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
                              self.most, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
         cdef room_t r = room_t(0, 0, NULL, NULL)
