@@ -1,8 +1,10 @@
-"""The examples and the sources, each loaded once for all tests."""
+"""The examples and the sources, each loaded once for all tests; Python in a process of its own."""
 
 import ast
 import functools
 import importlib.util
+import subprocess
+import sys
 from pathlib import Path
 
 import lavender
@@ -26,3 +28,11 @@ def syntax_of_package():
     """Path to syntax tree of every file of the package."""
     files = sorted(Path(lavender.__file__).parent.rglob("*.py"))
     return {path: ast.parse(path.read_text(encoding="utf-8")) for path in files}
+
+
+def python(*words, status=0, **more):
+    """What became of Python in a process of its own: what crashes or hangs there fails one test alone."""
+    asked = {"capture_output": True, "text": True, "check": False, "cwd": ROOT, "timeout": 1800.0} | more
+    done = subprocess.run([sys.executable, *map(str, words)], **asked)
+    assert done.returncode == status, done.stdout + done.stderr
+    return done

@@ -27,14 +27,13 @@ from lavender_ext.few.many import Gate, solve_first
 from lavender_ext.few.small import Bounded, Friction, Small
 
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
-# Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together,
-# which under the cone law are few.
-ISLAND = {"coulomb": 150, "cone": 12}
+# Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together.
+ISLAND = 150
 SWEPT = 32  # sweeps of a part at most, before its factors
 FACTORED = 0.05  # ns of a multiply-add of factors of parts
 # ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
 # Coulomb's law sooner; and up to which nobody looks at the clock in between.
-FIRST = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
+AT_ONCE = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
 MOST = 1e7
 
 
@@ -84,7 +83,7 @@ def _make(problem: Problem) -> Small | None:
         if bounded:
             return None
         count, label = islands(problem)
-        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND[law]:
+        if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND:
             return None
     reference(problem)
     data, start = problem.metric, problem._start
@@ -92,7 +91,10 @@ def _make(problem: Problem) -> Small | None:
         return None
     if not bounded:
         split = 0 if problem.rows is None else problem.rows.n_joints
-        return Friction(data, start, data if count == 1 else problem.csr_data, split, SWEPT, label, count)
+        # Islands are cut out of the bodies where these have fewer unknowns than rows, else out of A.
+        bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
+        over = data if count == 1 or bodies else problem.csr_data
+        return Friction(data, start, over, split, SWEPT, label, count)
     symmetric = problem.is_symmetric
     band = max(problem.bandwidth) if symmetric else problem.m - 1
     return Bounded(data, start, problem.csr_data, band, law == "linear", symmetric)
@@ -179,6 +181,8 @@ def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
     done, sweeps, restarts, factorisations, driven, count = counts
     where = f" on {count} islands" if count > 1 else ""
     ran = [("anderson" + where, {"sweeps": sweeps, "restarts": restarts})]
+    if not sweeps and factorisations:
+        ran = []
     if factorisations:
         where = f" on {driven} islands" if count > 1 else ""
         ran.append(("newton" + where, {"factorisations": factorisations}))
@@ -221,6 +225,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", gate(FIRST["cone"], FIRST["coulomb"]), True, True)
+AUTO = Few("auto", gate(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
 DIRECT = Few("direct", None, True)
 NEWTON = Few("newton", gate(MOST, MOST), False)

@@ -21,7 +21,7 @@ from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.small import FIRST, prepared, velocities_cost
+from lavender.solvers.small import AT_ONCE, prepared, velocities_cost
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph
@@ -172,7 +172,9 @@ class Structure:
     def goes_first(self) -> bool:
         """It is what the compiled call for few rows does."""
         kernel = self.kernel
-        return kernel is not None and velocities_cost(self.problem, kernel.largest) <= FIRST[self.problem.law]
+        return (
+            kernel is not None and velocities_cost(self.problem, kernel.largest) <= AT_ONCE[self.problem.law]
+        )
 
     @property
     def is_small(self) -> bool:

@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterator
 from math import fsum
 
 import numpy as np
-import scipy.sparse as sp
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._later import sparse as sp
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.lu import sparse_lu

@@ -3,9 +3,8 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.engine.arrays cimport (CAP_CONTACT, CAP_PAIR, N_BODY, N_CACHE_IMPULSE, N_DYNAMIC, N_EXCLUDED, N_FRAME,
-                                         N_HEAD, N_INDEX_ARRAYS, N_JOINT, N_JOINT_REAL, N_JOINT_ROW, N_KEY_ARRAYS,
-                                         N_REAL_ARRAYS, N_SETTINGS, ROWS_PER_CONTACT, bind, engine_t)
+from lavender_ext.engine.arrays cimport (N_CACHE_IMPULSE, N_INDEX_ARRAYS, N_JOINT_REAL, N_KEY_ARRAYS, N_REAL_ARRAYS, bind,
+                                         engine_t)
 
 
 cdef public void lav_engine_lengths(const int32_t* size, int32_t* used) noexcept nogil:
@@ -38,29 +37,24 @@ cdef public void lav_engine_offsets(const int32_t* size, double* real, int32_t* 
         out[N_REAL_ARRAYS + N_INDEX_ARRAYS + k] = <int32_t>(wide[k] - keys)
 
 
-#: Arrays by buffer, in the order of `bind`, with their shapes; None: scratch of a substep.
+#: Arrays by buffer, in the order of `bind`: the shape of one of their entries, or None for scratch of a substep.
 SHAPES = {
     "real": {
-        "setting": "settings", "x": "n 3", "q": "n 4", "v": "n 6", "inv_mass_body": "n", "inertia": "n 3 3",
-        "inv_inertia_body": "n 3 3", "shape": "n 4", "friction": "n", "restitution": "n", "patch": "n",
-        "rot": "frames 3 3", "fat": "n 6", "joint": "kj joint_reals", "joint_error": "mj", "jac": "mj 12",
-        "minv_jac": "mj 12", "joint_impulse": "mj", "inv_mass": "nd", "inv_inertia": "nd 3 3", "v_free": "nd 6",
-        "dv": "nd 6", "shift": "nd 6", "point": "c 3", "gap": "c", "normal": "c 3", "tangent": "nt 3",
-        "arm_a": "c 3", "arm_b": "c 3", "coupling": "nt 5", "swing": "contact_rows 6", "local": "c 6",
-        "cache_impulse": "c cache_reals", "cache_local": "c 6", "push": "pushes", "target": "m", "lower": "mj",
-        "upper": "mj", "b": "m", "d": "m", "step": "m", "compliance": "m", "impulse": "m", "mu": "blocks",
-        "patch_radius": "blocks", "rolling": "rolling_blocks", "cache_roll": "rolling_contacts 3",
+        "setting": (), "x": (3,), "q": (4,), "v": (6,), "inv_mass_body": (), "inertia": (3, 3), "inv_inertia_body": (3, 3),
+        "shape": (4,), "friction": (), "restitution": (), "patch": (), "rot": (3, 3), "fat": (6,), "joint": (N_JOINT_REAL,),
+        "joint_error": (), "jac": (12,), "minv_jac": (12,), "joint_impulse": (), "inv_mass": (), "inv_inertia": (3, 3),
+        "v_free": (6,), "dv": (6,), "shift": (6,), "point": (3,), "gap": (), "normal": (3,), "tangent": (3,), "arm_a": (3,),
+        "arm_b": (3,), "coupling": (5,), "swing": (6,), "local": (6,), "cache_impulse": (N_CACHE_IMPULSE,),
+        "cache_local": (6,), "push": (), "target": (), "lower": (), "upper": (), "b": (), "d": (), "step": (),
+        "compliance": (), "impulse": (), "mu": (), "patch_radius": (), "rolling": (), "cache_roll": (3,),
     },
     "index": {
-        "head": "heads", "kind_of_shape": "n", "dyn": "n", "uneven": "n", "body_of": "nd", "joint_kind": "kj",
-        "joint_motor": "kj", "joint_bodies": "kj 2", "excluded": "excluded 2", "pair": "p 2",
-        "pair_scratch": None, "count": None, "bucket": None, "chain": None, "cell": None, "contact_pair": "c 2",
-        "joint_body": "kj 2", "contact_body": "c 2", "ptr": "block_ends", "kind": "blocks", "order": None,
-        "order_scratch": None,
+        "head": (), "kind_of_shape": (), "dyn": (), "uneven": (), "body_of": (), "joint_kind": (), "joint_motor": (),
+        "joint_bodies": (2,), "excluded": (2,), "pair": (2,), "pair_scratch": None, "count": None, "bucket": None,
+        "chain": None, "cell": None, "contact_pair": (2,), "joint_body": (2,), "contact_body": (2,), "ptr": (), "kind": (),
+        "order": None, "order_scratch": None,
     },
-    "keys": {
-        "key": "c", "cache_key": "c", "color_scratch": None,
-    },
+    "keys": {"key": (), "cache_key": (), "color_scratch": None},
 }
 
 
@@ -83,21 +77,11 @@ def offsets(const int32_t[::1] size):
 
 def views(const int32_t[::1] size, real, index, keys):
     """Array -> writable view of one of the buffers, in its shape; without scratch."""
-    c, kj, mj = size[CAP_CONTACT], size[N_JOINT], size[N_JOINT_ROW]
-    rows, rolls = c * size[ROWS_PER_CONTACT], size[ROWS_PER_CONTACT] > 4
-    known = {
-        "n": size[N_BODY], "nd": size[N_DYNAMIC], "kj": kj, "mj": mj, "c": c, "p": size[CAP_PAIR],
-        "nt": c if size[ROWS_PER_CONTACT] > 1 else 0, "m": mj + rows, "contact_rows": rows, "blocks": kj + c,
-        "settings": N_SETTINGS, "heads": N_HEAD, "joint_reals": N_JOINT_REAL, "cache_reals": N_CACHE_IMPULSE,
-        "block_ends": kj + c + 1, "pushes": mj + c,
-        "rolling_blocks": (kj + c) * rolls, "rolling_contacts": c * rolls, "frames": size[N_FRAME], "excluded": size[N_EXCLUDED],
-    }
     first = offsets(size)
     out = {}
-    for buffer, shapes in zip((real, index, keys), SHAPES.values(), strict=True):
-        for name, text in shapes.items():
-            if text is not None:
-                shape = tuple(known[word] if word in known else int(word) for word in text.split())
-                end = first[name] + int(np.prod(shape, dtype=np.int64))
-                out[name] = buffer[first[name] : end].reshape(shape)
+    for buffer, end, shapes in zip((real, index, keys), lengths(size), SHAPES.values(), strict=True):
+        starts = [first[name] for name in shapes]
+        for (name, shape), start, stop in zip(shapes.items(), starts, [*starts[1:], end], strict=True):
+            if shape is not None:
+                out[name] = buffer[start:stop].reshape(-1, *shape)
     return out

@@ -41,7 +41,8 @@ cdef struct ask_t:
     double tol
     double e0                   # of the whole: E0 / sqrt(n),
     double v0
-    int32_t most                # sweeps
+    int32_t most                # sweeps, an eighth of all,
+    int32_t first               # and before the first factors
     int32_t wide
     int64_t swept               # what was done in all
     int64_t undone
@@ -182,7 +183,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     if s.v.r != NULL:
         rows_velocity(p, s.v.r, t.swept, t.c.v)
     t.said.factorisations = 0
-    now = sweep_on(&t, o.most, True)
+    now = sweep_on(&t, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol:

@@ -4,7 +4,7 @@
                    where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
-Under friction a part is the whole, or each island in its turn, cut out of A. Part i of n, E0_i its error of doing
+Under friction a part is the whole, or each island in its turn, cut out of A or of the bodies. Part i of n, E0_i its error of doing
 nothing, has met its share where
 
     E_i <= tol sqrt((E0_i^2 + E0^2 / n) / 2),   V_i <= tol V0                                              (1)
@@ -23,6 +23,7 @@ import numpy as np
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
@@ -40,6 +41,8 @@ cdef enum:
     SWEEPS = 2                  # that guess the free rows
     ROUNDS = 32                 # of exchanges
     PATH = 8                    # pivots of Lemke's for each row
+    FEW = 12                    # rows of an island that has all of its sweeps before its factors
+    PATIENT = 4                 # times its share of factors (SHORT) that islands may take before the whole is left
     LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
 
 
@@ -182,66 +185,100 @@ cdef class Bounded(Small):
         return l.pivots if t.relative <= tol else -1
 
 
-cdef enum:                      # arrays of an island's
-    OF_ROWS = 7                 # rows: lower, upper, b, d, nu, step, where it starts
-    OF_BLOCKS = 3               # blocks: mu, patch_radius, rolling
+cdef enum:                      # numbers of an island's
+    OF_ROW = 7                  # rows: lower, upper, b, d, nu, step, where it starts
+    OF_BLOCK = 3                # blocks: mu, patch_radius, rolling
+    OF_JOINT = 24               # rows of joints: J, M^-1 J^T
+    OF_TURN = 6                 # rows of contacts: swing
+    OF_CONTACT = 17             # contacts: normal, tangent, arm_a, arm_b, coupling
+    OF_BODY = 10                # bodies: 1/m, I^-1
+    SIZES = 5
 
 
-cdef struct island_t:           # cut out of A; its numbers and whole numbers are one run of bytes each
+cdef struct island_t:           # cut out of A or of the bodies; its numbers and whole numbers are one run of bytes each
     part_t s
     csr_t a
+    rows_t r
     double* numbers
     int32_t* marks
     int64_t n_numbers
     int64_t n_marks
 
 
-cdef inline void lay(island_t* x, double* numbers, int32_t* marks, int32_t m, int32_t k, int32_t nnz) noexcept nogil:
-    """Places of m rows in k blocks with nnz entries, and behind these of the answer."""
+cdef inline double* after(double** at, int64_t n) noexcept nogil:
+    """The next n of them."""
+    cdef double* x = at[0]
+    at[0] = x + n
+    return x
+
+
+cdef inline void lay(island_t* x, double* numbers, int32_t* marks, const int32_t* size, int32_t n) noexcept nogil:
+    """Places of an island of so many (SIZES) rows, blocks, entries, rows of joints and joints on n bodies, and of its answer.
+
+    n < 0: over A, without joints.
+    """
     cdef blocks_t* p = &x.s.v.p
+    cdef rows_t* r = &x.r
+    cdef int32_t m = size[0], k = size[1], nnz = size[2], mj = size[3], c = k - size[4]
     x.numbers, x.marks = numbers, marks
-    x.n_numbers, x.n_marks = OF_ROWS * <int64_t>m + OF_BLOCKS * k + nnz, 2 * k + m + 2 + nnz
     p.n_blocks, p.n_rows = k, m
-    p.lower, p.upper, p.b, p.d = numbers, numbers + m, numbers + 2 * m, numbers + 3 * m
-    p.nu, p.step = numbers + 4 * m, numbers + 5 * m
-    x.s.lam = numbers + 6 * m
-    numbers += OF_ROWS * m
-    p.mu, p.patch_radius, p.rolling = numbers, numbers + k, numbers + 2 * k
-    x.a.data = numbers + OF_BLOCKS * k
-    x.s.answer = x.numbers + x.n_numbers
+    p.lower, p.upper, p.b = after(&numbers, m), after(&numbers, m), after(&numbers, m)
+    p.d, p.nu, p.step, x.s.lam = after(&numbers, m), after(&numbers, m), after(&numbers, m), after(&numbers, m)
+    p.mu, p.patch_radius, p.rolling = after(&numbers, k), after(&numbers, k), after(&numbers, k)
     p.ptr, p.kind = marks, marks + k + 1
-    x.a.indptr, x.a.indices = marks + 2 * k + 1, marks + 2 * k + m + 2
-    x.s.v.a, x.s.v.r, x.s.v.g = &x.a, NULL, NULL
+    marks += 2 * k + 1
+    x.s.v.a = x.s.v.r = x.s.v.g = NULL
+    if n < 0:
+        x.a.data, x.a.indptr, x.a.indices = after(&numbers, nnz), marks, marks + m + 1
+        marks += m + 1 + nnz
+        x.s.v.a = &x.a
+    else:
+        r.n_bodies, r.n_joints, r.n_contacts = n, size[4], c
+        r.jac, r.minv_jac = after(&numbers, 12 * mj), after(&numbers, 12 * mj)
+        r.normal, r.tangent = after(&numbers, 3 * c), after(&numbers, 3 * c)
+        r.arm_a, r.arm_b, r.coupling = after(&numbers, 3 * c), after(&numbers, 3 * c), after(&numbers, 5 * c)
+        r.swing, r.compliance = after(&numbers, OF_TURN * (m - mj)), after(&numbers, m)
+        r.inv_mass, r.inv_inertia = after(&numbers, n), after(&numbers, 9 * n)
+        r.joint_body, r.contact_body = marks, marks + 2 * size[4]
+        marks += 2 * k
+        x.s.v.r = r
+    x.n_numbers, x.n_marks = numbers - x.numbers, marks - x.marks
+    x.s.answer = numbers
 
 
-cdef inline void cut(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block, const double* lam,
-                     int32_t* place) noexcept nogil:
+cdef inline void cut(island_t* x, const blocks_t* p, const int32_t* block, const double* lam, int32_t* place) noexcept nogil:
     """The blocks `block` of the whole; place (rows of the whole) gets the numbers that its rows have here."""
-    cdef const double* of_row[OF_ROWS]
-    cdef const double* of_block[OF_BLOCKS]
+    cdef const double* of_row[OF_ROW]
+    cdef const double* of_block[OF_BLOCK]
     cdef blocks_t* own = &x.s.v.p
-    cdef int32_t i, j, k, q, row, at = 0, n = 0
+    cdef int32_t i, j, k, q, row, n = 0
     cdef int32_t* ptr = <int32_t*>own.ptr
-    cdef int32_t* indptr = <int32_t*>x.a.indptr
     of_row[0], of_row[1], of_row[2], of_row[3], of_row[4], of_row[5] = p.lower, p.upper, p.b, p.d, p.nu, p.step
     of_row[6] = lam
     of_block[0], of_block[1], of_block[2] = p.mu, p.patch_radius, p.rolling
     own.law = p.law
-    ptr[0] = indptr[0] = 0
+    ptr[0] = 0
     for k in range(own.n_blocks):
         i = block[k]
         (<int32_t*>own.kind)[k] = p.kind[i]
-        for q in range(OF_BLOCKS):
-            x.numbers[OF_ROWS * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
+        for q in range(OF_BLOCK):
+            x.numbers[OF_ROW * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
         j = p.ptr[i]
-        for q in range(OF_ROWS):
+        for q in range(OF_ROW):
             memcpy(x.numbers + q * own.n_rows + n, of_row[q] + j, (p.ptr[i + 1] - j) * sizeof(double))
         for row in range(j, p.ptr[i + 1]):
             place[row] = n
             n += 1
         ptr[k + 1] = n
-    n = 0
-    for k in range(own.n_blocks):
+
+
+cdef inline void cut_matrix(island_t* x, const blocks_t* p, const csr_t* a, const int32_t* block,
+                            const int32_t* place) noexcept nogil:
+    """Their entries of A."""
+    cdef int32_t i, k, q, row, at = 0, n = 0
+    cdef int32_t* indptr = <int32_t*>x.a.indptr
+    indptr[0] = 0
+    for k in range(x.s.v.p.n_blocks):
         i = block[k]
         for row in range(p.ptr[i], p.ptr[i + 1]):
             for q in range(a.indptr[row], a.indptr[row + 1]):
@@ -252,10 +289,72 @@ cdef inline void cut(island_t* x, const blocks_t* p, const csr_t* a, const int32
             indptr[n] = at
 
 
+cdef inline const int32_t* bodies_at(const rows_t* r, int32_t i) noexcept nogil:
+    """The two of block i."""
+    return r.joint_body + 2 * i if i < r.n_joints else r.contact_body + 2 * (i - r.n_joints)
+
+
+cdef inline int32_t number_bodies(const rows_t* r, const int32_t* block, int32_t k, int32_t* number, int32_t* body) noexcept nogil:
+    """Those of k blocks, in the order in which they come, into `body`, their places there into `number`; how many."""
+    cdef const int32_t* two
+    cdef int32_t i, side, n = 0
+    for i in range(k):
+        two = bodies_at(r, block[i])
+        for side in range(2):
+            if two[side] >= 0 and number[two[side]] < 0:
+                number[two[side]] = n
+                body[n] = two[side]
+                n += 1
+    return n
+
+
+cdef inline void pick(const double* to, int64_t n, const double* x, int64_t i) noexcept nogil:
+    """n numbers of the i-th."""
+    memcpy(<void*>to, x + n * i, n * sizeof(double))
+
+
+cdef inline void cut_rows(island_t* x, const blocks_t* p, const rows_t* r, const int32_t* block, const int32_t* number,
+                          const int32_t* body) noexcept nogil:
+    """Their joints, contacts and bodies."""
+    cdef const blocks_t* own = &x.s.v.p
+    cdef const rows_t* y = &x.r
+    cdef const int32_t* two
+    cdef int32_t i, j, k, m, c, n, first = own.ptr[y.n_joints]
+    cdef int32_t* pair
+    for k in range(own.n_blocks):
+        i, m, n = block[k], own.ptr[k], own.ptr[k + 1] - own.ptr[k]
+        j, two, pair = p.ptr[i], bodies_at(r, i), <int32_t*>bodies_at(y, k)
+        for c in range(2):
+            pair[c] = number[two[c]] if two[c] >= 0 else -1
+        memcpy(<void*>(y.compliance + m), r.compliance + j, n * sizeof(double))
+        if k < y.n_joints:
+            memcpy(<void*>(y.jac + 12 * m), r.jac + 12 * j, 12 * n * sizeof(double))
+            memcpy(<void*>(y.minv_jac + 12 * m), r.minv_jac + 12 * j, 12 * n * sizeof(double))
+            continue
+        memcpy(<void*>(y.swing + OF_TURN * (m - first)), r.swing + OF_TURN * (j - p.ptr[r.n_joints]),
+               OF_TURN * n * sizeof(double))
+        c, i = k - y.n_joints, i - r.n_joints
+        pick(y.normal + 3 * c, 3, r.normal, i)
+        pick(y.tangent + 3 * c, 3, r.tangent, i)
+        pick(y.arm_a + 3 * c, 3, r.arm_a, i)
+        pick(y.arm_b + 3 * c, 3, r.arm_b, i)
+        pick(y.coupling + 5 * c, 5, r.coupling, i)
+    for k in range(y.n_bodies):
+        pick(y.inv_mass + k, 1, r.inv_mass, body[k])
+        pick(y.inv_inertia + 9 * k, 9, r.inv_inertia, body[k])
+
+
 cdef inline bint same(const island_t* x, const island_t* y) noexcept nogil:
     return (x.n_numbers == y.n_numbers and x.n_marks == y.n_marks
             and memcmp(x.numbers, y.numbers, x.n_numbers * sizeof(double)) == 0
             and memcmp(x.marks, y.marks, x.n_marks * sizeof(int32_t)) == 0)
+
+
+cdef inline int32_t swept_before(const blocks_t* p, int32_t most) noexcept nogil:
+    """Sweeps of an island before its factors: of many rows these pay sooner, and at once under the cone's law."""
+    if p.n_rows <= FEW:
+        return most
+    return 0 if p.law == CONE else most * FEW // p.n_rows
 
 
 cdef class Friction(Small):
@@ -284,16 +383,19 @@ cdef class Friction(Small):
         self.most_factored = SHORT * <double>data.blocks.n_rows ** 3
         if count > 1:
             ptr = np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)
-            entries = np.asarray(<int32_t[:data.blocks.n_rows + 1]>matrix.csr.indptr)[ptr]
+            rows, joint = np.diff(ptr), np.arange(len(label)) < (matrix.rows.n_joints if matrix.factored else 0)
+            entries = 0 * rows
+            if not matrix.factored:
+                entries = np.diff(np.asarray(<int32_t[:data.blocks.n_rows + 1]>matrix.csr.indptr)[ptr])
             self.block = np.argsort(label, kind="stable").astype(np.int32)
-            size = [np.bincount(label, of, count) for of in (np.diff(ptr), np.ones(len(label)), np.diff(entries))]
-            self.size = np.array(size, np.int32)
+            size = [np.bincount(label, of, count) for of in (rows, 1 + 0 * rows, entries, joint * rows, joint)]
+            self.size = np.array(size, np.int32).T.copy()
             self.most_factored = SHORT * float(size[0] @ size[0]**2)
 
     cdef solve(self, own, double tol, bint follow):
-        cdef double most = self.most_factored if self.count > 1 else 1.0 / 0.0
+        cdef double most = PATIENT * self.most_factored if self.count > 1 else 1.0 / 0.0
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
-                             has_wide(), 0, 0, 0, 0.0, most, 0, 0)
+                             self.most, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
         cdef room_t r = room_t(0, 0, NULL, NULL)
         try:
             good = self.whole(own, &o, &r) if self.count == 1 else self.islands(own, &o, &r)
@@ -324,44 +426,59 @@ cdef class Friction(Small):
 
     cdef bint islands(self, double[::1] own, ask_t* o, room_t* r) except -1:
         cdef const blocks_t* p = &self.matrix.blocks
+        cdef const rows_t* rows = &self.matrix.rows
+        cdef bint over_bodies = self.matrix.factored
         cdef const int32_t[::1] block = self.block, prepared_at
-        cdef const int32_t[:, ::1] size = self.size     # of each: rows, blocks, entries
+        cdef const int32_t[:, ::1] size = self.size     # SIZES of each
         cdef const double[::1] prepared
-        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks
+        cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
+        cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks, number, body
         cdef double[::1] numbers, work
-        cdef int32_t i, j, q, m, k, first = 0
-        cdef int64_t swept, unheard = 0
+        cdef int32_t i, j, q, m, k, n = -1, first = 0
+        cdef int64_t swept, read, unheard = 0
         cdef double factored
         cdef island_t two[2]
         cdef island_t* x
         cdef island_t* last
         cdef bint good = True
-        m, k, q = self.size.max(axis=1)
-        cdef int64_t each = (OF_ROWS + 1) * <int64_t>m + OF_BLOCKS * k + q, whole = 2 * k + m + 2 + q
-        numbers, marks, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(work_of(m, 0))
+        m, k, q, _, _ = self.size.max(axis=0)
+        cdef int64_t each = (OF_ROW + 1) * <int64_t>m + OF_BLOCK * k + q, whole = 4 * k + m + 2 + q
+        if over_bodies:
+            n = min(2 * k, n_bodies)
+            each += (OF_JOINT + OF_TURN + 1) * <int64_t>m + OF_CONTACT * k + OF_BODY * n
+        numbers, marks, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(work_of(m, max(n, 0)))
         at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
+        number, body = np.full(n_bodies + 1, -1, np.int32), np.empty(n + 2, np.int32)
         if self.prepared is not None:
             prepared_at, prepared = self.at, self.prepared
         two[1].n_numbers = -1
         with nogil:
             for i in range(self.count):
                 x, last = &two[i % 2], &two[1 - i % 2]
-                m, k = size[0, i], size[1, i]
-                lay(x, &numbers[(i % 2) * each], &marks[(i % 2) * whole], m, k, size[2, i])
-                cut(x, p, &self.matrix.csr, &block[first], &own[0], &place[0])
+                m, k = size[i, 0], size[i, 1]
+                if over_bodies:
+                    n = number_bodies(rows, &block[first], k, &number[0], &body[0])
+                lay(x, &numbers[(i % 2) * each], &marks[(i % 2) * whole], &size[i, 0], n)
+                cut(x, p, &block[first], &own[0], &place[0])
+                if over_bodies:
+                    cut_rows(x, p, rows, &block[first], &number[0], &body[0])
+                else:
+                    cut_matrix(x, p, &self.matrix.csr, &block[first], &place[0])
                 if same(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
-                    x.s.split, x.s.at, x.s.prepared = 0, NULL, NULL
+                    x.s.split, x.s.at, x.s.prepared = size[i, 4], NULL, NULL
                     if p.law == CONE:
                         for j in range(k):
                             at[j] = prepared_at[block[first + j]]
                         x.s.at, x.s.prepared = &at[0], &prepared[0]
+                    o.first = swept_before(&x.s.v.p, o.most)
                     swept, factored = o.swept, o.factored
                     good = solve_part(&x.s, o, r, &work[0], &order[0])
                     if not good:
                         break
-                    unheard += <int64_t>(o.factored - factored) + size[2, i] * (o.swept - swept)
+                    read = OF_JOINT * m if over_bodies else size[i, 2]
+                    unheard += <int64_t>(o.factored - factored) + read * (o.swept - swept)
                     if unheard > LISTEN:
                         unheard = 0
                         with gil:

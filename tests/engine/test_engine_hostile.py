@@ -3,13 +3,12 @@
 import _thread
 import os
 import signal
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from worked import python
 
 import lavender as lv
 from lavender.engine import check
@@ -19,18 +18,6 @@ from lavender.registry import specs
 
 HERE = Path(__file__).resolve().parent.parent
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
-
-
-def run_apart(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """A process of its own: what crashes or hangs there fails this test alone."""
-    return subprocess.run(
-        [sys.executable, "-X", "faulthandler", "-c", code, *arguments],
-        capture_output=True,
-        text=True,
-        timeout=600.0,  # what hangs; nothing takes so long on a loaded machine
-        check=False,
-        cwd=HERE,
-    )
 
 
 def trajectory(sim, steps):
@@ -130,8 +117,7 @@ assert open(sys.argv[1], "rb").read() == old
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="no limit on the size of a file here")
 def test_a_full_disk_leaves_the_old_snapshot(tmp_path):
     path = tmp_path / "state"
-    done = run_apart(FULL_DISK, str(path))
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", FULL_DISK, str(path))
     lv.Simulation("stack").load(path)
     assert [p.name for p in tmp_path.iterdir()] == ["state"]
 
@@ -170,10 +156,8 @@ assert sim.steps == 180, sim.steps
 def test_threads_that_share_a_simulation_take_turns():
     # Without turns: a crash in eight of eight. restore(snapshot()) of one thread may undo a step of another
     # between the two calls, so the bits are compared where each thread only steps.
-    done = run_apart(SHARED.replace("if i % 10 == 0:", "if False:"))
-    assert done.returncode == 0, done.stderr
-    done = run_apart(SHARED.replace("assert sim.steps == 180, sim.steps", ""))
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", SHARED.replace("if i % 10 == 0:", "if False:"))
+    python("-X", "faulthandler", "-c", SHARED.replace("assert sim.steps == 180, sim.steps", ""))
 
 
 def test_steps_of_threads_are_the_steps_of_one():
@@ -368,8 +352,7 @@ else:
 
 def test_one_real_signal_ends_the_step():
     # the budget of one substep alone would take hours
-    done = run_apart(SIGNAL)
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", SIGNAL)
 
 
 def test_the_state_is_copied_only_where_a_registered_solver_may_stop_half_way(monkeypatch):
@@ -413,8 +396,7 @@ for n in (60, 65_537, 92_682):
 def test_coincident_spheres_touch_or_are_refused():
     # 65,537 of them are 2,147,516,416 pairs, 92,682 are 2^32 and some: beyond int32, then beyond uint32
     pytest.importorskip("resource")
-    done = run_apart(COINCIDENT)
-    assert done.returncode == 0, done.stderr
+    python("-X", "faulthandler", "-c", COINCIDENT)
 
 
 def test_room_for_more_contacts_than_memory_is_refused():

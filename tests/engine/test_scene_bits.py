@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from worked import python
 
 from lavender.errors import InputError
 from lavender.scene import arithmetic
@@ -28,12 +27,7 @@ print(json.dumps({name: hashed(name) for name in SCENES}))
 
 
 def starts(**environment):
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", STARTS],
-        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, **environment},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return json.loads(python("-W", "ignore", "-c", STARTS, env={**os.environ, **environment}).stdout)
 
 
 def test_every_scene_starts_from_the_same_bits_without_the_instructions_of_new_processors():

@@ -1,7 +1,6 @@
 """The fuzzer sees what it is there to see: its judge, its watchdog, its findings; and what it found stays mended."""
 
 import json
-import subprocess
 import sys
 from itertools import product
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from random_problems import random_lcp
+from worked import python
 
 import lavender as lv
 
@@ -112,11 +112,8 @@ def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypat
     monkeypatch.setenv("LAVENDER_FUZZ_FOUND", str(tmp_path / "found"))
     monkeypatch.setenv("LAVENDER_FUZZ_SCRIPT", str(script))
     limit = "1" if how == "hang" else "60"
-    done = subprocess.run(
-        [sys.executable, str(script), "30", "--seed", "1", "--kinds", "promise", "--most", "3", "--limit", limit],
-        capture_output=True, text=True, timeout=1800, check=False,
-    )  # fmt: skip
-    assert done.returncode == 1, done.stdout + done.stderr
+    asked = ["--seed", "1", "--kinds", "promise", "--most", "3", "--limit", limit]
+    done = python(script, "30", *asked, status=1)
     assert (tmp_path / "found").exists(), done.stdout + done.stderr
     found = list((tmp_path / "found").iterdir())
     assert {path.name.split("-")[1] for path in found} == {how}

@@ -11,7 +11,6 @@ import lavender as lv
 from benchmarks.kernels import lattice_pile
 from lavender.engine.layout import HEAD
 from lavender.solvers import layout
-from lavender.solvers.sequential_impulses import SequentialImpulses
 
 CASES = [
     ("stack", {}),
@@ -109,30 +108,6 @@ def test_packed_contacts_of_boxes_thrown_together(mixed):
     assert not mixed or rows_of >= {1, 3, 4, 5, 6}
 
 
-@pytest.mark.parametrize("order", ["given", "reverse", "bottom_up", "colored", "symmetric", "random"])
-@pytest.mark.parametrize("name", ["pyramid", "bridge", "pile"])
-def test_the_solver_packs_long_runs_and_changes_no_bit(name, order):
-    sim = lv.Simulation(lv.Scene(name))
-    for _ in range(30):
-        sim.step()
-    problem = sim.constraint_problem()
-    solver = SequentialImpulses(order=order)
-    whole, single = np.zeros(problem.m), np.zeros(problem.m)
-    solver.run(solver.prepare(problem), whole, 40, 0.0)
-    state = solver.prepare(problem)
-    for _ in range(40):  # too short a run for packing
-        solver.run(state, single, 1, 0.0)
-    np.testing.assert_array_equal(whole.view(np.uint8), single.view(np.uint8))
-    # an order may mix joints and contacts
-    mixed = np.random.default_rng(2).permutation(problem.n_blocks).astype(np.int32)
-    a = lv.solve(problem, "sequential_impulses", tol=0, max_iter=40, order=mixed).impulse
-    state, b = SequentialImpulses(order=mixed).prepare(problem), np.zeros(problem.m)
-    b[:] = problem.start() if problem.guess is None else problem.guess
-    for _ in range(40):
-        SequentialImpulses(order=mixed).run(state, b, 1, 0.0)
-    np.testing.assert_array_equal(a.view(np.uint8), b.view(np.uint8))
-
-
 FIXED = ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"]
 
 
@@ -165,6 +140,15 @@ def in_chunks(problem, order, counts, start, *, packs=True):
     return lam, state.velocity[:-2], state.packing
 
 
+def packed(problem, order, counts, start):
+    """How the contacts were packed in those runs, which have the bits of one contact after the other."""
+    lam, v, packing = in_chunks(problem, order, counts, start)
+    one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
+    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+    return packing
+
+
 @pytest.mark.parametrize("order", FIXED)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
@@ -176,10 +160,7 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
     warm = np.abs(rng.normal(size=problem.m)) * 0.05
     for start in (problem.start(), warm):
         for counts in ([1], [7], [40], [1, 2, 16, 1, 3, 9, 2], [*rng.integers(1, 20, 6).tolist(), 30]):
-            lam, v, packing = in_chunks(problem, order, counts, start)
-            one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
-            np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-            np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+            packing = packed(problem, order, counts, start)
             assert (packing is not None) == (problem.n_blocks >= 24)
             if packing is not None:
                 pairs, _ = packing.shape
@@ -197,12 +178,7 @@ def test_a_tall_stack_is_packed_over_sweeps(order):
     for _ in range(5):
         sim.step()
     problem = sim.constraint_problem()
-    counts = [8, 1, 2, 3, 5, 30, 4]
-    lam, v, packing = in_chunks(problem, order, counts, problem.start())
-    one, v_one, _ = in_chunks(problem, order, counts, problem.start(), packs=False)
-    assert packing.shape[1] > 1
-    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+    assert packed(problem, order, [8, 1, 2, 3, 5, 30, 4], problem.start()).shape[1] > 1
 
 
 def test_a_joint_on_top_of_a_tower_leaves_it_packed():
@@ -217,9 +193,7 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
         for _ in range(5):
             sim.step()
         problem = sim.constraint_problem()
-        lam, _, packing = in_chunks(problem, "given", [20], problem.start())
-        np.testing.assert_array_equal(lam, in_chunks(problem, "given", [20], problem.start(), packs=False)[0])
-        shapes.append(packing.shape)
+        shapes.append(packed(problem, "given", [20], problem.start()).shape)
     assert shapes[1][0] <= shapes[0][0] + 2
     assert shapes[1][1] >= shapes[0][1]
 
@@ -228,11 +202,8 @@ def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
     pile = lattice_pile(5_000, shuffle=True)
     for least in (layout.LARGE, 1):
         monkeypatch.setattr(layout, "LARGE", least)
-        for counts, packed in (([8], False), ([16, 3], True)):
-            lam, _, packing = in_chunks(pile, "reverse", counts, pile.start())
-            one = in_chunks(pile, "reverse", counts, pile.start(), packs=False)[0]
-            np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-            assert (packing.shape[0] > 0) == packed
+        for counts, packs in (([8], False), ([16, 3], True)):
+            assert (packed(pile, "reverse", counts, pile.start()).shape[0] > 0) == packs
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-6])
@@ -270,18 +241,8 @@ def test_a_new_problem_takes_over_the_room():
 def test_contacts_of_one_body_are_not_packed():
     problem = tangled(1, 40, 0, bodies=3)
     ground = np.stack([np.full(40, -1), np.zeros(40)], axis=1).astype(np.int32)
-    rows = problem.rows
-    alone = lv.Problem.from_rows(
-        lv.Rows(
-            rows.inv_mass, rows.inv_inertia, rows.v_free, normal=rows.normal, tangent=rows.tangent,
-            arm_a=rows.arm_a, arm_b=rows.arm_b, contact_body=ground,
-        ),
-        mu=0.5, tangents=2,
-    )  # fmt: skip
-    lam, _, packing = in_chunks(alone, "given", [20], alone.start())
-    assert packing.shape == (0, 0)
-    one = in_chunks(alone, "given", [20], alone.start(), packs=False)[0]
-    np.testing.assert_array_equal(lam, one)
+    alone = lv.Problem.from_rows(replace(problem.rows, contact_body=ground), mu=0.5)
+    assert packed(alone, "given", [20], alone.start()).shape == (0, 0)
 
 
 @pytest.mark.parametrize("order", ["symmetric", "random"])

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 import warnings
 from dataclasses import fields, replace
 
@@ -21,6 +19,7 @@ from random_problems import (
     seeds,
     touching,
 )
+from worked import python
 
 import lavender as lv
 
@@ -316,7 +315,7 @@ def test_ctrl_c_from_a_real_signal(tmp_path):
         "assert solution.status is lv.Status.INTERRUPTED, solution\n"
         "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
+    python("-c", code)
 
 
 # -- what is given stays the giver's ---------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
-import subprocess
 import sys
 import sysconfig
 import threading
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from random_problems import FORMS, random_contact_problem, random_lcp
+from worked import python
 
 import lavender as lv
 import lavender_ext
@@ -73,10 +73,7 @@ for name in {modules}:
     importlib.import_module(name)
     assert not sys._is_gil_enabled(), name
 """
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    python("-W", "error", "-c", code)
 
 
 @pytest.fixture

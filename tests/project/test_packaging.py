@@ -7,12 +7,11 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
-from worked import syntax_of_package
+from worked import python, syntax_of_package
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -25,12 +24,6 @@ import lavender_ext
 ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
 MODULES = sorted(".".join(path.relative_to(KERNELS).with_suffix("").parts) for path in KERNELS.rglob("*.pyx"))
-
-
-def python(code):
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_version_is_the_installed_one_and_in_the_changelog():
@@ -46,11 +39,7 @@ def test_what_is_not_built_says_what_to_do(tmp_path):
         Path(lavender.__file__).parent, tmp_path / "lavender", ignore=shutil.ignore_patterns("*.wasm")
     )
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", "import lavender"],
-        capture_output=True, text=True, check=False, cwd=tmp_path, env=env,
-    )  # fmt: skip
-    assert done.returncode == 1
+    done = python("-S", "-c", "import lavender", status=1, cwd=tmp_path, env=env)
     last = done.stderr.strip().splitlines()[-1]
     assert last.startswith("ImportError: the kernels in ")
     assert "pip install -e ." in last
@@ -61,11 +50,8 @@ def test_a_folder_of_the_same_name_beside_does_not_hide_the_package(tmp_path):
     if "__editable___lavender" in "".join(getattr(f, "__module__", "") for f in sys.meta_path):
         pytest.skip("installed before setup.py asked for a .pth file: pip install -e . again")
     (tmp_path / "lavender").mkdir()
-    done = subprocess.run(
-        [sys.executable, "-c", "import lavender; print(lavender.__version__)"],
-        capture_output=True, text=True, check=False, cwd=tmp_path,
-    )  # fmt: skip
-    assert done.stdout.strip() == lavender.__version__, done.stderr
+    done = python("-c", "import lavender; print(lavender.__version__)", cwd=tmp_path)
+    assert done.stdout.strip() == lavender.__version__
 
 
 def test_no_text_offers_the_package_of_someone_else():
@@ -94,8 +80,7 @@ def test_no_text_offers_the_package_of_someone_else():
 
 def test_links_of_the_metadata_stand_below_an_address_that_is_known_and_nowhere_else(tmp_path):
     def metadata(**env):
-        run = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
-        subprocess.run(run, capture_output=True, check=True, cwd=ROOT, env={**os.environ, **env})
+        python("setup.py", "-q", "egg_info", "--egg-base", tmp_path, env={**os.environ, **env})
         (info,) = tmp_path.glob("*/PKG-INFO")
         head, _, description = info.read_text(encoding="utf-8").partition("\n\n")
         return dict(re.findall(r"^Project-URL: (\w+), (.+)$", head, re.MULTILINE)), description
@@ -170,7 +155,7 @@ first = list(sys.modules)
 lv.known(), lv.available(law="lcp")
 print(json.dumps([first, list(sys.modules)]))
 """
-    first, listed = map(set, json.loads(python(code)))
+    first, listed = map(set, json.loads(python("-c", code).stdout))
     assert len(first) < 300
     assert first & {"scipy", "importlib.metadata"} == set()
     heavy = {
@@ -197,7 +182,7 @@ for solver in ("auto", "pgs"):
     assert lv.solve(problem, solver).success
 print("scipy" in sys.modules)
 """
-    assert python(code).strip() == "False"
+    assert python("-c", code).stdout.strip() == "False"
 
 
 def test_public_names_are_there():
@@ -245,12 +230,7 @@ def test_every_import_is_declared():
 
 @pytest.mark.parametrize("name", ["report", "test"])
 def test_readme_command_is_one_line_from_a_fresh_clone(name):
-    done = subprocess.run(
-        [sys.executable, str(ROOT / ".ci" / "readme_command.py"), name],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python(ROOT / ".ci" / "readme_command.py", name)
     assert done.stdout.startswith("python3 -m venv .venv && .venv/bin/pip install ")
     assert done.stdout.count("\n") == 1
 

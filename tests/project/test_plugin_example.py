@@ -3,11 +3,10 @@
 import importlib.util
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from worked import python
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 FOLDER = ROOT / "examples" / "plugin"
@@ -45,27 +44,10 @@ def environment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plugin")
     shutil.copytree(FOLDER, folder / "source", ignore=shutil.ignore_patterns("build", "*.egg-info"))
     installed = folder / "installed"
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-index",
-        "--no-build-isolation",
-        "--no-deps",
-    ]
-    run([*command, "--target", str(installed), str(folder / "source")], os.environ)
+    alone = ("--quiet", "--no-index", "--no-build-isolation", "--no-deps")
+    python("-m", "pip", "install", *alone, "--target", installed, folder / "source")
     paths = [str(installed), str(ROOT), os.environ.get("PYTHONPATH", "")]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))}
-
-
-def run(command, environment):
-    done = subprocess.run(
-        command, env=dict(environment), capture_output=True, text=True, check=False, cwd=ROOT
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
 
 
 def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment, tmp_path):
@@ -74,22 +56,14 @@ def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[lavender.solvers]\nnonsense = no_such_module:SPEC\n")
     path = os.pathsep.join([str(tmp_path), environment["PYTHONPATH"]])
-    assert "apgd" in run([sys.executable, "-c", SOLVES], {**environment, "PYTHONPATH": path})
+    assert "apgd" in python("-c", SOLVES, env={**environment, "PYTHONPATH": path}).stdout
 
 
 def test_keeps_the_contract_of_every_solver(environment):
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "tests/solvers/test_contract.py",
-        "-k",
-        "apgd",
-    ]
-    report = run(command, environment)
+    contract = "tests/solvers/test_contract.py"
+    report = python(
+        "-m", "pytest", "-q", "-p", "no:cacheprovider", contract, "-k", "apgd", env=environment
+    ).stdout
     # Each general property of a resumable solver that takes a start; the spec declares no order, seed or threads.
     assert "passed" in report
     assert int(report.split(" passed")[0].split()[-1]) >= 15
