@@ -6,8 +6,6 @@ nothing by themselves. What is not installed is named; where another is faster, 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -19,55 +17,14 @@ from benchmarks.peers import race
 from benchmarks.peers.contest import Result, ours
 from benchmarks.peers.engines import Step
 from benchmarks.peers.problems import PROBLEMS, problems
-from benchmarks.peers.tables import (
-    Comparison,
-    compare,
-    losses,
-    mean_table,
-    over_ours,
-    ratio,
-    solver_table,
-    step_table,
-)
+from benchmarks.peers.tables import engines_table, solvers_tables
 from lavender.bench import machine
 from lavender.bench.peers.adapters import contestants
-from lavender.report.table import markdown
 
-__all__ = ["command", "engines_table", "solvers_tables"]
+__all__ = ["command"]
 
 PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
             "quadprog", "scs")  # fmt: skip
-
-
-def solvers_tables(results: Sequence[Result]) -> list[str]:
-    """Every problem and error, geometric means, losses, and what nobody reached."""
-    compared = compare(results)
-    reached = [c for c in compared if math.isfinite(min(c.our_time, c.peer_time))]
-    lost = losses(compared)
-    lines = [*markdown(solver_table(reached)), "", *markdown(mean_table(results))]
-    lines += ["", f"Lost: {len(lost)} of {sum(math.isfinite(c.peer_time) for c in compared)}."]
-    lines += [f"- {c.problem} at {c.target:.0e}: {c.peer} against {c.ours}, {ratio(c.ratio)}" for c in lost]
-    alone = [c for c in reached if math.isinf(c.peer_time)]
-    if alone:
-        lines += ["", "Reached by no peer: " + _list(alone)]
-    nobody = [c for c in compared if c not in reached]
-    if nobody:
-        lines += ["", "Reached by nobody: " + _list(nobody)]
-    return lines
-
-
-def _list(compared: Sequence[Comparison]) -> str:
-    return ", ".join(f"{c.problem} at {c.target:.0e}" for c in compared) + "."
-
-
-def engines_table(steps: Sequence[Step]) -> list[str]:
-    """Each engine beside ours in the same mode, then where ours takes longer."""
-    lines = markdown(step_table(steps))
-    lost = sorted(((over_ours(s, steps), s) for s in steps if over_ours(s, steps) < 1.0), key=lambda x: x[0])
-    if lost:
-        lines += ["", f"Lost: {len(lost)}."]
-        lines += [f"- {s.scene}: {s.engine}, {over:.2f} of the time of ours" for over, s in lost]
-    return lines
 
 
 @click.command("peers")
@@ -134,7 +91,7 @@ def command(
         for scene in filter(None, scenes.split(",")):
             note(scene)
             steps += peer_engines.measure_scene(scene, sweeps)
-        click.echo("\n".join(engines_table(steps)) + "\n")
+        click.echo(engines_table(steps) + "\n")
     if solvers:
         rounds_of_all = race.race(
             problems(files or PROBLEMS, note),
@@ -149,5 +106,5 @@ def command(
                 keep()  # an interruption costs one problem
         except KeyboardInterrupt:
             note("stopped")
-        click.echo("\n".join(solvers_tables(found)))
+        click.echo(solvers_tables(found))
     keep()

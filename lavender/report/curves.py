@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
@@ -258,33 +259,36 @@ def profile_figure(profile: tables.Profile) -> Figure:
     )  # fmt: skip
 
 
+Group = Mapping[str, tuple[Figure, ...]]  # by what they are of
+
+
 @dataclass(frozen=True)
 class Figures:
     """Every figure of a report, in the places where its page shows them; those without a curve are left out."""
 
-    cases: Mapping[str, tuple[Figure, ...]]  # error against time, residual against iterations
-    families: Mapping[str, Figure]
-    profiles: Mapping[str, tuple[Figure, ...]]  # by problem class, one for each level
-    sequences: Mapping[str, tuple[Figure, ...]]
-    over: tuple[Figure, ...] = ()  # the one over all cases
-    moved: Figures | None = (
-        None  # the same with motion errors [m/s] in place of residuals, where they are known
-    )
+    over: Group = field(default_factory=dict)  # "all": the one over all cases
+    families: Group = field(default_factory=dict)
+    profiles: Group = field(default_factory=dict)  # by law, one for each level
+    sequences: Group = field(default_factory=dict)
+    cases: Group = field(default_factory=dict)  # error against time, residual against iterations
+    moved: Figures | None = None  # the same with motion errors [m/s] in place of residuals, where known
+
+    @property
+    def places(self) -> dict[str, Group]:
+        """The groups by their names."""
+        return {name: group for name, group in vars(self).items() if name != "moved"}
 
     def __iter__(self) -> Iterator[Figure]:
-        yield from self.over
-        yield from self.families.values()
-        for group in (self.profiles, self.sequences, self.cases):
+        for group in self.places.values():
             for some in group.values():
                 yield from some
-        if self.moved is not None:
-            yield from self.moved
+        yield from self.moved or ()
 
 
 def figures(records: Records) -> Figures:
     """The figures of the records, by residual and, where it is known, by motion error; none of a campaign."""
     if tables.is_campaign(records):
-        return Figures({}, {}, {}, {})
+        return Figures()
     found = _figures(records)
     return replace(found, moved=_by_motion(_figures(by_speed(records)))) if speed_levels(records) else found
 
@@ -300,12 +304,11 @@ def _by_motion(found: Figures) -> Figures:
             y_title=figure.y_title.replace("relative residual [-]", "motion error [m/s]"),
         )
 
-    def group(some: Mapping[str, tuple[Figure, ...]]) -> dict[str, tuple[Figure, ...]]:
-        return {name: tuple(map(told, own)) for name, own in some.items()}
-
-    families = {name: told(figure) for name, figure in found.families.items()}
-    over = tuple(map(told, found.over))
-    return Figures(group(found.cases), families, group(found.profiles), group(found.sequences), over)
+    groups: dict[str, Any] = {
+        place: {name: tuple(map(told, own)) for name, own in group.items()}
+        for place, group in found.places.items()
+    }
+    return Figures(**groups)
 
 
 def _figures(records: Records) -> Figures:
@@ -313,17 +316,19 @@ def _figures(records: Records) -> Figures:
     for r in records:
         if r.step < 0:
             parts.setdefault(r.case, Records(records.runs)).add(r)
-    families = {f: family_figure(records, f, cs) for f, cs in tables.families(records).items() if len(cs) > 1}
     profiles: dict[str, list[Figure]] = {}
     for profile in tables.profiles(records):
         if profile.cases > 1:
             profiles.setdefault(profile.law, []).append(profile_figure(profile))
+    shared = {family: cases for family, cases in tables.families(records).items() if len(cases) > 1}
+    families = {family: _drawn(family_figure(records, family, cases)) for family, cases in shared.items()}
+    over = _drawn(overall_figure(records))
     return Figures(
-        {c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
-        {f: figure for f, figure in families.items() if figure.curves},
-        {law: _drawn(*some) for law, some in profiles.items()},
-        {name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
-        _drawn(overall_figure(records)),
+        over={"all": over} if over else {},
+        families={family: some for family, some in families.items() if some},
+        profiles={law: _drawn(*some) for law, some in profiles.items()},
+        sequences={name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
+        cases={c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},
     )
 
 

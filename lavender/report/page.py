@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.report import contents, tables
-from lavender.report.curves import Figure, Figures
+from lavender.report.curves import Figures
 from lavender.report.findings import Report
 from lavender.report.moved import robustness_by_speed
 from lavender.report.svg import svg
@@ -65,7 +65,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
     spreads = sorted(tables.spreads(records), key=lambda s: -s.factor)
     return {
         **_drawings(records, figures, found),
-        **_cases(records, figures, levels),
+        **_cases(records, levels),
         **_changes(report.before, records),
         "verdict": found,
         "others": _others(report),
@@ -117,11 +117,8 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
     # Under the heading of a case or a family its name says nothing new.
-    titles = {f.name: "" for some in figures.cases.values() for f in some} | {
-        f.name: "" for f in figures.families.values()
-    }
-    titles |= {f"motion {name}": "" for name in titles}
-    other = figures.moved or Figures({}, {}, {}, {})
+    own = [f.name for group in (figures.cases, figures.families) for some in group.values() for f in some]
+    titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
         "drawings": {  # each escapes what it holds
             file_name(figure.name): svg(figure, number, found.leaders, titles.get(figure.name))
@@ -130,24 +127,24 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
         "solvers": names,
         "number": number,
         "by_motion": figures.moved is not None,
-        "over": _keys(figures.over),
-        "moved_over": _keys(other.over),
-        "family_figures": {f: file_name(figure.name) for f, figure in figures.families.items()},
-        "moved_families": {f: file_name(figure.name) for f, figure in other.families.items()},
-        "profiles": {law: _keys(some) for law, some in figures.profiles.items()},
-        "moved_profiles": {law: _keys(some) for law, some in other.profiles.items()},
-        "sequence_figures": {name: _keys(some) for name, some in figures.sequences.items()},
-        "moved_sequences": {name: _keys(some) for name, some in other.sequences.items()},
+        "drawn": _keys(figures),
+        "moved_drawn": _keys(figures.moved or Figures()),
     }
 
 
-def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[str, Any]:
+def _keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
+    return {
+        place: {name: [file_name(figure.name) for figure in some] for name, some in group.items()}
+        for place, group in figures.places.items()
+    }
+
+
+def _cases(records: Records, levels: Sequence[float]) -> dict[str, Any]:
     """Each case with its solvers; none of a campaign: of thousands the tables over all of them say it."""
     by_case: dict[str, list[tables.Reach]] = {}
     if not tables.is_campaign(records):
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
-    moved_figures = {} if figures.moved is None else figures.moved.cases
     level = levels[len(levels) // 2]
     fastest = {name: _fastest(rows, level) for name, rows in by_case.items()}
     stored = any(math.isfinite(x.stored) for x in records.cases.values())
@@ -155,8 +152,6 @@ def _cases(records: Records, figures: Figures, levels: Sequence[float]) -> dict[
         {
             "info": records.cases[name],
             "reaches": contents.reach_table(rows, levels).without("case"),
-            "figures": _keys(figures.cases.get(name, ())),
-            "moved": _keys(moved_figures.get(name, ())),
         }
         for name, rows in by_case.items()
     ]
@@ -217,7 +212,3 @@ def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
     """Who brings a case to the level first, from a cold start, with claims that hold."""
     honest = [r for r in rows if r.start == "cold" and not r.contradicted and math.isfinite(r.times[level])]
     return min(honest, key=lambda r: r.times[level], default=None)
-
-
-def _keys(some: Iterable[Figure]) -> list[str]:
-    return [file_name(figure.name) for figure in some]

@@ -55,7 +55,7 @@ def write_paper(report: Report, folder: str | Path) -> Path:
         raise InputError("a paper's figures need runs with times; these records have none")
     folder = Path(folder)
     drawn = figures(found)
-    some = [_leading(figure, report.verdict.leaders) for figure in drawn.over]
+    some = [_leading(figure, report.verdict.leaders) for figure in drawn.over.get("all", ())]
     some += [
         figure for group in (drawn.profiles, drawn.sequences) for own in group.values() for figure in own
     ]

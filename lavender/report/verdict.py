@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lavender.bench.line import c_of
@@ -40,15 +40,8 @@ class Verdict:
         return " ".join(self.sentences)
 
 
-@dataclass(frozen=True)
-class _Scale:
-    """What a level is of: a residual, or metres per second of motion error."""
-
-    reached: Callable[[float], str]  # "to 1e-6"
-    tol: Callable[[str, float], float]  # to ask a solver for, so that it reaches a level
-
-
-BY_RESIDUAL = _Scale(lambda x: f"to {level_name(x)}", lambda solver, x: x)
+def _until(speed: float) -> str:
+    return f"until no body is wrong by more than {speed_name(speed)}"
 
 
 def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Verdict:
@@ -61,17 +54,10 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     if tables.is_campaign(records) or not len(records):
         return Verdict((), (), ())
     newest = next(reversed(list(records.runs.values())), None)
-    speeds = speed_levels(records)
-    scale = BY_RESIDUAL
-    if speeds:
-        moving = by_speed(records)
-        scale = _Scale(
-            lambda x: f"until no body is wrong by more than {speed_name(x)}",
-            lambda solver, x: _tolerance(moving, solver, x),
-        )
-        if newest is not None and newest.plan.get("speed_levels"):
-            return _by_advice(moving, scale)
     plan = {} if newest is None else newest.plan
+    speeds = speed_levels(records)
+    if speeds and plan.get("speed_levels"):
+        return _by_advice(by_speed(records))
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
     parts = [_of(records, subject, times, sweeps) for subject in subjects(records, times)]
@@ -79,7 +65,7 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     if speeds and parts:
         best = subjects(by_speed(records))[0].best.best
         if best is not None:
-            reached = scale.reached(speeds[len(speeds) // 2])
+            reached = _until(speeds[len(speeds) // 2])
             sentences.append(f"By motion error {best.solver}: {seconds(best.score)} {reached}.")
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
     return Verdict(tuple(sentences), tuple(c for part in parts for c in part.code), tuple(leaders)[:3])
@@ -90,12 +76,12 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
     level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     in_turns = lines(records, subject.way)
     race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
-    what = _what(records, subject)
+    what, reached = _what(records, subject), f"to {level_name(level)}"
     if race is None or not race.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
-        return Verdict((f"Nobody brings any of {what} {BY_RESIDUAL.reached(level)}.",), (), near)
+        return Verdict((f"Nobody brings any of {what} {reached}.",), (), near)
     final, first = race.ranking[0]
-    said = [_head(first, level, what, BY_RESIDUAL), *_sure(race)]
+    said = [_head(first, reached, what), *_sure(race)]
     code = _told(records, final, first.score, WAYS[subject.way])
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
@@ -138,8 +124,8 @@ def _what(records: Records, subject: Subject) -> str:
     return f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
 
 
-def _head(first: Choice, level: float, what: str, scale: _Scale) -> str:
-    said = f"Use {first.solver}: {seconds(first.score)} {scale.reached(level)} on {what}"
+def _head(first: Choice, reached: str, what: str) -> str:
+    said = f"Use {first.solver}: {seconds(first.score)} {reached} on {what}"
     if first.solved < first.cases:
         said += f", of which it brings {first.solved} of {first.cases} there"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
@@ -200,19 +186,19 @@ def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     return [*before, f"{last}  # {timed}", *in_c]
 
 
-def _by_advice(records: Records, scale: _Scale) -> Verdict:
+def _by_advice(records: Records) -> Verdict:
     """By motion error: lines are not timed for it."""
     subject = subjects(records)[0]
-    best, what = subject.best, _what(records, subject)
+    best, what, reached = subject.best, _what(records, subject), _until(subject.best.target)
     leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
     first = best.best
     if first is None:
-        return Verdict((f"Nobody brings any of {what} {scale.reached(best.target)}.",), (), leaders)
+        return Verdict((f"Nobody brings any of {what} {reached}.",), (), leaders)
     ties = (f"As good within noise: {', '.join(best.ties)}.",) if best.ties else ()
-    tol = scale.tol(first.solver, best.target)
+    tol = _tolerance(records, first.solver, best.target)
     asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
     code = f'lv.solve(problem, "{first.solver}", {asked})'
-    return Verdict((_head(first, best.target, what, scale), *ties), (code,), leaders)
+    return Verdict((_head(first, reached, what), *ties), (code,), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:

@@ -49,16 +49,8 @@ __all__ = [
     "why_not",
 ]
 
-#: Modules of lavender_ext that the page and the checks use.
-MODULES = (
-    "engine.arrays",
-    "core.order",
-    "core.problem",
-    "engine.substep",
-    "host.memory",
-    "judge.measure",
-    "sweep.serial",
-)
+#: Modules of lavender_ext that the page uses.
+MODULES = ("engine.arrays", "engine.substep", "host.memory")
 #: Largest size of a finished module [bytes].
 LARGEST = 200_000
 

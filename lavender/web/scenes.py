@@ -11,7 +11,6 @@ from lavender.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTI
 from lavender.engine.snapshot import Snapshot
 from lavender.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
-from lavender_ext.host import memory
 
 __all__ = ["PAGE", "PRESETS", "describe", "layout", "page_scenes"]
 
@@ -142,16 +141,15 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
 
 
 def layout() -> dict[str, Any]:
-    """Structs, arrays and numbered entries, as this build of the kernels has them.
+    """Arrays and numbered entries, as this build of the kernels has them.
 
     Returns
     -------
     dict
-        structs: name -> field -> type ("i4", "f8", "p" for a pointer); arrays: buffer -> names in order; size, head,
-        setting, joint, joint_kinds: name -> place, number; orders: name -> number; steppers: name -> what it writes.
+        arrays: buffer -> names in order; size, head, setting, joint, joint_kinds: name -> place, number; orders:
+        name -> number; steppers: name -> what it writes.
     """
     return {
-        "structs": memory.STRUCTS,
         "arrays": {buffer: tuple(names) for buffer, names in SHAPES.items()},
         "size": {**SIZE, "cap_pair": CAP_PAIR, "cap_contact": CAP_CONTACT},
         "head": HEAD,

@@ -1,36 +1,15 @@
-"""The judge for Python: thin entries of judge/measure.pxd, and the same pass exported by name."""
-from libc.stdint cimport int32_t
+"""The judge for Python: thin entries of judge/measure.pxd."""
 from libc.string cimport memcmp
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
-from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport (csr_judge, csr_slack, general_slack, judge_nothing, judge_view, relative_of,
-                                         rows_judge, rows_slack, scratch_of)
+from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing, judge_view, relative_of, rows_slack,
+                                         scratch_of)
 from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
-
-
-cdef public void lav_judge_csr(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
-                               int32_t floor, score_t* out) noexcept nogil:
-    """Slack w (m), error e (m) and the sums of lam (m) for a problem given by A."""
-    csr_judge(p, a, lam, w, e, floor, out)
-
-
-cdef public void lav_judge_rows(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
-                                int32_t floor, score_t* out) noexcept nogil:
-    """The same for a factored problem; v (n_bodies, 6), with the floor (n_bodies, 12), is scratch."""
-    rows_judge(p, r, lam, w, e, v, floor, out)
-
-
-cdef public void lav_rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
-    """v = M^-1 J^T lam (n_bodies, 6), from which sweeps over bodies start."""
-    rows_velocity(p, r, lam, v)
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):

@@ -142,7 +142,7 @@ cdef struct context_t:          # what a sweep needs besides lam
 
 
 cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps, order as in lav_pgs_sweeps; counts how often a block fell back."""
+    """n sweeps, order as in sweep/serial.pyx; counts how often a block fell back."""
     cdef context_t* c = <context_t*>context
     cdef const blocks_t* p = c.blocks
     cdef int32_t s, q, i

@@ -24,29 +24,9 @@ from lavender_ext.sweep.packed cimport MOST, move_impulses, pack_order, packed_t
 from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
 
 
-cdef public void lav_pgs_sweeps(const blocks_t* p, const csr_t* a, double* lam, int32_t* order, int32_t split, int32_t mode,
-                                uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (1); order (k) is advanced before each, within order[:split] and order[split:] apart;
-    `first_sweep` says that none came before."""
-    cdef int32_t s, i
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for i in range(p.n_blocks):
-            relax_csr_block(p, a, order[i], lam)
-
-
-cdef public void lav_pgs_rows_in_order(const blocks_t* p, const csr_t* a, double* lam, int32_t n) noexcept nogil:
-    """(1) where every block is one row and the order is as given: the same bits, without the look-ups."""
-    cdef int32_t _s, i
-    for _s in range(n):
-        for i in range(p.n_rows):
-            lam[i] = relax_row(lam[i], csr_dot(a, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
-
-
 cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,
                                     int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (2); v (n_bodies, 6)."""
+    """n sweeps of (2), order as in next_order; v (n_bodies, 6)."""
     cdef int32_t s, i
     for s in range(n):
         advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
@@ -89,26 +69,67 @@ cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, do
     return 1
 
 
-cdef public void lav_sor_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, int32_t* order,
-                                int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
+cdef struct context_t:          # what a sweep needs besides lam
+    const blocks_t* blocks
+    const csr_t* csr
+    const rows_t* rows
+    const generalized_t* general        # NULL where A is swept
+    double omega
+    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses; (nv) u
+    int32_t* order
+    int32_t split
+    int32_t mode
+    uint64_t* rng
+    packing_t* packing          # NULL: one block after the other
+
+
+cdef inline void next_order(context_t* c, int32_t first_sweep) noexcept nogil:
+    """Advance order (k) within order[:split] and order[split:] apart; `first_sweep` says that none came before."""
+    advance_order(c.mode, first_sweep, c.order, 0, c.split, c.rng)
+    advance_order(c.mode, first_sweep, c.order, c.split, c.blocks.n_blocks, c.rng)
+
+
+cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1); over J and M u (nv) = Y^T lam is in scratch."""
+    cdef context_t* c = <context_t*>context
+    cdef const blocks_t* p = c.blocks
+    cdef int32_t s, i
+    for s in range(n):
+        if c.order == NULL:                             # every block is one row, as it stands: without the look-ups
+            for i in range(p.n_rows):
+                lam[i] = relax_row(lam[i], csr_dot(c.csr, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
+            continue
+        next_order(c, first_sweep and s == 0)
+        if c.general == NULL:
+            for i in range(p.n_blocks):
+                relax_csr_block(p, c.csr, c.order[i], lam)
+        else:
+            for i in range(p.n_blocks):
+                relax_general_block(p, c.general, c.order[i], lam, c.scratch)
+
+
+cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n sweeps of (4) over free rows."""
+    cdef context_t* c = <context_t*>context
+    cdef const blocks_t* p = c.blocks
     cdef int32_t s, i, q
     for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
+        next_order(c, first_sweep and s == 0)
         for i in range(p.n_blocks):
-            for q in range(p.ptr[order[i]], p.ptr[order[i] + 1]):
-                lam[q] = lam[q] - omega * p.step[q] * (csr_dot(a, q, lam) - p.b[q])
+            for q in range(p.ptr[c.order[i]], p.ptr[c.order[i] + 1]):
+                lam[q] = lam[q] - c.omega * p.step[q] * (csr_dot(c.csr, q, lam) - p.b[q])
 
 
-cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double omega, double* lam, double* w,
-                                   int32_t n) noexcept nogil:
-    """n sweeps of (3); w (m) is scratch."""
+cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (3); scratch (m) holds w."""
+    cdef context_t* c = <context_t*>context
+    cdef const blocks_t* p = c.blocks
+    cdef double* w = c.scratch
     cdef int32_t _s, i, j, q, nt, end
-    cdef double bound
+    cdef double bound, omega = c.omega
     for _s in range(n):
         for i in range(p.n_rows):
-            w[i] = csr_dot(a, i, lam) - p.b[i]
+            w[i] = csr_dot(c.csr, i, lam) - p.b[i]
         for i in range(p.n_blocks):
             j = p.ptr[i]
             end = p.ptr[i + 1]
@@ -128,47 +149,6 @@ cdef public void lav_jacobi_sweeps(const blocks_t* p, const csr_t* a, double ome
             if p.kind[i] == CONTACT_ROLLING:
                 q = end - 2
                 relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
-
-
-cdef struct context_t:          # what a sweep needs besides lam
-    const blocks_t* blocks
-    const csr_t* csr
-    const rows_t* rows
-    const generalized_t* general        # NULL where A is swept
-    double omega
-    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses; (nv) u
-    int32_t* order
-    int32_t split
-    int32_t mode
-    uint64_t* rng
-    packing_t* packing          # NULL: one block after the other
-
-
-cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (1); over J and M u (nv) = Y^T lam is in scratch."""
-    cdef context_t* c = <context_t*>context
-    cdef int32_t s, i
-    if c.general == NULL and c.order == NULL:
-        lav_pgs_rows_in_order(c.blocks, c.csr, lam, n)
-        return
-    if c.general == NULL:
-        lav_pgs_sweeps(c.blocks, c.csr, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
-        return
-    for s in range(n):
-        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
-        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, c.blocks.n_blocks, c.rng)
-        for i in range(c.blocks.n_blocks):
-            relax_general_block(c.blocks, c.general, c.order[i], lam, c.scratch)
-
-
-cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    cdef context_t* c = <context_t*>context
-    lav_sor_sweeps(c.blocks, c.csr, c.omega, lam, c.order, c.split, c.mode, c.rng, first_sweep, n)
-
-
-cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    cdef context_t* c = <context_t*>context
-    lav_jacobi_sweeps(c.blocks, c.csr, c.omega, lam, c.scratch, n)
 
 
 cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:

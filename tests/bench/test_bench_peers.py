@@ -14,7 +14,7 @@ from click.testing import CliRunner
 import lavender as lv
 from benchmarks.peers import engines, race
 from benchmarks.peers import tables as comparison
-from benchmarks.peers.command import command, engines_table, solvers_tables
+from benchmarks.peers.command import command
 from benchmarks.peers.contest import Result, ours
 from benchmarks.peers.problems import problems
 from lavender import suite
@@ -148,13 +148,13 @@ def test_ratios_means_and_losses():
     assert by["big", 1e-6].scratch == 3.0
     assert by["small", 1e-3].ratio == 3.0 and by["small", 1e-3].peer == "daqp"
     assert math.isinf(by["small", 1e-9].ratio)
-    means = {(m.which, m.target): m for m in comparison.geometric_means(results_by_hand())}
+    means = {(m.which, m.target): m for m in comparison.means(results_by_hand())}
     assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
     assert means["cases, smaller", 1e-3].auto == pytest.approx(4.0)
     assert means["cases, smaller", 1e-9].compared == 0 and math.isnan(means["cases, smaller", 1e-9].ours)
     # SciPy's factorisations are peers of the last group alone.
     more = [*results_by_hand(), Result("big", 2000, "linear", "scipy banded", True, [(1.0, 1e-15)])]
-    means = {(m.which, m.target): m for m in comparison.geometric_means(more)}
+    means = {(m.which, m.target): m for m in comparison.means(more)}
     assert means["cases, 1000 rows and more", 1e-6].ours == pytest.approx(0.2)
     assert means["all, SciPy too, 1000 rows and more", 1e-6].ours == pytest.approx(2.0)
     assert not any(which.startswith("exported") for which, _ in means)
@@ -163,7 +163,7 @@ def test_ratios_means_and_losses():
         ("small", 1e-3),
         ("small", 1e-6),
     ]
-    text = "\n".join(solvers_tables(results_by_hand()))
+    text = comparison.solvers_tables(results_by_hand())
     assert "Lost: 3 of 6." in text
     assert "- small at 1e-09: daqp against -, only the peer" in text
 
@@ -204,7 +204,7 @@ def test_engines_step_the_same_scene():
         assert 24 <= s.contacts <= 40
         assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
         assert math.isnan(s.relative) == ("pybullet" in s.engine)
-    text = "\n".join(engines_table(steps)).splitlines()
+    text = comparison.engines_table(steps).splitlines()
     lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
     assert len(text) == 2 + len(steps) + (2 + len(lost) if lost else 0)
     assert all(any(f"- stack6: {s.engine}," in line for line in text) for s in lost)
@@ -233,7 +233,7 @@ def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
     monkeypatch.setattr(engines, "SETTLE_LIMIT", 0.0)
     steps = engines.measure_scene("stack6", engines=["lavender"], rounds=1)
     assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
-    assert "did not settle" in engines_table(steps)[2]
+    assert "did not settle" in comparison.engines_table(steps).splitlines()[2]
 
 
 def test_command(tmp_path):

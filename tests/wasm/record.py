@@ -1,4 +1,4 @@
-"""Record natively what WebAssembly is to repeat: scenes step by step, and problems sweep by sweep.
+"""Record natively what WebAssembly is to repeat: scenes step by step; and the problems of the parity table.
 
     python tests/wasm/record.py FOLDER
 
@@ -18,7 +18,6 @@ from newton_steps import NewtonSteps
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
-from lavender.ordering import block_order
 from lavender.web.scenes import describe, layout
 
 STEPS = 600
@@ -142,54 +141,6 @@ def record_newton(writer, name, parameters, changes):
     }
 
 
-def record_problem(writer, problem, sweeps, order, seed):
-    """Data, derived numbers, impulses after `sweeps` sweeps, and what the judge says of them."""
-    solver = "pgs" if problem.rows is None else "sequential_impulses"
-    order_options = {"seed": seed} if order == "random" else {}
-    start = problem.start() if problem.guess is None else problem.guess
-    found = lv.solve(problem, solver, tol=0, max_iter=sweeps, impulse=start, order=order, **order_options)
-    o, c = block_order(problem, order, **order_options), problem.cones
-    ints = {"ptr": c.ptr, "kind": c.kind, "order": o.blocks}
-    reals = {"lower": c.lower, "upper": c.upper, "mu": c.mu, "patch_radius": c.patch_radius}
-    reals |= {"b": problem.b, "start": start}
-    if problem.rows is None:
-        a = problem.csr
-        ints |= {"indptr": a.indptr, "indices": a.indices}
-        reals |= {"data": a.data}
-    else:
-        r = problem.rows
-        ints |= {"joint_body": r.joint_body, "contact_body": r.contact_body}
-        for key in ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia"):
-            reals[key] = getattr(r, key)
-        reals["compliance"] = problem.compliance
-    expected = {"d": problem.d, "nu": problem.data.nu, "step": problem.data.step, "impulse": found.impulse}
-    expected |= {"slack": found.slack, "error": found.residual.error}
-    judged = found.residual
-    return {
-        "name": f"{problem.name}, {solver}, {order}, {sweeps} sweeps",
-        "counts": {
-            "blocks": problem.n_blocks,
-            "rows": problem.m,
-            "bodies": 0 if problem.rows is None else problem.rows.n_bodies,
-            "joints": 0 if problem.rows is None else problem.rows.n_joints,
-            "contacts": 0 if problem.rows is None else problem.rows.n_contacts,
-        },
-        "law": 1 if problem.friction == "cone" else 0,
-        "factored": problem.rows is not None,
-        "split": o.split,
-        "mode": o.mode,
-        "seed": str(int(o.rng[0])),
-        "sweeps": sweeps,
-        "single_rows": problem.n_blocks == problem.m and not np.any(c.kind),
-        "ints": {key: writer.put(value, "<i4") for key, value in ints.items()},
-        "reals": {key: writer.put(value, "<f8") for key, value in reals.items()},
-        "expected": {key: writer.put(value, "<f8") for key, value in expected.items()},
-        "energy": judged.energy,
-        "velocity": judged.velocity,
-        "worst": judged.worst_row,
-    }
-
-
 def problems():
     """Linear, boxed, with contacts in two and three dimensions, with spin, factored, recorded from scenes."""
     for seed in range(40):
@@ -214,20 +165,11 @@ def record(folder, steps=STEPS):
     writer = Writer()
     scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
     newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
-    found = []
-    for i, problem in enumerate(problems()):
-        for sweeps, order in (
-            (1, "given"),
-            (7, ("symmetric", "random", "reverse", "colored")[i % 4]),
-            (40, "given"),
-        ):
-            found.append(record_problem(writer, problem, sweeps, order, seed=i))
     contents = {
         "layout": layout(),
         "body_arrays": BODY_ARRAYS,
         "scenes": scenes,
         "newton": newton,
-        "problems": found,
     }
     path = Path(folder) / "recording.json"
     path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")

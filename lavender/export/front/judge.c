@@ -64,7 +64,7 @@ static void change_of(lav_solver *s, const double *x, double *v) {
     return;
   }
 #endif
-  k_rows_velocity(&s->p, &s->r, x, v);
+  core_velocity_rows_velocity(&s->p, &s->r, x, v);
 }
 
 /* A x into out (m), what compliance adds into soft: 1/2 x.A x is an energy [J]; v: scratch of change_of. */

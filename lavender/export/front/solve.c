@@ -43,18 +43,6 @@ static void carry(lav_solver *s) {
 
 /* -- methods ---------------------------------------------------------------------------------------------------------- */
 
-static void pgs_step(void *context, double *lam, int32_t first, int32_t n) {
-  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
-#ifndef LAV_SWEEPS_ONLY
-  if (c->general) {
-    sweep_serial_pgs_step(context, lam, first, n);
-    return;
-  }
-#endif
-  if (!c->order) k_pgs_rows_in_order(c->blocks, c->csr, lam, n);
-  else k_pgs_sweeps(c->blocks, c->csr, lam, c->order, c->split, c->mode, c->rng, first, n);
-}
-
 static void impulse_step(void *context, double *lam, int32_t first, int32_t n) {
   struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
   k_impulse_sweeps(c->blocks, c->rows, lam, c->scratch, c->order, c->split, c->mode, c->rng, first, n);
@@ -72,7 +60,7 @@ static int32_t prepare_sweeps(lav_solver *s) {
   s->swept.rng = &s->rng;
   s->swept.packing = NULL;
   s->context = &s->swept;
-  s->step = s->options.method == LAV_PGS ? pgs_step : sweep_serial_sor_step;
+  s->step = s->options.method == LAV_PGS ? sweep_serial_pgs_step : sweep_serial_sor_step;
   if (s->options.method == LAV_SOR || s->options.method == LAV_GAUSS_SEIDEL) s->swept.order = s->order;
   if (s->options.method == LAV_JACOBI) {
     double most = 0.0, sum;
@@ -140,7 +128,7 @@ static void form_velocity(lav_solver *s) {
     return;
   }
 #endif
-  k_rows_velocity(&s->p, &s->r, s->impulse, s->v);
+  core_velocity_rows_velocity(&s->p, &s->r, s->impulse, s->v);
 }
 
 #ifndef LAV_SWEEPS_ONLY
