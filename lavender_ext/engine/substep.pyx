@@ -238,7 +238,7 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
 
 cdef int32_t finish(engine_t* e) noexcept nogil:
     cdef int32_t i, shifted, unsolved
-    cdef const double* by = e.shift if e.head[H_STEPPER] == SOFT_STEP else NULL if e.head[H_STEPPER] == XPBD else e.dv
+    cdef const double* by = e.dv
     cdef double* out = e.setting + S_OUT
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
@@ -246,6 +246,10 @@ cdef int32_t finish(engine_t* e) noexcept nogil:
     out[3] = e.head[H_MATCHES]
     for i in range(e.size[N_JOINT_ROW]):
         e.joint_impulse[i] = e.impulse[i]
+    if e.head[H_STEPPER] == SOFT_STEP:
+        by = e.shift
+    elif e.head[H_STEPPER] == XPBD:
+        by = NULL
     unsolved = unsolved_body(e)
     store_contacts(e)
     shifted = project_positions(e)
