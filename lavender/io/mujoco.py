@@ -300,7 +300,8 @@ def _before(model: Any, data: Any) -> FloatArray:
     gap, size = export.motion_gap(parent, bodies, axis, spatial, data.qvel)
     if gap < 0.0:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
-    if gap <= SUMMED * size:
+    unfilled = not np.any(spatial) and np.any(data.efc_vel)  # by a copy
+    if gap <= SUMMED * size or unfilled:
         return data.qvel
     v, known = np.array(data.qvel), True
     for body in np.unique(bodies):

@@ -459,6 +459,9 @@ def test_a_jacobian_that_did_not_make_the_data_is_refused(factor, stepped, movin
 def test_vectors_that_a_copy_did_not_fill_tell_nothing_of_the_jacobian():
     model, data = state()
     right = lv.io.from_mujoco(model, data)
+    data.cvel[:] = 0.0
+    assert lv.io.from_mujoco(model, data) == right
+    data.cdof[:] = 0.0
     data.efc_vel[:] = data.efc_b[:] = 0.0
     data.qfrc_constraint[:] = 0.0
     assert lv.io.from_mujoco(model, data) == right
