@@ -28,6 +28,7 @@ cdef struct lemke_t:
     dictionary_t d
     direct_t* t                 # the rows: what is judged, and the exchanges at the end of a path
     int32_t* row                # row of each place; of a cap the place that it is for
+    int32_t* exchanged          # places whose w and s have exchanged their parts
     int32_t bounded             # places: so many bounded rows, then
     int32_t caps                # of those with two bounds one more, then free rows that no pivot reached,
     int32_t split               # second halves of these, then free rows that were eliminated

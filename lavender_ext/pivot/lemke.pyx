@@ -16,7 +16,7 @@ Bounded rows become (1), scaled to unit diagonal:
     lower bound alone   lambda = lower + s              upper bound alone   lambda = upper - s, w -> -w
     both bounds         lambda = lower + s, a row more: upper - lower - s >= 0 complementary to v >= 0,
                         w + v >= 0 complementary to s
-    free                eliminated by a pivot of its own; what none reaches is split, lambda = s+ - s-
+    free                eliminated by a pivot of its own or with another row; what none reaches is split, lambda = s+ - s-
     fixed               a constant
 
 A path ends at z = 0, a solution, or on a ray. Its sides are where the exchanges of direct.pyx begin, which solve the
@@ -216,6 +216,8 @@ cdef inline void standard_form(lemke_t* l) noexcept nogil:
             l.row[k] = i
             k += 1
     d.n = d.rows = k
+    for j in range(most_rows(p)):
+        l.exchanged[j] = 0
     for j in range(k):
         row = d.t + j * d.width
         for i in range(k + 2):
@@ -242,16 +244,23 @@ cdef inline void standard_form(lemke_t* l) noexcept nogil:
     every_w_basic(d)
 
 
-cdef inline void swap_places(lemke_t* l, int32_t i, int32_t j) noexcept nogil:
-    cdef dictionary_t* d = &l.d
+cdef inline void swap_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
     cdef double* x = d.t + i * d.width
     cdef double* y = d.t + j * d.width
     cdef double old
-    cdef int32_t k, row = l.row[i]
+    cdef int32_t k
     for k in range(d.n + 2):
         old = x[k]
         x[k] = y[k]
         y[k] = old
+
+
+cdef inline void swap_places(lemke_t* l, int32_t i, int32_t j) noexcept nogil:
+    cdef dictionary_t* d = &l.d
+    cdef double* x
+    cdef double old
+    cdef int32_t k, row = l.row[i]
+    swap_rows(d, i, j)
     for k in range(d.rows):
         x = d.t + k * d.width
         old = x[i]
@@ -261,34 +270,75 @@ cdef inline void swap_places(lemke_t* l, int32_t i, int32_t j) noexcept nogil:
     l.row[j] = row
 
 
+cdef inline double largest(const dictionary_t* d, int32_t i) noexcept nogil:
+    # of row i of M
+    cdef int32_t j
+    cdef double size = 0.0
+    for j in range(d.n):
+        if fabs(d.t[i * d.width + j]) > size:
+            size = fabs(d.t[i * d.width + j])
+    return size
+
+
+cdef inline int32_t free_pivot(const lemke_t* l, int32_t end, int32_t* one) noexcept nogil:
+    """Of free rows before `end` the one, and the variable of another, whose entry is largest beside the row; or -1."""
+    cdef const dictionary_t* d = &l.d
+    cdef int32_t i, j, first = l.bounded + l.caps, two = -1
+    cdef double size, most = 1e-11
+    for i in range(first, end):
+        size = largest(d, i)
+        for j in range(first, end):
+            if fabs(d.t[i * d.width + j]) > most * size:
+                one[0], two, most = i, j, fabs(d.t[i * d.width + j]) / size
+    return two
+
+
+cdef inline int32_t bounded_pivot(lemke_t* l, int32_t end, int32_t* one) noexcept nogil:
+    """Of free rows before `end` the one, and which other row, whose determinant is largest beside both; or -1."""
+    cdef dictionary_t* d = &l.d
+    cdef int32_t i, j, first = l.bounded + l.caps, two = -1
+    cdef double share, most = 1e-11
+    cdef double* x
+    cdef double* y
+    for i in range(end):
+        d.t[i * d.width + d.n] = largest(d, i)          # z has no column yet
+    for i in range(first, end):
+        x = d.t + i * d.width
+        for j in range(first):
+            y = d.t + j * d.width
+            share = fabs(x[i] * y[j] - x[j] * y[i])
+            if share > most * x[d.n] * y[d.n]:
+                one[0], two, most = i, j, share / (x[d.n] * y[d.n])
+    return two
+
+
 cdef inline int32_t eliminate(lemke_t* l) noexcept nogil:
     """Free rows made basic for good, behind all others; how many places are left.
 
-    First those whose diagonal is no less than a hundredth of their row, then down to 1e-8.
+    Each with the variable of a free row, which takes the place of its own; else with a row that is not free, whose w and
+    s exchange their parts.
     """
     cdef dictionary_t* d = &l.d
-    cdef int32_t i, j, k, end = d.n, moved, first = l.bounded + l.caps
-    cdef double size, share
-    cdef double* row
-    for k in range(2):
-        share = 1e-8 if k else 1e-2
-        moved = 1
-        while moved:
-            moved = 0
-            i = first
-            while i < end:
-                row = d.t + i * d.width
-                size = 0.0
-                for j in range(d.n):
-                    if fabs(row[j]) > size:
-                        size = fabs(row[j])
-                if fabs(row[i]) > share * size:
-                    pivot(d, i, i)
-                    end -= 1
-                    swap_places(l, i, end)
-                    moved = 1
-                else:
-                    i += 1
+    cdef int32_t row, one = 0, two, end = d.n
+    while end > l.bounded + l.caps:
+        two = free_pivot(l, end, &one)
+        if two >= 0:
+            pivot(d, one, two)
+            swap_rows(d, one, two)                      # what leaves has no part any more: all w of free rows are 0
+            one = two
+        else:
+            two = bounded_pivot(l, end, &one)
+            if two < 0:
+                return end
+            pivot(d, one, two)
+            pivot(d, two, one)
+            swap_places(l, one, two)                    # each variable into its own place again
+            row = l.row[one]
+            l.row[one] = l.row[two]
+            l.row[two] = row
+            l.exchanged[two] = not l.exchanged[two]
+        end -= 1
+        swap_places(l, one, end)
     return end
 
 
@@ -348,9 +398,15 @@ cdef inline void open_path(lemke_t* l) noexcept nogil:
 
 # -- what a path finds -------------------------------------------------------------------------------------------
 
-cdef inline double along(const dictionary_t* d, int32_t j, int32_t c, double least) noexcept nogil:
+cdef inline int32_t where_s(const lemke_t* l, int32_t j) noexcept nogil:
+    # as `where`, of s of a place
+    return l.d.where[j] if l.exchanged[j] else l.d.where[l.d.n + j]
+
+
+cdef inline double along(const lemke_t* l, int32_t j, int32_t c, double least) noexcept nogil:
     # s_j in column c: its value, or how it grows with the entering variable
-    cdef int32_t r = d.where[d.n + j]
+    cdef const dictionary_t* d = &l.d
+    cdef int32_t r = where_s(l, j)
     cdef double x
     if r < 0:
         return 1.0 if -1 - r == c else 0.0
@@ -365,10 +421,10 @@ cdef inline void column(const lemke_t* l, int32_t c, double least, double* x) no
     cdef int32_t i, j, first = l.bounded + l.caps, second = first + l.split
     for j in range(l.bounded):
         i = l.row[j]
-        x[i] = turn(p, i) * along(d, j, c, least)
+        x[i] = turn(p, i) * along(l, j, c, least)
     for j in range(first, second):
         i = l.row[j]
-        x[i] = turn(p, i) * (along(d, j, c, least) - along(d, j + l.split, c, least))
+        x[i] = turn(p, i) * (along(l, j, c, least) - along(l, j + l.split, c, least))
     for j in range(d.n, d.rows):
         i = l.row[j]
         x[i] = turn(p, i) * d.t[j * d.width + c]
@@ -387,10 +443,10 @@ cdef inline void take_values(lemke_t* l) noexcept nogil:
         l.t.s.x[i] += base(p, i)
     for j in range(l.bounded):
         i = l.row[j]
-        if d.where[d.n + j] < 0:
+        if where_s(l, j) < 0:
             l.t.s.at[i] = AT_LOWER if p.lower[i] > -INFINITY else AT_UPPER
     for j in range(l.bounded, l.bounded + l.caps):
-        if d.where[d.n + j] >= 0:                       # the cap pulls
+        if where_s(l, j) >= 0:                          # the cap pulls
             l.t.s.at[l.row[l.row[j]]] = AT_UPPER
     judge_now(l.t)
 
@@ -435,7 +491,7 @@ cdef int64_t lemke_real(const blocks_t* p) noexcept nogil:
 
 
 cdef int64_t lemke_index(const blocks_t* p) noexcept nogil:
-    return 5 * <int64_t>most_rows(p) + 2
+    return 6 * <int64_t>most_rows(p) + 2
 
 
 cdef void lemke_lay(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil:
@@ -443,7 +499,8 @@ cdef void lemke_lay(lemke_t* l, direct_t* t, double* real, int32_t* index) noexc
     cdef int32_t n = most_rows(t.s.p)
     l.t = t
     l.d.t, l.d.width = real, n + 2
-    l.row, l.d.basic, l.d.nonbasic, l.d.where = index, index + n, index + 2 * n, index + 3 * n + 1
+    l.row, l.exchanged, l.d.basic = index, index + n, index + 2 * n
+    l.d.nonbasic, l.d.where = index + 3 * n, index + 4 * n + 1
 
 
 cdef void lemke_begin(lemke_t* l) noexcept nogil:
