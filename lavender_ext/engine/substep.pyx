@@ -238,8 +238,10 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
 
 cdef int32_t finish(engine_t* e) noexcept nogil:
     cdef int32_t i, shifted, unsolved
-    cdef const double* by = e.shift if e.head[H_STEPPER] == SOFT_STEP else NULL if e.head[H_STEPPER] == XPBD else e.dv
+    cdef const double* by = e.shift if e.head[H_STEPPER] == SOFT_STEP else e.dv
     cdef double* out = e.setting + S_OUT
+    if e.head[H_STEPPER] == XPBD:
+        by = NULL
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
     out[2] = e.head[H_CONTACTS]
