@@ -3,10 +3,11 @@
     python -m benchmarks newton [--sets hard,default,wild,scenes] [--seeds 9000:9060] [--rows 1000]
                                 [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME] [--out FILE]
 
-A part is taken out by putting something in its place while a problem is solved, a phase by leaving it out. A line for
-each part and class (law, operator, size) on which its absence changes the result's bits or work: problems, those then
-unsolved and those that only then are solved, factorisations and CPU time without over with, geometric means (time of
-problems solved both ways, the two solved in turn).
+A part is taken out by putting something in its place while a problem is solved (with it, itself), a phase by leaving it
+out. A line for each part and class (law, operator, size) on which its absence changes the result's bits or work: those
+so changed and all of the class that the part is for, those then unsolved and those that only then are solved,
+factorisations and CPU time without over with, geometric means of what changed (time of problems solved both ways, the
+two solved in turn), CPU time over all of the class, and at worst.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import click
 import numpy as np
 
 import lavender as lv
-from benchmarks.drawn import wild
+from benchmarks import drawn
 from benchmarks.islands import forms
 from benchmarks.output import folder_of, markdown, write_json
 from lavender import suite
@@ -140,10 +141,10 @@ PARTS: dict[str, Part] = {
 def problems(args: Asked) -> Iterator[tuple[str, Problem]]:
     """Name and problem of all that is asked for."""
     for name in args.sets:
-        if name == "wild":
+        if name in drawn.__all__:
             first, last = map(int, args.seeds.split(":"))
             for seed in range(first, last):
-                yield f"wild({seed})", wild(seed=seed, rows=args.rows).problem
+                yield f"{name}({seed})", getattr(drawn, name)(seed=seed, rows=args.rows).problem
         elif name == "scenes":
             for scene in SCENES:
                 simulation = lv.Simulation(lv.Scene(scene, solver="newton"))
@@ -169,10 +170,9 @@ def run(p: Problem, part: Part | None, args: Asked) -> tuple[bool, int, float, b
     """(solved or proven infeasible, factorisations, CPU time [s], impulse and work)."""
     with ExitStack() as stack:
         options: dict[str, Any] = {}
-        if part is not None:
-            for where, name, instead in part[1]:
-                stack.enter_context(patch.object(where, name, instead))
-            options = dict(part[2])
+        for where, name, instead in () if part is None else part[1]:
+            stack.enter_context(patch.object(where, name, instead))
+        options.update({} if part is None else part[2])
         begun = process_time()
         try:
             guess = p.guess
@@ -193,22 +193,22 @@ def run(p: Problem, part: Part | None, args: Asked) -> tuple[bool, int, float, b
 
 
 def compare(p: Problem, parts: dict[str, Part], args: Asked) -> Iterator[dict[str, Any]]:
-    """A record for every part whose absence changes anything."""
+    """A record for every part that is for such a problem."""
     run(p, None, args)
     first = run(p, None, args)
     for name, part in parts.items():
         if not part[0](p):
             continue
+        same = part[0], [(where, what, getattr(where, what)) for where, what, _ in part[1]], {}
         without = run(p, part, args)
-        if without[3] == first[3]:
-            continue
+        changed = without[3] != first[3]
         times, least = [without[2]], [first[2]]
-        if without[0] and first[0]:
+        if changed and without[0] and first[0]:
             for _ in range(2 if without[2] + first[2] < 0.3 else 0):
-                least.append(run(p, None, args)[2])
+                least.append(run(p, same, args)[2])
                 times.append(run(p, part, args)[2])
         yield {
-            "part": name, "kind": kind(p), "rows": p.m, "with": first[0], "without": without[0],
+            "part": name, "kind": kind(p), "changed": changed, "rows": p.m, "with": first[0], "without": without[0],
             "factors": (without[1] + 1) / (first[1] + 1), "time": min(times) / min(least),
             "ms": 1e3 * min(least),
         }  # fmt: skip
@@ -223,16 +223,19 @@ def table(records: list[dict[str, Any]]) -> str:
     order = {name: i for i, name in enumerate(PARTS)}
     lines = []
     for (part, of), rs in sorted(grouped.items(), key=lambda item: (order[item[0][0]], item[0][1])):
-        both = [r for r in rs if r["with"] and r["without"]]
-        mean = [
-            math.exp(np.mean(np.log([r[k] for r in both]))) if both else math.nan for k in ("factors", "time")
-        ]
+        changed = [r for r in rs if r["changed"]]
+        both = [r for r in changed if r["with"] and r["without"]]
+        log = {k: [math.log(r[k]) for r in both] for k in ("factors", "time")}
+        mean = [math.exp(np.mean(log[k])) if both else math.nan for k in log]
+        of_all = math.exp(sum(log["time"]) / len(rs))
         worst = max((r["time"] for r in both), default=math.nan)
         lost = sum(r["with"] and not r["without"] for r in rs)
         won = sum(r["without"] and not r["with"] for r in rs)
-        numbers = (f"{mean[0]:.2f}", f"{mean[1]:.2f}", f"{worst:.1f}")
-        lines.append(("" if of else part, of or "all", len(rs), lost, won, *numbers))
-    return markdown(("without", "class", "n", "lost", "won", "factors", "time", "worst"), lines)
+        numbers = (f"{mean[0]:.2f}", f"{mean[1]:.2f}", f"{of_all:.2f}", f"{worst:.1f}")
+        if changed:
+            lines.append(("" if of else part, of or "all", len(changed), len(rs), lost, won, *numbers))
+    head = ("without", "class", "changed", "of", "lost", "won", "factors", "time", "of all", "worst")
+    return markdown(head, lines)
 
 
 @click.command("newton")

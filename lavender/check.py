@@ -161,7 +161,7 @@ def cross_check(
     Returns
     -------
     CrossCheck
-        Distances, slack and objective only for symmetric A without Coulomb friction.
+        Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction.
 
     Raises
     ------
@@ -203,6 +203,8 @@ def _reference(
         return None, None, "Coulomb friction is not the optimality condition of a QP"
     if not problem.is_symmetric:
         return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
+    if not problem.is_semidefinite:
+        return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
     usual = CONE_REFERENCES if problem.law == "cone" else REFERENCES
     chain = (first, *(r for r in usual if r != first))
     failed = []

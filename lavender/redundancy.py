@@ -25,6 +25,7 @@ from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
 from lavender.problem import Problem, check_problem
+from lavender.problem.operators import semidefinite
 from lavender.residuals import residual
 from lavender.solve import solve
 from lavender_ext.pivot.direct import Pivoting
@@ -79,7 +80,7 @@ class Redundancy:
     @property
     def slack_is_unique(self) -> bool:
         """Slack and body velocities are the same in every solution."""
-        return self.problem.is_symmetric and self.problem.law != "coulomb"
+        return self.problem.is_semidefinite and self.problem.law != "coulomb"
 
     @property
     def unique(self) -> tuple[str, ...]:
@@ -105,16 +106,16 @@ class Redundancy:
         Raises
         ------
         CapabilityError
-            Coulomb friction, or bounded rows with asymmetric A: solutions do not form one convex set.
+            Coulomb friction, or bounded rows with asymmetric or indefinite A: solutions do not form one convex set.
         SolveFailed
             The judge did not accept the result.
         """
         p = self.problem
         previous = p.impulse_array(previous, "previous")
-        if p.law == "coulomb" or (p.law != "linear" and not p.is_symmetric):
+        if p.law == "coulomb" or (p.law != "linear" and not p.is_semidefinite):
             raise CapabilityError(
-                "a representative impulse needs symmetric A without Coulomb friction, where solutions form "
-                "one convex set; pass problem.relaxed('cone') for the convex relaxation"
+                "a representative impulse needs symmetric positive semidefinite A without Coulomb friction, where "
+                "solutions form one convex set; pass problem.relaxed('cone') for the convex relaxation of friction"
             )
         if p.law == "linear":
             x = solve(p, "direct", impulse=previous, tol=ACCEPTED).impulse
@@ -153,8 +154,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
 
     Islands (rows that share no body, directly or through others) are decomposed apart: up to 1,200 rows by
     QR of J M^-1/2, and of J, with column pivoting where J is given (nothing is squared), else by Cholesky with
-    pivoting, or QR for asymmetric A; larger ones by LDL^T of A + 1e-13 D, where pivots up to 1e-12 d times
-    the number of rows count as zero.
+    pivoting, or QR for asymmetric or indefinite A; larger ones by LDL^T of A + 1e-13 D, where pivots up to
+    1e-12 d times the number of rows count as zero.
 
     Parameters
     ----------
@@ -166,7 +167,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     InputError
         `tol` is not between 0 and 1.
     CapabilityError
-        Asymmetric A with an island of more than 1,200 rows; numbers whose products are beyond float64.
+        Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     check_problem(problem)
     if not 0.0 <= tol < 1.0:
@@ -187,8 +188,9 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         )
     for island in _islands(scaled):
         a = scaled[island][:, island]
+        sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
         if problem.is_symmetric and len(island) <= DENSE:
-            found, words = _dense_island(a.toarray(), [root[island] for root in roots], tol)
+            found, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
             if len(found):
                 basis = _null_basis(a.toarray(), found)
                 if unit is not scale:  # to the metric of d
@@ -196,7 +198,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
                 null.append((island, basis))
                 unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
         else:
-            found, limit, words = _other_island(a, problem.is_symmetric, tol)
+            found, limit, words = _other_island(a, sound, tol)
             used = max(used, limit)
             unique[island] = len(found) == 0
         methods.update(words)
@@ -222,8 +224,12 @@ def _islands(scaled: sp.csr_array) -> list[Places]:
     return np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
 
 
-def _dense_island(a: FloatArray, roots: list[sp.csr_array], tol: float) -> tuple[Places, list[str]]:
-    """Dependent rows of a symmetric island, each of those before it, and how they were found."""
+def _dense_island(
+    a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
+) -> tuple[Places, list[str]]:
+    """Dependent rows of a symmetric island, each of those before it where A is `sound`, and how they were found."""
+    if not sound:
+        return _by_qr(a, tol), [f"QR with pivoting, {tol:.0e}"]
     if not roots:
         tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
@@ -237,15 +243,15 @@ def _dense_island(a: FloatArray, roots: list[sp.csr_array], tol: float) -> tuple
     return _in_order(a, tail, tol), words
 
 
-def _other_island(a: sp.csr_array, symmetric: bool, tol: float) -> tuple[Places, float, list[str]]:
+def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[Places, float, list[str]]:
     """Dependent rows of a large or asymmetric island, the share that counts as nothing, how they were found."""
     n = a.shape[0]
-    if symmetric:
+    if sound:
         limit = max(tol, 10.0 * SHIFT * n)
         return _sparse(a, limit), limit, [f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}"]
     if n > DENSE:
         raise CapabilityError(
-            f"A is asymmetric and {n} of its rows hang together; the rank of at most "
+            f"A is asymmetric or indefinite and {n} of its rows hang together; the rank of at most "
             f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
         )
     return _by_qr(a.toarray().T, tol), tol, [f"QR with pivoting, {tol:.0e}"]

@@ -41,7 +41,6 @@ def export(
         refuse_unused(context, ["solver", "vectors"], "without --for")
     elif kind != "c":
         raise click.UsageError("--for goes with c: test vectors are checked by a C program")
-    written = library.write(kind, folder, replace=replace)
-    if records is not None:
-        written += chosen.write(records, folder, solver, vectors, replace=replace)
+    more = chosen.made(records, solver, vectors) if records is not None else {}
+    written = library.write(kind, folder, more=more, replace=replace)
     click.echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

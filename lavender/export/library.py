@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -12,7 +12,7 @@ import lavender_ext
 from lavender.errors import InputError, LavenderError
 from lavender.export import bindings
 from lavender.export.amalgamate import CutFailed, amalgamate, source_hash
-from lavender.io.stored import write_text
+from lavender.io.stored import write_bytes, write_text
 from lavender.web import compile as wasm
 
 __all__ = ["HEADER", "source", "write"]
@@ -57,7 +57,9 @@ def _files(folder: Path) -> Iterator[Path]:
     )
 
 
-def write(kind: str, out: Path, *, replace: bool = False) -> list[Path]:
+def write(
+    kind: str, out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False
+) -> list[Path]:
     """Write a folder: the C library, the Rust crates, or the npm package.
 
     Parameters
@@ -65,13 +67,15 @@ def write(kind: str, out: Path, *, replace: bool = False) -> list[Path]:
     kind : {"c", "rust", "npm"}
     out : Path
         A folder; made where it is not there. Files of other names in it stay.
+    more : mapping, optional
+        Further files by name, without a line in SHA256SUMS.
     replace : bool
         Replace files of ours that are others than what would be written.
 
     Returns
     -------
     list of Path
-        What was written, SHA256SUMS last.
+        What was written, SHA256SUMS and `more` last.
 
     Raises
     ------
@@ -92,7 +96,7 @@ def write(kind: str, out: Path, *, replace: bool = False) -> list[Path]:
         made["lavender.c"] = source()
     sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
     made["SHA256SUMS"] = sums
-    written = put(out, made, replace)
+    written = _put(out, {**made, **(more or {})}, replace)
     if kind == "npm":
         written.insert(0, _module(out / "liblavender.wasm", header))
     return written
@@ -121,16 +125,13 @@ def _module(out: Path, header: str) -> Path:
     return out
 
 
-def put(out: Path, made: dict[str, str], replace: bool) -> list[Path]:
-    """Write texts by their names below a folder; none where one of them is there and is another."""
-    for name, text in made.items():
-        path = out / name
-        if path.exists() and not replace and path.read_text(encoding="utf-8", errors="replace") != text:
+def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path]:
+    """Write files by their names below a folder; none where one of them is there and is another."""
+    files = {out / name: x.encode() if isinstance(x, str) else x for name, x in made.items()}
+    for path, data in files.items():
+        if path.exists() and not replace and path.read_bytes() != data:
             raise InputError(f"{path} is there and is another: give --replace, or another folder")
-    written = []
-    for name, text in made.items():
-        path = out / name
+    for path, data in files.items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, text)
-        written.append(path)
-    return written
+        write_bytes(path, data)
+    return list(files)

@@ -15,22 +15,23 @@ import numpy as np
 
 import lavender as lv
 from lavender import bench, registry
+from lavender.bench.cases import fingerprint
 from lavender.bench.line import c_of
-from lavender.bench.store import read
+from lavender.bench.store import Records, read
 from lavender.errors import InputError
-from lavender.export.library import HERE, put
+from lavender.export.library import HERE
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.io.stored import write_bytes
 from lavender.report.verdict import verdict
 from lavender.solvers.costs import METHODS as METHODS_OF_PLANS
 
-__all__ = ["chosen", "pack", "pack_problem", "write", "write_packed"]
+__all__ = ["chosen", "made", "pack", "pack_problem", "write_packed"]
 
 MAGIC = b"LAVVEC1\0"
 
 
-def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool = False) -> list[Path]:
-    """Write `vectors.bin`, `check.c` and `chosen.h`, the settings as C, into a folder of the library.
+def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
+    """`vectors.bin`, `check.c` and `chosen.h`, the settings as C, by name: to lie beside the library.
 
     Parameters
     ----------
@@ -50,30 +51,24 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
     record = chosen(records, solver)
     packed: list[bytes] = []
     left: list[str] = []
-    for name in dict.fromkeys(r.case for r in records if r.solver == record.solver and r.success):
+    for case, sha in dict.fromkeys(
+        (r.case, r.sha) for r in records if r.solver == record.solver and r.success
+    ):
         if len(packed) < most:
             try:
-                packed.append(
-                    pack(
-                        bench.resolve([name])[0].problem,
-                        record.solver,
-                        record.tol,
-                        record.max_iter,
-                        record.options,
-                    )
-                )
+                problem = _again(records, case, sha)
+                packed.append(pack(problem, record.solver, record.tol, record.max_iter, record.options))
             except (NotTaken, lv.LavenderError) as error:
-                left.append(f"{name}: {error}")
+                left.append(f"{case}: {error}")
     if not packed:
         raise InputError(
             f"no problem of {record.solver} in {path} makes a test vector: {'; '.join(left[:3])}"
         )
-    write_packed(out, packed)
     text = (
         f"/* What the report measured: {record.solver}, to a relative residual of {record.tol:g}. */\n"
         '#include "lavender.h"\n\n'
         "static inline void lav_chosen(lav_options *options, lav_budget *budget) {\n"
-        + _turns_of(record)
+        + _turns_of(records, record)
         + "".join(f"  {_by_pointer(line)};\n" for line in c_of(record))
         + (
             "  options->turns = turns;\n  options->n_turns = sizeof turns / sizeof *turns / 2;\n"
@@ -83,23 +78,39 @@ def write(path: Path, out: Path, solver: str | None, most: int, *, replace: bool
         + "}\n"
     )
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
-    return [out / "vectors.bin", *put(out, {"check.c": check, "chosen.h": text}, replace)]
+    return {"vectors.bin": _file_of(packed), "check.c": check, "chosen.h": text}
+
+
+def _again(records: Records, case: str, sha: str) -> lv.Problem:
+    """The problem that was measured, from where the report had it; InputError where other numbers stand there now."""
+    if case not in records.cases:
+        raise InputError("the records do not say where it is from")
+    source = records.cases[case].source
+    problem = bench.resolve([source])[0].problem
+    now = fingerprint(problem)
+    if now != sha:
+        raise InputError(f"{source} is another problem here, hash {now}; measured was {sha}")
+    return problem
 
 
 def write_packed(out: Path, packed: Sequence[bytes]) -> None:
     """Write `vectors.bin` of what `pack` has made."""
-    write_bytes(out / "vectors.bin", MAGIC + struct.pack("<q", len(packed)) + b"".join(packed))
+    write_bytes(out / "vectors.bin", _file_of(packed))
+
+
+def _file_of(packed: Sequence[bytes]) -> bytes:
+    return MAGIC + struct.pack("<q", len(packed)) + b"".join(packed)
 
 
 def _by_pointer(line: str) -> str:
     return line.replace("&", "").replace("options.", "options->").replace("budget.", "budget->")
 
 
-def _turns_of(record: Any) -> str:
+def _turns_of(records: Records, record: Any) -> str:
     """The plan of `auto` for the record's problem as turns in C; empty for the others."""
     if record.solver != "auto":
         return ""
-    plan = lv.explain(bench.resolve([record.case])[0].problem, record.tol)
+    plan = lv.explain(_again(records, record.case, record.sha), record.tol)
     return (
         f"  static const int32_t turns[] = {{{', '.join(map(str, turns(plan)))}}}; /* lavender.explain */\n"
     )

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -25,9 +24,9 @@ from lavender.problem import Problem
 __all__ = ["Operator", "Size", "make"]
 
 U = 2.0**-53
-# A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
-# rounded leave negative eigenvalues of about m 2^-53.
-SHIFT = 1e-12
+SHIFT = (
+    1e-12  # -, of the largest eigenvalue of an inverse inertia: by what rounding may have made one negative
+)
 SQUARED = 1e-140  # sqrt J: squares of less begin to lose digits, or vanish
 LEAST = 2.0**-1022  # the smallest number of float64 with all its digits
 LARGEST_TREE = 2000  # generalised velocities of one tree, whose M is inverted, dense
@@ -226,12 +225,12 @@ class _Matrix(Operator):
         self.a = a if problem.asymmetry == 0.0 else sp.csr_array(0.5 * (a + a.T))
         self.size_of_a = abs(self.a)
         self.of_slack = _gamma(int(np.diff(self.a.indptr).max(initial=0)) + 3)
-        self.d = problem.d
+        self.semidefinite = problem.is_semidefinite
 
     def refusal(self) -> str | None:
         if self.asymmetry > 0.0:
             return f"A is not symmetric (by {self.asymmetry:.1e})"
-        return None if _is_semidefinite(self.a, self.d) else "A is not positive semidefinite"
+        return None if self.semidefinite else "A is not positive semidefinite"
 
     def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
@@ -272,23 +271,3 @@ def _norms(v: FloatArray) -> FloatArray:
 
 def _gamma(n: int) -> float:
     return 1.01 * n * U  # n u / (1 - n u) for every n below 1e13
-
-
-def _is_semidefinite(a: sp.csr_array, d: FloatArray) -> bool:
-    """Whether D^-1/2 A D^-1/2 + SHIFT has a Cholesky factor (few rows), or positive pivots (many)."""
-    m = a.shape[0]
-    scale = 1.0 / np.sqrt(d)
-    scaled: Any = sp.diags_array(scale) @ a @ sp.diags_array(scale) + SHIFT * sp.eye_array(m)
-    if m <= 400:
-        try:
-            np.linalg.cholesky(scaled.toarray())
-        except np.linalg.LinAlgError:
-            return False
-        return True
-    import qdldl
-
-    try:
-        _, pivot, _ = qdldl.Solver(sp.csc_matrix(sp.triu(scaled)), upper=True).factors()
-    except (ValueError, RuntimeError):  # a pivot of zero
-        return False
-    return bool(np.all(pivot > 0.0))

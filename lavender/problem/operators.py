@@ -20,6 +20,10 @@ from lavender_ext.core.problem import Data, nothing_done
 from lavender_ext.factor import sparse
 from lavender_ext.judge import measure
 
+# A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
+# rounded leave negative eigenvalues of about m 2^-53.
+SHIFT = 1e-12
+
 
 class Operators(ProblemData):
     """A, J and what kernels and the judge read, of the problem's data."""
@@ -47,6 +51,16 @@ class Operators(ProblemData):
     def is_symmetric(self) -> bool:
         """A = A^T up to rounding of its entries (1e-14 of the largest)."""
         return self.asymmetry <= 1e-14
+
+    @cached_property
+    def is_semidefinite(self) -> bool:
+        """A is symmetric and x.A x >= 0 for every x, to rounding; always with J and M."""
+        if self.matrix is None:
+            return True
+        if not self.is_symmetric:
+            return False
+        scale = sp.diags_array(1.0 / np.sqrt(self.d))
+        return semidefinite(scale @ (0.5 * (self.csr + self.csr.T)) @ scale)
 
     @once
     def data(self) -> Data:
@@ -232,3 +246,21 @@ def _read_only(matrix: sp.csr_array) -> sp.csr_array:
     for part in (matrix.data, matrix.indices, matrix.indptr):
         read_only(part)
     return matrix
+
+
+def semidefinite(a: Any) -> bool:
+    """Whether a sparse symmetric matrix of unit diagonal, + SHIFT, has a Cholesky factor (few) or positive pivots."""
+    shifted: Any = a + SHIFT * sp.eye_array(a.shape[0])
+    if a.shape[0] <= 400:
+        try:
+            np.linalg.cholesky(shifted.toarray())
+        except np.linalg.LinAlgError:
+            return False
+        return True
+    import qdldl
+
+    try:
+        _, pivot, _ = qdldl.Solver(sp.csc_matrix(sp.triu(shifted)), upper=True).factors()
+    except (ValueError, RuntimeError):  # a pivot of zero
+        return False
+    return bool(np.all(pivot > 0.0))

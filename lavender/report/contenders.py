@@ -46,11 +46,11 @@ def subjects(records: Records, times: Sequence[float] = ()) -> list[Subject]:
     if cases:
         quick = tuple(tables.within(records, "all", cases, t) for t in times)
         found.append(Subject(cases, "call", tables.to_level(records, "all", cases, level), quick))
-    steps = tuple(dict.fromkeys(r.case for r in records if r.step >= 0 and r.case in records.cases))
-    if steps:
+    sequences = tables.steps_of(records)
+    if sequences:
+        steps = [step for some in sequences.values() for step in some]
         quick = tuple(tables.within(records, "all", steps, t) for t in times)
-        sequences = tuple(dict.fromkeys(records.cases[step].sequence for step in steps))
-        found.append(Subject(sequences, "steps", tables.to_level(records, "all", steps, level), quick))
+        found.append(Subject(tuple(sequences), "steps", tables.to_level(records, "all", steps, level), quick))
     return found
 
 

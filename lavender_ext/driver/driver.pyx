@@ -15,7 +15,7 @@ from lavender_ext.generalized.islands cimport aim_at, furnish as furnish_flow, m
 from lavender_ext.generalized.newton cimport DONE as G_DONE
 from lavender_ext.generalized.newton cimport SPENT as G_SPENT
 from lavender_ext.generalized.newton cimport descend_all
-from lavender_ext.generalized.sparse cimport PER_COLUMN
+from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport judge_nothing
 from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
@@ -104,12 +104,12 @@ cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) 
     cdef state_t* s = <state_t*>r.real
     cdef double* x = begin(v, o, r)
     cdef need_t need
-    cdef int32_t per = PER_COLUMN
+    cdef int32_t per = per_column(v.g.n)
     while True:
         if not grant(r, marks_of(&v.p, v.g, per), begun_room(v)):
             return ROOM
         settle(&s.f, &v.p, v.g, per, r.index, &need)
-        if not need.crowded or 4 * per > v.g.n:
+        if not need.crowded:
             break
         per *= 2
     if not grant(r, marks_of(&v.p, v.g, per), begun_room(v) + numbers_of(&s.f, &need)):
@@ -144,7 +144,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
     if o.method != NEWTON or v.p.n_rows == 0:
         return 0
     if v.g != NULL:
-        r.n_index, r.n_real = marks_of(&v.p, v.g, PER_COLUMN), begun_room(v)
+        r.n_index, r.n_real = marks_of(&v.p, v.g, per_column(v.g.n)), begun_room(v)
         return 1
     if not is_known(&v.p):
         return 0

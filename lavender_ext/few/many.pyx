@@ -20,7 +20,7 @@ from lavender_ext.few.room cimport has_room
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, descend_all
-from lavender_ext.generalized.sparse cimport PER_COLUMN
+from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.score cimport relative, score_t
 
@@ -51,7 +51,7 @@ cdef struct job_t:
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
     int32_t cold                # 1: from doing nothing, else from lam as it is
     bint solved
-    int32_t counts[5]           # steps, factorisations, updates, rounds, evaluations
+    int32_t counts[4]           # steps, factorisations, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
     score_t score
@@ -78,14 +78,14 @@ cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) no
 cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, steps = MOST
+    cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n)
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
         return
-    if j.made.n_empty or not has_room(room, marks_of(&j.p, &j.g, PER_COLUMN), 3 * <ssize_t>m + j.g.n):
+    if j.made.n_empty or not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
         return
     if j.begin[0] < 0.0:
         begin(j, room.real)
-    settle(&f, &j.p, &j.g, PER_COLUMN, room.index, &need)
+    settle(&f, &j.p, &j.g, per, room.index, &need)
     if need.crowded or need.values > gate.values or not is_cheap(j, gate, need.wide):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
@@ -98,8 +98,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double to
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
     if descend_all(&f, j.lam) != DONE:
         return
-    j.counts[0], j.counts[1], j.counts[2] = steps - f.steps, f.factorisations, f.updates
-    j.counts[3], j.counts[4] = f.rounds, f.evaluations
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if not has_room(room, 0, <ssize_t>j.g.n + m):
         return
     j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
@@ -142,7 +141,7 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
 cdef result(job_t* j, Data p, impulse, both):
     """(What the judge found, counts as of `Newton.run`); doing nothing is kept with the data."""
     return judged_from(p, impulse, both, &j.score, j.relative, j.floor), (
-        j.counts[0], j.counts[1], j.counts[2], j.counts[3], j.counts[4])
+        j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
 cdef void remember(job_t* j, Data p):

@@ -53,9 +53,8 @@ cdef struct flow_t:
     const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
-    const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other; NULL: all dense
+    const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
     const int32_t* lidx         # columns in their island, ascending
-    int32_t thin                # the present island's N and L are kept where L has entries (`sparse.pxd`)
     const int32_t* pblock       # (n_panels + 1) first block of each panel
     const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
     int32_t island              # the present one
@@ -81,10 +80,10 @@ cdef struct flow_t:
     double* e                   # (m)
     double* v                   # V at s
     double* held                # V inside `normal`
-    double* normal              # N of the present island, lower triangle by rows; or L's entries; or whole: Coulomb
+    double* normal              # N of the present island where L has entries; or whole: Coulomb
     double* factor              # its factor
     double* inv                 # (s) 1 / D
-    double* turned              # (rows of a panel, columns) changes of V times Y
+    double* turned              # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
     int32_t* swap               # (s)
@@ -92,7 +91,6 @@ cdef struct flow_t:
     double velocity_limit       # m/s
     int32_t steps               # Newton steps left
     int32_t factorisations
-    int32_t updates             # of N by changed blocks alone
     int32_t rounds              # of Coulomb friction
     int32_t evaluations         # of lambda(s) along a line
     wait_t wait

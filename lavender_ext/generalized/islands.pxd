@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.block cimport CONE, COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.generalized.flow cimport flow_t
-from lavender_ext.generalized.sparse cimport MANY, SMALL, factor_work, find_pattern, is_worth, pattern_marks
+from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
 
 
 cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
@@ -139,8 +139,8 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
 
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
-    int32_t wide                # columns of a dense island that costs what the costliest does, at most most[0]
-    int32_t crowded             # L of a large problem has more than `per` entries in a row: settle again, with more
+    int32_t wide                # columns of a full island that costs what the costliest does, at most most[0]
+    int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
 
 
@@ -153,10 +153,11 @@ cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t 
 
 cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, int32_t per, int32_t* w,
                         need_t* need) noexcept nogil:
-    """Islands of a problem, in w (`marks_of`), and how N is kept in each."""
+    """Islands of a problem, in w (`marks_of`), and where L of each has entries."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size, wide
     cdef double values
+    cdef const int32_t* lptr
     f.p = p[0]
     f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
     f.p.law = f.law
@@ -175,28 +176,26 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
                                <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
     f.swap = w                                          # scratch of before
     f.wait.island = -1
-    f.lptr = NULL
-    f.lidx = NULL
-    need.crowded = False
-    if need.most[0] > SMALL:
-        if find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) >= 0:
-            f.lptr = w + at
-            f.lidx = w + at + f.cptr[f.n_islands] + 1
-        else:
-            need.crowded = need.most[0] > MANY and f.law != COULOMB
-    need.wide = 0
+    need.crowded = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
+    f.lptr = w + at
+    f.lidx = w + at + f.cptr[f.n_islands] + 1
+    need.wide = need.most[0] if need.crowded else 0
     need.values = 0.0
-    for i in range(f.n_islands):
+    for i in range(0 if need.crowded else f.n_islands):
         size = f.cptr[i + 1] - f.cptr[i]
-        values = <double>size * size
+        lptr = f.lptr + f.cptr[i]
+        values = lptr[size] - lptr[0] + size
         wide = size
-        if f.law != COULOMB and f.lptr != NULL and is_worth(size, f.lptr + f.cptr[i], f.lidx):
-            values = f.lptr[f.cptr[i + 1]] - f.lptr[f.cptr[i]] + size
-            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, f.lptr + f.cptr[i], f.lidx) / size))
+        if f.law == COULOMB:                            # whole, since its own N lacks symmetry
+            values = <double>size * size
+        elif size > 0:
+            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, lptr, f.lidx) / size))
         if values > need.values:
             need.values = values
-        if wide > need.wide:
+        if size > wide > need.wide:
             need.wide = wide
+        elif wide >= size > need.wide:
+            need.wide = size
 
 
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
@@ -250,4 +249,4 @@ cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energ
     f.velocity_limit = tol * start_velocity
     f.steps = steps
     f.wait.island = -1
-    f.factorisations = f.updates = f.rounds = f.evaluations = 0
+    f.factorisations = f.rounds = f.evaluations = 0

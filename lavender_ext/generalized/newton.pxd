@@ -18,7 +18,7 @@ that lacks symmetry, as long as |G| falls; where it does not, normals are lowere
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
-N is kept between steps; where few blocks have changed their V only those change it.
+N and its factor serve the next step where no block has changed its V.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -29,8 +29,7 @@ from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
-from lavender_ext.generalized.normal cimport factor, form, newton_step
-from lavender_ext.generalized.sparse cimport is_worth
+from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
 
 
 cdef enum:
@@ -48,7 +47,7 @@ cdef enum:                      # a round of Coulomb friction
 cdef enum:
     IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
     LINE_STEPS = 24             # evaluations of one line search
-    RENEW = 16                  # steps after which s and N are formed anew
+    RENEW = 16                  # steps after which s is formed anew
     ROUNDS = 60                 # rounds of Coulomb friction
 
 
@@ -308,11 +307,9 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if form(f, island, x.stale or x.n % RENEW == 0, square) or x.stale:
+        if x.stale or not is_held(f, island):
+            form(f, island, square)
             if not factor(f, island, square):
-                if not x.stale:
-                    x.stale = 1
-                    continue
                 return FAILED
         x.stale = 0
         newton_step(f, island, square)
@@ -455,7 +452,6 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
     cdef int32_t end
     cdef bint waits = f.wait.island == island
     f.island = island
-    f.thin = f.lptr != NULL and is_worth(f.cptr[island + 1] - f.cptr[island], f.lptr + f.cptr[island], f.lidx)
     if not waits:
         restart(f, island, impulse)
         level(f, island)

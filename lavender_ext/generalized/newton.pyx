@@ -4,7 +4,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.sparse cimport PER_COLUMN
+from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, descend_all
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
@@ -13,7 +13,7 @@ ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": 
 cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
-    `largest`: velocities of the island whose factor costs most, or of a dense one that costs the same. Where N of an
+    `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. Where N of an
     island has more than `most` values (`fits`) there is no room, and no `run`.
     """
     cdef flow_t f
@@ -24,17 +24,17 @@ cdef class Newton:
 
     def __init__(self, Data p, double most):
         cdef need_t need
-        cdef int32_t per = PER_COLUMN
+        cdef int32_t per = per_column(p.general.n)
         cdef Room marks, numbers
         self.data = p
         while True:
             marks = room_for(marks_of(&p.blocks, &p.general, per) * sizeof(int32_t))
             settle(&self.f, &p.blocks, &p.general, per, <int32_t*>marks.at, &need)
-            if not need.crowded or 2.0 * per * p.general.n > most or 4 * per > p.general.n:
-                break                                   # beyond a quarter of its columns a row is best kept dense
+            if not need.crowded or <double>per * p.general.n > most:
+                break
             per *= 2
         self.largest = need.wide
-        self.fits = need.values <= most
+        self.fits = not need.crowded and need.values <= most
         if not self.fits:
             return
         numbers = room_for(numbers_of(&self.f, &need) * sizeof(double))
@@ -56,7 +56,7 @@ cdef class Newton:
 
         again: on from where the run before, to the same tol, has used up its steps. Under Coulomb's law the best at a
         cut is kept, and may be the end sooner than one run of as many steps finds it; else the bits are those of one.
-        Returns how it ended (`ENDS`) and (steps, factorisations, updates of N, rounds, evaluations of a line).
+        Returns how it ended (`ENDS`) and (steps, factorisations, rounds, evaluations of a line).
         """
         cdef int32_t end = DONE, waits = self.f.wait.island if again else -1
         if self.f.p.n_rows > 0:
@@ -64,4 +64,4 @@ cdef class Newton:
             self.f.wait.island = waits
             with nogil:
                 end = descend_all(&self.f, &impulse[0])
-        return end, (steps - self.f.steps, self.f.factorisations, self.f.updates, self.f.rounds, self.f.evaluations)
+        return end, (steps - self.f.steps, self.f.factorisations, self.f.rounds, self.f.evaluations)

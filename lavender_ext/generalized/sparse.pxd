@@ -1,8 +1,9 @@
-"""N = L^T D L of an island whose branches hardly meet, kept where L has entries: rows from the last to the first, as M.
+"""N = L^T D L of an island, kept where L has entries: rows from the last to the first, as M.
 
 A row of Y has entries in a few chains of a tree, so N = I + Y^T V Y couples columns of one panel alone, and
 eliminating row k couples those that it has an entry in (`tree_pattern`): without contacts between branches the pattern
-is that of M's factor, some 12 entries in a row of an insect.
+is that of M's factor, some 12 entries in a row of an insect; where all meet, L is a full triangle, and costs no more
+than a dense one would.
 
     val     entries left of the diagonal, row by row, then the diagonal
 """
@@ -12,10 +13,14 @@ from lavender_ext.core.generalized cimport generalized_t, tree_pattern
 
 
 cdef enum:
-    PER_COLUMN = 24             # entries in a row of L for which there is room at first
-    MANY = 200                  # columns from which on more room is made where that does not hold a pattern
-    PASSED = 8                  # multiply-adds of a dense factor that it costs to pass over a column
-    SMALL = 40                  # columns up to which dense factors cost less than to look for a pattern: a hand's
+    PER_COLUMN = 24             # entries in a row of L for which there is room at first,
+    MANY = 200                  # of more columns than these: of fewer for all that there may be
+    PASSED = 8                  # multiply-adds of a full factor that it costs to pass over a column
+
+
+cdef inline int32_t per_column(int32_t n) noexcept nogil:
+    """Entries in a row of L of n columns for which there is room at first."""
+    return PER_COLUMN if n > MANY else (n + 1) // 2
 
 
 cdef inline ssize_t pattern_marks(ssize_t n, ssize_t reached, ssize_t per) noexcept nogil:
@@ -91,13 +96,6 @@ cdef inline double factor_work(int32_t n, const int32_t* lptr, const int32_t* li
             if theirs != q - first:
                 passed += theirs
     return s + PASSED * passed
-
-
-cdef inline bint is_worth(int32_t n, const int32_t* lptr, const int32_t* lidx) noexcept nogil:
-    """Whether the rows' own entries cost less: multiply-adds, 12 instructions of each entry, 5 of each of a square."""
-    cdef double size = n
-    return (n > SMALL and factor_work(n, lptr, lidx) + 12.0 * (lptr[n] - lptr[0])
-            < size * size * size / 6.0 + 5.0 * size * size)
 
 
 cdef inline void take_row(double* x, const double* y, double f, int32_t n) noexcept nogil:

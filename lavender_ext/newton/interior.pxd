@@ -6,7 +6,7 @@ u dual to G z, G z and u inside every cone, W = G^T T^-2 G with T u = T^-1 G z =
     combined   c = v o v + (T^-1 G dz_a) o (T du_a) - sigma mu e,   sigma = (mu_a / mu)^3
                (H + W) dz = -(H z - g - G^T u) - G^T T^-1 (v \\ c),  du = -T^-1 (v \\ c) - T^-2 G dz  (4)
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport ROW
@@ -88,68 +88,6 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
         for which in range(PARTS):
             if has_cone(e, i, which):
                 dual_head(e, i, which, u1, u2)[0] += worst_u
-    return degree
-
-
-cdef inline double ipm_start_apart(const elements_t* e, const double* hz, double margin, double* z, double* u1,
-                                       double* u2) noexcept nogil:
-    """Puts z and u inside their cones, starting from z with (H + W) z = g for a small W; returns the degree (number of cones).
-
-    Each cone apart, by no more than it needs: z and u keep at least `margin` times the mean |z| and the mean |g|
-    from the boundary.
-    """
-    cdef int32_t i, j, which, n
-    cdef double size_z = 0.0, size_u = 0.0, x, degree = 0.0, width
-    cdef double c[4]
-    for j in range(e.m):
-        size_z += fabs(z[j])
-        size_u += fabs(e.g[j])
-    size_z = margin * size_z / (e.m if e.m > 0 else 1)
-    size_u = margin * size_u / (e.m if e.m > 0 else 1)
-    if not size_z > 0.0:
-        size_z = 1.0
-    if not size_u > 0.0:
-        size_u = 1.0
-    for i in range(e.n):
-        j = e.ptr[i]
-        if e.kind[i] == ROW:
-            u1[j] = 0.0
-            u2[j] = 0.0
-            x = hz[j] - e.g[j]
-            if is_low(e, j) and is_high(e, j):
-                width = 0.1 * (e.upper[j] - e.lower[j])
-                if z[j] < e.lower[j] + width:
-                    z[j] = e.lower[j] + width
-                if z[j] > e.upper[j] - width:
-                    z[j] = e.upper[j] - width
-                u1[j] = x if x > size_u else size_u
-                u2[j] = -x if -x > size_u else size_u
-                degree += 2.0
-            elif is_low(e, j):
-                if z[j] < e.lower[j] + size_z:
-                    z[j] = e.lower[j] + size_z
-                u1[j] = x if x > size_u else size_u
-                degree += 1.0
-            elif is_high(e, j):
-                if z[j] > e.upper[j] - size_z:
-                    z[j] = e.upper[j] - size_z
-                u2[j] = -x if -x > size_u else size_u
-                degree += 1.0
-            continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            n = cone_size(e, i, which)
-            slack_dual(e, i, which, hz, c)
-            x = size_u - cone_gap(c, n)
-            if x > 0.0:
-                c[0] += x
-            store_dual(e, i, which, c, u1, u2)
-            gather(e, i, which, z, c)
-            x = (size_z - cone_gap(c, n)) / on_normal(ratio(e, i, which))
-            if x > 0.0:
-                z[j] += x
-            degree += 1.0
     return degree
 
 

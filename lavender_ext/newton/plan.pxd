@@ -4,8 +4,8 @@ Bounded rows: exchanges from the warm start and from the solution of H z = g, an
 decades. Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
-interior points, each ended by rounds; closed loops of joints through the augmented system; rounds from the answer of the
-convex relaxation; the other shares of phi's derivative; the first walk for what is left of the budget.
+interior point, ended by rounds; closed loops of joints through the augmented system; rounds from the answer of the
+convex relaxation; the first walk for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -39,12 +39,11 @@ cdef enum:
     MORE_REFINEMENTS = 20       # and with another factor of rows that all hold
     RELAXED_STEPS = 30          # of the convex problem that a walk starts from, at most
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
-    SHARES = 5
 
 
-cdef inline double share_of(int32_t i) noexcept nogil:
-    """Of phi's derivative, tried in turn: 0.7, 0.95, 1, 0.85, 0.5 (a formula, since a table is static data)."""
-    return (14 + 5 * i - 2 * i * (i - 1)) / 20.0
+cdef inline double share_of() noexcept nogil:
+    """Of phi's derivative."""
+    return 0.7
 
 
 cdef inline double cone_delta() noexcept nogil:
@@ -104,7 +103,7 @@ cdef inline void begin_rows(newton_t* n) noexcept nogil:
     cdef int32_t j
     cdef double* z = n.ip.everything
     cdef bint linear
-    begin_interior(n, delta_of(), 0.0, n.s.symmetric)
+    begin_interior(n, delta_of(), 0.0)
     linear = all_hold(n, z, True)
     if not linear and (n.s.form == BODIES or not all_hold(n, z, False)):
         return
@@ -135,7 +134,7 @@ cdef inline void go_ends(newton_t* n) noexcept nogil:
         if n.best < 1e-3 and n.loops:                   # near-dependent rows may be what is in the way
             n.at = 11
             n.s.augmented = 1
-            begin_interior(n, shift_of(), 0.0, False)
+            begin_interior(n, shift_of(), 0.0)
             n.s.augmented = 0
             begin_approach(n, CONE, 1)
         return
@@ -165,7 +164,7 @@ cdef inline void go_convex(newton_t* n) noexcept nogil:
         elif at == 2:
             n.at = 10
         else:
-            begin_interior(n, cone_delta() if at == 0 else delta_of(), 0.0, n.s.symmetric)
+            begin_interior(n, cone_delta() if at == 0 else delta_of(), 0.0)
             begin_steps(n, False)
     elif at == 0:
         if not n.cold:
@@ -194,43 +193,36 @@ cdef inline void go_convex(newton_t* n) noexcept nogil:
 # -- Coulomb friction --------------------------------------------------------------------------------------------
 
 
-cdef inline void try_shares(newton_t* n, int32_t first, int32_t end, int32_t augmented) noexcept nogil:
-    cdef tries_t* x = &n.tries
-    x.at = 0
-    x.share, x.end, x.augmented = first, end, augmented
+cdef inline void begin_de_saxce(newton_t* n, int32_t augmented) noexcept nogil:
+    n.tries.at = 0
+    n.tries.augmented = augmented
     enter(n, DE_SAXCE)
 
 
 cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
-    """Interior points, each ended by Newton's method on the Alart-Curnier map."""
+    """An interior point, ended by Newton's method on the Alart-Curnier map."""
     cdef tries_t* x = &n.tries
     cdef double best
     if x.at == 0:
-        if x.share == x.end:
-            leave(n)
-            return
         x.at = 1
         n.s.augmented = x.augmented
-        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x.share), False)
+        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of())
         n.s.augmented = 0
         begin_approach(n, COULOMB, x.augmented)
         return
     best = n.look.lowest if x.at == 1 else end_apart(n, n.look.kept)
-    if over(n):
+    if over(n) or x.augmented or x.at == 3:
         leave(n)
-    elif x.augmented or x.at == 3:
-        x.at = 0
-        x.share += 1
-    else:
-        begin_rounds(n, 1, n.look.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
-                     (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
-        begin_apart(n)
-        enter_rounds(n, 1, 15 if x.at == 1 else 12)
-        x.at += 1
+        return
+    begin_rounds(n, 1, n.look.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
+                 (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
+    begin_apart(n)
+    enter_rounds(n, 1, 15 if x.at == 1 else 12)
+    x.at += 1
 
 
 cdef inline void begin_relaxed(newton_t* n) noexcept nogil:
-    begin_interior(n, delta_of(), 0.0, False)
+    begin_interior(n, delta_of(), 0.0)
     memset(n.trial, 0, n.s.e.m * sizeof(double))
     with_products(n, n.trial, n.rest)
     n.relaxed = 1e-4 * system_natural(&n.s, n.trial, n.rest, CONE, 0.0, n.f)
@@ -264,20 +256,18 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
     n.at += 1
     if at > 0 and over(n):
-        at = 6
+        at = 5
     if at == 0:
         begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, INNER)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
         pursue(n, 0)
     elif at == 1:
-        try_shares(n, 0, 1, 0)
+        begin_de_saxce(n, 0)
     elif at == 2:                                       # closed loops of joints: their rows nearly depend on each other
         if n.loops and has_free_rows(n):
-            try_shares(n, 0, 2, 1)
+            begin_de_saxce(n, 1)
     elif at == 3:
         begin_relaxed(n)
     elif at == 4:
-        try_shares(n, 1, SHARES, 0)
-    elif at == 5:
         enter_rounds(n, 0, LIMITLESS)
     else:
         leave(n)

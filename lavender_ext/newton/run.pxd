@@ -139,10 +139,8 @@ cdef struct pursuit_t:
     int32_t stretches
 
 
-cdef struct tries_t:            # De Saxce's interior points
+cdef struct tries_t:            # De Saxce's interior point
     int32_t at
-    int32_t share
-    int32_t end
     int32_t augmented
 
 

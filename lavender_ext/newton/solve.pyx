@@ -343,9 +343,9 @@ cdef class Solve:
         found = relative_at(n, n.exchange.z, n.exchange.hz)
         return finite, z_array, found, sides(n.s.e, n.exchange.z, n.exchange.hz, n.exchange.side, True)
 
-    def begin(self, double delta, double share=0.0, bint apart=False):
+    def begin(self, double delta, double share=0.0):
         """The first point of an interior point."""
-        begin_interior(&self.n, delta, share, apart)
+        begin_interior(&self.n, delta, share)
 
     def advance(self):
         """A step of it: (whether it went, its length, gap before it, |F| and velocity error after it)."""

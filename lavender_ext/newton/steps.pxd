@@ -20,7 +20,7 @@ which shares its tangents with s. W^-1 = L L^T gives (C W)^-1 = L P, P = L^T B, 
 Both matrices lack symmetry and are factored by LU. The central path of a problem that is not monotone may
 turn back: steps then shrink to nothing. With `share` psi for psi in B, share a little below 1, the method is
 between Newton's and the fixed point and passes such folds, at a linear rate, after which Newton's method on
-the Alart-Curnier map ends it. Several shares are tried in turn.
+the Alart-Curnier map ends it.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -29,7 +29,7 @@ from libc.string cimport memset
 from lavender_ext.core.block cimport ROW
 from lavender_ext.newton.cones cimport PARTS, cone_at, cone_size, has_cone, load_dual, ratio, scatter
 from lavender_ext.newton.elements cimport elements_t
-from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_start_apart, ipm_update
+from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_update
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.run cimport newton_t, interior_t, take
 from lavender_ext.newton.system cimport (OF_BARRIER, OF_PAIR, all_finite, first_weights, system_factor, system_solve,
@@ -41,8 +41,8 @@ cdef inline double delta_of() noexcept nogil:
     return 1e-10
 
 
-cdef inline void begin_interior(newton_t* n, double delta, double share, bint apart) noexcept nogil:
-    """A first point near H z = g, each boundary left by what it needs (`apart`), or all by the worst; one factor."""
+cdef inline void begin_interior(newton_t* n, double delta, double share) noexcept nogil:
+    """A first point near H z = g, all boundaries left by what the worst of them needs; one factor."""
     cdef system_t* s = &n.s
     cdef interior_t* p = &n.ip
     cdef int32_t m = s.e.m
@@ -57,10 +57,7 @@ cdef inline void begin_interior(newton_t* n, double delta, double share, bint ap
     system_solve(s, OF_BARRIER, s.e.g, p.z)
     take(n, p.everything, p.z)                          # where all rows hold, the answer
     system_times(s, p.z, p.hz)
-    if apart:
-        p.degree = ipm_start_apart(s.e, p.hz, 0.1, p.z, p.u1, p.u2)     # of mean sizes (measured: 0.03 to 1)
-    else:
-        p.degree = ipm_start(s.e, p.hz, 0.01, p.z, p.u1, p.u2)          # of the first impulses (measured: 0.001 to 1)
+    p.degree = ipm_start(s.e, p.hz, 0.01, p.z, p.u1, p.u2)      # of the first impulses (measured: 0.001 to 1)
     system_times(s, p.z, p.hz)
 
 

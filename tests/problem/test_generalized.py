@@ -350,7 +350,7 @@ def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(frictio
     problem = random_general(seed, friction, n=24, compliance=False)
     whole, cut = problem.start(), problem.start()
     end, counts = general.prepare(problem).run(whole, 1e-9, 90)
-    kernel, done, now, again = general.prepare(problem), np.zeros(5, int), ENDS["spent"], False
+    kernel, done, now, again = general.prepare(problem), np.zeros(4, int), ENDS["spent"], False
     while now == ENDS["spent"] and done[0] < 90:
         now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), again)
         done, again = done + more, kernel.waits

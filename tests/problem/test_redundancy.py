@@ -74,6 +74,31 @@ def test_rank_is_that_of_numpy(seed):
 
 
 @given(seed=seeds)
+def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
+    rng = np.random.default_rng(seed)
+    m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
+    g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
+    a = g * signs @ g.T
+    a = np.block(
+        [[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]]
+    )
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
+    found = redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))
+    assert not found.slack_is_unique and found.unique == ()
+    kept = np.setdiff1d(np.arange(m + 2), found.rows)
+    assert np.linalg.matrix_rank(a[kept], tol=1e-9 * np.linalg.norm(a, 2)) == found.rank
+    previous = rng.normal(size=m + 2)
+    near = found.nearest_to(previous)
+    for null in np.linalg.svd(a)[2][found.rank :]:
+        assert (
+            abs(null @ (problem.d * (near - previous))) < 1e-5 * np.abs(problem.d).max() * np.abs(near).max()
+        )
+    with pytest.raises(lv.CapabilityError, match="semidefinite"):
+        redundancy(lv.Problem.lcp(a, problem.b)).least_norm()
+
+
+@given(seed=seeds)
 def test_without_the_redundant_rows_the_rank_is_the_same(seed):
     problem = as_matrix(random_contact_problem(seed, tangents=0, spin=False, bodies=2, contacts=12))
     a = problem.dense()
@@ -242,6 +267,6 @@ def test_beside_a_diagonal_1e26_times_larger_a_row_is_still_a_row():
 
 
 def test_a_diagonal_that_is_rounding_is_not_scaled_by():
-    # 1e-17 beside 1e-3: no semidefinite matrix, and so no size of the row.
-    found = lv.redundancy(lv.Problem.linear([[1e-17, 1e-3], [1e-3, 1.0]], [0.0, 0.0]))
+    # 1e-27 beside 1e-13: semidefinite to rounding alone, and so no size of the row.
+    found = lv.redundancy(lv.Problem.linear([[1e-27, 1e-13], [1e-13, 1.0]], [0.0, 0.0]))
     assert found.rank == 1

@@ -476,6 +476,21 @@ def test_a_frame_has_the_rows(real):
     assert frame["relative"].tolist() == [r.relative for r in real[0]]
 
 
+def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_name_of_a_structure():
+    made = [record(f"stack[{i}]", "x", 1e-3, 1e-8, step=i) for i in range(2)]
+    found = records_of(record("a", "x", 1e-5, 1e-8), *made)
+    for i in range(3):  # the pass ended after two of three steps
+        found.add(dataclasses.replace(info(f"stack[{i}]"), sequence="stack", step=i))
+    lines = report.advice(found, [1.0])
+    assert [(x.name, x.size, x.sequence) for x in lines] == [("stack", 1, False), ("stack", 3, True)]
+    for line, solved in zip(lines, (1, 2), strict=True):
+        for best in (line.by_level[1e-6].best, line.by_time[1.0].best):
+            assert (best.solved, best.cases) == (solved, line.size)
+    # charged the time limit of 2 s, as a case is
+    score = lines[1].by_level[1e-6].best.score
+    assert score == pytest.approx((1e-3**2 * 2.0) ** (1 / 3), rel=0.05)
+
+
 def test_sequences_are_compared_carried_against_cold(tmp_path):
     a = np.diag(np.full(6, 2.0)) - np.diag(np.ones(5), 1) - np.diag(np.ones(5), -1)
     problems = [lv.Problem.lcp(a, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]

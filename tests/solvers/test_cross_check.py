@@ -99,6 +99,9 @@ def test_coulomb_and_asymmetric_have_no_reference():
     assert "not symmetric" in table.reference_note
     assert table["osqp"].verdict == check.REFUSED
     assert "symmetric" in table["osqp"].note
+    table = cross_check(lv.Problem.lcp([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]), ["newton"], reference="direct")
+    assert table.reference is None and table["newton"].verdict == check.AGREES_UNCOMPARED
+    assert "not positive semidefinite" in table.reference_note
 
 
 # -- claims ---------------------------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 from typing import Any
 
@@ -26,6 +26,7 @@ __all__ = [
     "advice_by_time",
     "counts_sweeps",
     "quantile",
+    "steps_of",
     "time_budgets",
     "to_level",
     "within",
@@ -128,18 +129,18 @@ class Line:
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget."""
     times = tuple(times) or time_budgets(records)
-    ways, sequences = _ways(records), _sequences(records)
-    swept = {(a.family, a.target): a for a in advice_by_sweeps(records)}
+    ways, swept = _ways(records), _swept(records)
     return [
         Line(
             name=name,
             size=len(cases),
-            sequence=name in sequences,
+            sequence=is_sequence,
             by_level={x: to_level(records, name, cases, x, ways) for x in levels_of(records)},
             by_time={t: within(records, name, cases, t, ways) for t in times},
-            by_sweeps={n: a for (family, n), a in swept.items() if family == name},
+            by_sweeps={float(n): _with_sweeps(records, name, cases, n, some) for n, some in swept.items()},
         )
-        for name, cases in [*families(records).items(), *sequences.items()]
+        for is_sequence, groups in ((False, families(records)), (True, steps_of(records)))
+        for name, cases in groups.items()
     ]
 
 
@@ -172,7 +173,7 @@ def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice
 
 def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
     """For each sequence, by level and by time of a step: which solver and budget, carried or cold."""
-    times, ways, sequences = tuple(times) or time_budgets(records), _ways(records), _sequences(records)
+    times, ways, sequences = tuple(times) or time_budgets(records), _ways(records), steps_of(records)
     return (
         [to_level(records, s, c, x, ways) for s, c in sequences.items() for x in levels_of(records)],
         [within(records, s, c, t, ways) for s, c in sequences.items() for t in times],
@@ -184,6 +185,17 @@ def advice_by_sweeps(records: Records) -> list[Advice]:
 
     Solvers whose iterations are sweeps: the others' cost nobody can compare by number.
     """
+    groups = [*families(records).items(), *steps_of(records).items()]
+    swept = _swept(records)
+    return [_with_sweeps(records, name, cases, n, swept[n]) for name, cases in groups for n in swept]
+
+
+def _with_sweeps(records: Records, name: str, cases: Sequence[str], n: int, ways: Ways) -> Advice:
+    return replace(within(records, name, cases, math.inf, ways), target=float(n))
+
+
+def _swept(records: Records) -> dict[int, Ways]:
+    """By budget, the solvers whose iterations are sweeps."""
     ways: dict[int, dict[tuple[str, str, str], _Way]] = defaultdict(dict)
     for r in records:
         plain = r.order == "given" and not r.turns and r.start in ("cold", "carried") and r.usable
@@ -191,12 +203,7 @@ def advice_by_sweeps(records: Records) -> list[Advice]:
             start = "" if r.step < 0 else r.start
             way = ways[r.max_iter].setdefault((r.solver, "", start), _Way(r.solver, start, r.max_iter))
             way.runs[r.case] = [r]
-    groups = [*families(records).items(), *_sequences(records).items()]
-    return [
-        within(records, name, cases, math.inf, ways[n], float(n))
-        for name, cases in groups
-        for n in sorted(ways)
-    ]
+    return {n: ways[n] for n in sorted(ways)}
 
 
 @dataclass(frozen=True)
@@ -237,7 +244,8 @@ def _ways(records: Records) -> Ways:
     return found
 
 
-def _sequences(records: Records) -> dict[str, list[str]]:
+def steps_of(records: Records) -> dict[str, list[str]]:
+    """The steps of each sequence, those that nobody was asked for, too."""
     ran = {r.case for r in records if r.step >= 0}
     found: dict[str, list[str]] = {}
     for name, info in records.cases.items():
@@ -268,17 +276,12 @@ def to_level(
 
 
 def within(
-    records: Records,
-    family: str,
-    cases: Sequence[str],
-    limit: float,
-    ways: Ways | None = None,
-    target: float | None = None,
+    records: Records, family: str, cases: Sequence[str], limit: float, ways: Ways | None = None
 ) -> Advice:
     """Who comes closest on these cases, or steps, within a time [s]; see `advice_by_time`.
 
     A run that takes the time within noise may be in it or not the next time: who would be the best with it is
-    as good as the best. `target` stands in the place of the time where that is something else.
+    as good as the best.
     """
     taking, liars = _taking(cases, _ways(records) if ways is None else ways), _liars(records, cases)
 
@@ -291,7 +294,7 @@ def within(
         return (way.solver in liars, -served), choice
 
     places = _best_of_each(standing(way, limit) for way in taking)
-    found = ranked(family, limit if target is None else target, places, RESIDUAL_NOISE)
+    found = ranked(family, limit, places, RESIDUAL_NOISE)
     if found.best is None or math.isinf(limit):
         return found
     late = {c.solver: (key, c.score) for key, c in _best_of_each(standing(w, NOISE * limit) for w in taking)}

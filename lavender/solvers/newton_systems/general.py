@@ -18,7 +18,7 @@ from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"
 # Steps for each island between two looks at the clock and at Ctrl-C, at most as many as are counted for WATCHED [s]: at
-# FLOP, LOOKED_UP times as much where a sparse factor looks for its entries. With a time limit at most as many as a
+# FLOP, LOOKED_UP times as much where a factor looks for its entries. With a time limit at most as many as a
 # share of what is left is for: counted so, then at the pace so far, and at FLOP at least: the first may be cheap ones.
 CLOCK = 64
 WATCHED = 4.0
@@ -35,7 +35,7 @@ _STATUS = {
     ENDS["failed"]: Status.NUMERICAL_ERROR,
     ENDS["lost"]: Status.DIVERGED,
 }
-_WORDS = ("factorisations", "updates", "Coulomb rounds", "line evaluations")
+_WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
 def prepare(problem: Problem) -> Newton | None:
@@ -66,7 +66,7 @@ def run(
     `again`: on from where a run before, to the same tol, has used up its steps.
     """
     deadline, watch = Deadline(time_limit), Stopwatch()
-    counts = np.zeros(5, np.int64)
+    counts = np.zeros(4, np.int64)
     status, closer = Status.MAX_ITERATIONS, 1.0
     now = 0.0
     islands = max(1, kernel.islands)
@@ -112,7 +112,7 @@ def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
 
 
 def claim(status: Status, counts: Any) -> Claim:
-    """What (steps, factorisations, updates, rounds, evaluations) come to in words."""
+    """What (steps, factorisations, rounds, evaluations) come to in words."""
     done, *parts = (int(c) for c in counts)
     work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
     return Claim(status, done, work, form=FORM)
