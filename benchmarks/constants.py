@@ -131,7 +131,7 @@ def clock_of_the_process() -> Iterator[None]:
 @click.option("--factors", default="0.5,2", show_default=True, help="What each is multiplied by.")
 @click.option("--limits/--no-limits", default=False, help="Under time limits instead.")
 def command(names: tuple[str, ...], families: str, seeds: int, factors: str, limits: bool) -> None:
-    """Halve and double the constants of auto that are called NAME, such as AGAIN or BELIEVED."""
+    """Halve and double the constants of auto that are called NAME, such as FIRST or BELIEVED."""
     lv.solve(suite.case("wild(seed=3)").problem)
     problems = [
         (name, suite.case(name).problem)

@@ -134,7 +134,6 @@ PARTS: dict[str, Part] = {
     "SuperLU after panels": (matrix, [(sparse, "sparse_lu", _singular)], {}),
     "panels over bodies": (bodies, [(systems, "PANELS", math.inf)], {}),
     "block rows over bodies": (bodies, [(systems, "PANELS", 0.0)], {}),
-    "dissection": (bodies, [(systems, "dissected", lambda n, a, p, i: (p, i, None, None, None))], {}),
 }  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem
 from lavender.registry import available, get, known
 from lavender.residuals import FLOOR_MOST, WRONG
-from lavender.solution import Solution, Status
+from lavender.solution import Solution, Status, uninterrupted
 from lavender.solve import solve
 
 __all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
@@ -185,7 +185,7 @@ def cross_check(
             rows.append(CrossCheckRow(name, REFUSED, note=reason))
             continue
         try:
-            solution = solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit)
+            solution = uninterrupted(solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit))
         except InputError:
             raise
         except LavenderError as error:  # refused only after a look at the numbers
@@ -216,7 +216,9 @@ def _reference(
         try:
             spec = get(name)
             budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
-            solution = solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
+            solution = uninterrupted(
+                solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
+            )
         except LavenderError as error:
             failed.append(f"{name}: {error}")
             continue

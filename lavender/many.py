@@ -17,7 +17,7 @@ import numpy as np
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.solution import Solution
+from lavender.solution import Solution, uninterrupted
 from lavender.solve import check_budget, of_batch, solve
 from lavender_ext.few.many import Batch
 
@@ -58,6 +58,8 @@ def solve_many(
         `threads` is not a whole number from 1, `impulses` of another length than `problems`, `impulse`, or as `solve`.
     UnknownName, CapabilityError, SolverUnavailable
         As `solve`, for the first problem that is refused.
+    KeyboardInterrupt
+        Ctrl-C.
     """
     given = list(problems)
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
@@ -84,7 +86,8 @@ def solve_many(
         _batch(given, starts, part, tol, spec, made)
 
     def alone(i: int) -> None:
-        made[i] = solve(given[i], solver, impulse=starts[i], **more)
+        found = solve(given[i], solver, impulse=starts[i], **more)
+        made[i] = found if "callback" in options else uninterrupted(found)
 
     parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []
     if threads == 1:

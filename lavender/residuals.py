@@ -49,10 +49,14 @@ from lavender_ext.judge import measure
 
 __all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
 
-FLOOR_MOST = 1e-5  # relative residual above which no floor of float64 excuses it, see `at_floor`
+FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
 AT_REST = 1e-9  # m/s, V0 below which nobody could tell doing nothing from a solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
 CHUNK = 2**22  # numbers of J M^-1 that are formed at once: 32 MB
+
+at_floor = (
+    measure.at_floor
+)  # (relative, floor): the test of every solver and of the judge, its reason with it
 
 AT_FLOOR, EARLY, WRONG = "at its floor", "stopped early", "wrong"
 
@@ -155,16 +159,6 @@ class Residual:
         if self.rounding is None:
             return text
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
-
-
-def at_floor(relative: float, floor: float) -> bool:
-    """Whether a relative residual is within twice its floor, both finite, and at most 1e-5.
-
-    The floor grows with the impulse, so one that runs away, as where there is no solution, excuses any residual: it
-    says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave; the worst
-    conditioned problems of the suite and the tests, condition of M up to 1e16, end below 1e-5.
-    """
-    return relative <= 2.0 * floor < math.inf and relative <= FLOOR_MOST
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:

@@ -274,5 +274,12 @@ class Solution:
         )
 
 
+def uninterrupted(solution: Solution) -> Solution:
+    """The solution, for callers that go on with it or to the next: KeyboardInterrupt where Ctrl-C ended its solve."""
+    if solution.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return solution
+
+
 def _restored(values: dict[str, Any]) -> Solution:
     return Solution.of(values | {"work": MappingProxyType(values["work"])})

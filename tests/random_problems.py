@@ -8,22 +8,11 @@ import numpy as np
 import scipy.sparse as sp
 
 import lavender as lv
+from lavender.scene.parts import rotation
 
 
-def rotation(rng):
-    q = rng.normal(size=4)
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def unit(rng):
-    x = rng.normal(size=3)
+def unit(rng, n=3):
+    x = rng.normal(size=n)
     return x / np.linalg.norm(x)
 
 
@@ -32,7 +21,7 @@ def random_rows(rng, bodies=5, joints=3, contacts=8):
     mass = rng.uniform(0.5, 3.0, bodies)
     inertia = [
         r @ np.diag(rng.uniform(5.0, 12.0, 3)) @ r.T / m
-        for m, r in zip(mass, (rotation(rng) for _ in mass), strict=True)
+        for m, r in zip(mass, (rotation(unit(rng, 4)) for _ in mass), strict=True)
     ]
 
     def pair():

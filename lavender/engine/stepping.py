@@ -24,7 +24,7 @@ from lavender.problem import Problem
 from lavender.registry import get
 from lavender.scene import Scene
 from lavender.scene.steppers import get_stepper
-from lavender.solution import Solution, Status
+from lavender.solution import Solution, uninterrupted
 from lavender.solve import solve
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.warm_start import Tried, claim_of
@@ -368,8 +368,8 @@ class Stepping:
         solution = solve(
             problem, p.solver, impulse=guess, max_iter=self.solver_iterations, **p.solver_options
         )
-        if solution.status is Status.INTERRUPTED and "callback" not in p.solver_options:
-            raise KeyboardInterrupt  # the front door has turned it into a result; half a solve is no step
+        if "callback" not in p.solver_options:
+            uninterrupted(solution)  # half a solve is no step
         self._last = solution
         if solution.success or solution.residual.at_floor:
             return solution.impulse

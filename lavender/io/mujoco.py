@@ -68,6 +68,9 @@ UNSEEN = 1e-8  # m/s: what differs by less is nothing that happens (six boxes at
 SUMMED = (
     2.0**-40
 )  # of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
+ALIKE = (
+    1e-10  # -, least over largest singular value of a body's axes from which its velocities are told apart
+)
 # Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
@@ -92,7 +95,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     ----------
     model : mujoco.MjModel
     data : mujoco.MjData
-        After `mj_forward` or `mj_step`.
+        After `mj_forward` or `mj_step`; v* is of the velocities before the step.
     name : str
         Name of the problem; "(noslip)" is added where `noslip_iterations` moved MuJoCo's impulses off its solution.
 
@@ -111,7 +114,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     CapabilityError
         The data belong to another problem than J, M and R: an integrator that treats damping inside M
         (`integrator="discrete"`), a Jacobian that is not the one of the forward pass (`opt.jacobian` changed since),
-        or a copy that lacks what the problem needs.
+        or a copy that lacks what the problem needs; after `mj_step`, joints of one body that move it alike.
     """
     mj = _mujoco(model, data)
     opt = model.opt
@@ -123,7 +126,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     jac = _rows(mj, model, data, m, n, scale)
     _check_smooth(model, data, mass, smooth)
     free = dt * smooth
-    general = Generalized.compressed(jac, mass, data.qvel + free)
+    general = Generalized.compressed(jac, mass, _before(model, data) + free)
     own, target, softness, gap = export.numbers(force, data.efc_aref, data.efc_R, data.efc_D, scale, dt)
     rhs = general.operator.bias(free if general.order is None else free[general.order], target)
     noslip = opt.noslip_iterations > 0
@@ -289,6 +292,30 @@ def _compliance(data: Any) -> FloatArray:
             "this MjData, or copy both from where the step ran"
         )
     return np.where(empty, 1.0 / inverse, r)
+
+
+def _before(model: Any, data: Any) -> FloatArray:
+    """Velocities (nv,) of the forward pass: qvel, or after a step what those of bodies, made before it, tell."""
+    parent, bodies, axis, spatial = model.body_parentid, model.dof_bodyid, data.cdof, data.cvel
+    gap, size = export.motion_gap(parent, bodies, axis, spatial, data.qvel)
+    if gap < 0.0:
+        raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
+    unfilled = not np.any(spatial) and np.any(data.efc_vel)  # by a copy
+    if gap <= SUMMED * size or unfilled:
+        return data.qvel
+    v, known = np.array(data.qvel), True
+    for body in np.unique(bodies):
+        own = np.flatnonzero(bodies == body)
+        rest = spatial[body] - spatial[parent[body]] - v[own] @ axis[own]
+        change, _, rank, _ = np.linalg.lstsq(axis[own].T, rest, rcond=ALIKE)
+        v[own] += change
+        known &= bool(rank == len(own))
+    if not known or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
+        raise CapabilityError(
+            "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
+            "MjData was changed since its forward pass: run mj_forward"
+        )
+    return v
 
 
 def _check_smooth(model: Any, data: Any, mass: Any, smooth: Any) -> None:

@@ -154,6 +154,16 @@ def _measured(problem: Problem, x: FloatArray, reference: Reference) -> MotionEr
     return MotionError(**values, reference=reference, note="; ".join(n for n in notes if n), _problem=problem)
 
 
+def in_own_rows(problem: Problem, x: FloatArray, found: MotionError) -> MotionError:
+    """`rows` and `row` where contacts are ellipses, whose disks the error was measured on; x (m,) [N s] theirs."""
+    if found.rows is None:
+        return found
+    delta = x - found.reference.impulse
+    w = (kept(problem.disk).operator.slack(delta)[0] + problem.disk.b) / problem.cones.stretch
+    row, rows = _largest(np.abs(w))
+    return told(replace(found, row=row, rows=rows), ("rows",))
+
+
 def _ratio(x: float, reference: float) -> float:
     return 0.0 if x == 0.0 else x / reference if reference > 0.0 and x < math.inf else math.inf
 

@@ -61,17 +61,18 @@ def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
         scale = 1.0 / np.sqrt(problem.d)
         a = scale[:, None] * problem.dense() * scale
         b = scale * problem.b
+        unit = float(np.abs(b).max(initial=0.0)) or 1.0  # sqrt J: the largest number of a system is 1
+        b, scale = b / unit, unit * scale
         ways = [w for i in range(c.n_blocks) for w in _ways(problem, i, a, b, scale)]
     if not all(np.isfinite(part).all() for way in ways for part in way):
         return None
     found, whole = [], True
     left = SINGULAR
     for equal, rhs, above, bound in _systems(ways):
-        size = 1.0 + np.abs(b).max(initial=0.0)
         value = np.linalg.svd(equal, compute_uv=False)
         regular = value[:, -1] > NULL * value[:, 0]
         x = np.linalg.solve(equal[regular], rhs[regular][:, :, None])[:, :, 0]
-        slop = SLOP * np.maximum(size, np.abs(x).max(axis=1, initial=0.0))
+        slop = SLOP * np.maximum(1.0, np.abs(x).max(axis=1, initial=0.0))
         inside = np.all(np.einsum("kij,kj->ki", above[regular], x) >= bound[regular] - slop[:, None], axis=1)
         found += list(scale * x[inside])
         equal, rhs, above, bound = equal[~regular], rhs[~regular], above[~regular], bound[~regular]
@@ -80,12 +81,12 @@ def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
         along = inverse * np.einsum("klj,kl->kj", u, rhs)
         x = np.einsum("kji,kj->ki", vt, along)
         off = np.abs(np.einsum("kij,kj->ki", equal, x) - rhs).max(axis=1, initial=0.0)
-        for i in np.flatnonzero(off <= SLOP * size):
+        for i in np.flatnonzero(off <= SLOP):
             null = vt[i][inverse[i] == 0.0].T
             left -= null.shape[1] > 1
             if left < 0:
                 return found, False
-            y = _within(above[i] @ null, bound[i] - above[i] @ x[i] - SLOP * size)
+            y = _within(above[i] @ null, bound[i] - above[i] @ x[i] - SLOP)
             if y is not None:
                 whole &= bool(np.abs(a @ null).max() <= SLOP)
                 found.append(scale * (x[i] + null @ y))

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lavender._arrays import FloatArray, read_only
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import CapabilityError
 from lavender.motion import operator as operators
 from lavender.motion.bound import Witness, witness
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
-from lavender.solution import Solution
+from lavender.solution import Solution, uninterrupted
 from lavender.solve import solve
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def reference(problem: Problem) -> Reference:
     """
     own = kept(problem)
     if own.reference is None:
-        found = solve(problem, SOLVER, tol=ASKED)
+        found = uninterrupted(solve(problem, SOLVER, tol=ASKED))
         own.reference = judged(problem, found.impulse, f"{SOLVER}: {found.message}")
     return own.reference
 
@@ -112,10 +112,11 @@ def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
 
 def as_reference(problem: Problem, given: Any) -> Reference:
     """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s]."""
+    solver, impulse = "given", given
     if isinstance(given, Reference):
-        if given.impulse.shape != (problem.m,):
-            raise InputError(f"the reference has {len(given.impulse)} rows; the problem has {problem.m}")
-        return given
-    if isinstance(given, Solution):
-        return judged(problem, problem.impulse_array(given.impulse, "reference"), given.solver.name)
-    return judged(problem, problem.impulse_array(given, "reference"), "given")
+        if given.residual._problem is problem:
+            return given
+        solver, impulse = given.solver, given.impulse  # of another problem, or an equal one: judged anew
+    elif isinstance(given, Solution):
+        solver, impulse = given.solver.name, given.impulse
+    return judged(problem, problem.impulse_array(impulse, "reference"), solver)

@@ -19,7 +19,7 @@ from lavender._later import sparse as sp
 from lavender.cones import ROW, project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
-from lavender.motion.error import SAME, MotionError, measure, told
+from lavender.motion.error import SAME, MotionError, in_own_rows, measure, told
 from lavender.motion.modes import enumerated
 from lavender.motion.reference import Reference, as_reference, judged, kept
 from lavender.motion.reference import reference as reference_of
@@ -27,6 +27,7 @@ from lavender.motion.unique import uniqueness
 from lavender.problem import Problem, check_problem
 from lavender.registry import available, get
 from lavender.residuals import residual
+from lavender.solution import uninterrupted
 from lavender.solve import solve
 
 __all__ = [
@@ -169,7 +170,8 @@ class Motions:
         out: dict[str, Pick | None] = {}
         for name in available(p) if solvers is None else solvers:
             try:
-                found = solve(p, name, tol=tol, max_iter=max_iter if get(name).resumable else None)
+                budget = max_iter if get(name).resumable else None
+                found = uninterrupted(solve(p, name, tol=tol, max_iter=budget))
             except CapabilityError:
                 continue
             out[name] = None
@@ -193,6 +195,7 @@ class Motions:
         return "\n".join([head, *(f"  {i}: {motion}" for i, motion in enumerate(self.motions))])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # what is not finite is no solution
 def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = False) -> Motions:
     """The motions that solve a problem: from several starts, in several orders, by several solvers, or all of them.
 
@@ -228,9 +231,10 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     whole = bool(proof)
     if (always or not proof) and (modes := enumerated(problem)) is not None:
         best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
+        speed = float(np.max(np.abs(problem.b), initial=0.0)) or 1.0  # m/s, of which 1e-9 is rounding
         single = {
-            tuple(np.round(problem.slack(x), 9)): x for x in best_last
-        }  # m/s: modes that share a motion
+            tuple(np.round(problem.slack(x) / speed, 9)): x for x in best_last
+        }  # modes that share a motion
         ends = [judged(problem, x, "every mode") for x in list(single.values())[:MANY]]
         solved = [end for end in ends if end.accepted]
         found += [(end, "every mode") for end in solved]
@@ -282,7 +286,7 @@ def branch(problem: Problem, impulse: Any) -> Reference:
     for name in ("anderson", "newton"):
         if name not in available(problem):
             continue
-        end = solve(problem, name, impulse=x, tol=ASKED)
+        end = uninterrupted(solve(problem, name, impulse=x, tol=ASKED))
         new = judged(problem, end.impulse, f"{name} from it") if np.isfinite(end.impulse).all() else None
         if new is not None and (found is None or new.residual.relative < found.residual.relative):
             found = new
@@ -295,9 +299,9 @@ def compliant(problem: Problem) -> FloatArray:
     """Where softness that vanishes leads: compliance s d on every row, s from 1 to 1e-12, then none; (m,) [N s]."""
     x, s = problem.start(), SOFTEST
     while s >= HARDEST:
-        x = np.array(solve(softened(problem, s), "auto", impulse=x, tol=1e-12).impulse)
+        x = np.array(uninterrupted(solve(softened(problem, s), "auto", impulse=x, tol=1e-12)).impulse)
         s *= STEP
-    return np.array(solve(problem, "auto", impulse=x, tol=1e-13).impulse)
+    return np.array(uninterrupted(solve(problem, "auto", impulse=x, tol=1e-13)).impulse)
 
 
 def softened(problem: Problem, share: float) -> Problem:
@@ -330,7 +334,9 @@ def search(problem: Problem, own: Reference, n: int, seed: int) -> Iterator[tupl
         start = _start(problem, own, rng, max(turn - spec.order, 0))
         limit = budget if spec.resumable else spec.max_iter
         try:
-            end = solve(problem, spec.name, impulse=start[1], tol=ASKED, max_iter=limit, **options)
+            end = uninterrupted(
+                solve(problem, spec.name, impulse=start[1], tol=ASKED, max_iter=limit, **options)
+            )
         except LavenderError:  # refused after a look at the numbers
             continue
         if np.isfinite(end.impulse).all():
@@ -443,11 +449,13 @@ def motion_error(problem: Problem, impulse: Any, reference: Any = None) -> Motio
     """
     check_problem(problem)
     x = problem.on_disk(problem.impulse_array(impulse))
-    if problem.cones.has_ellipse:  # rows are those of its disks
+    if problem.cones.has_ellipse:  # measured on its disks
         if reference is not None and not isinstance(reference, Reference):
             given = problem.impulse_array(getattr(reference, "impulse", reference), "reference")
             reference = problem.on_disk(given)
-        problem = problem.disk
+        found = motion_error(problem.disk, x, reference)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return in_own_rows(problem, x, found)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is told in `note`
         if reference is not None:
             return measure(problem, x, as_reference(problem, reference))

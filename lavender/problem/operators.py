@@ -59,8 +59,9 @@ class Operators(ProblemData):
             return True
         if not self.is_symmetric:
             return False
-        scale = sp.diags_array(1.0 / np.sqrt(self.d))
-        return semidefinite(scale @ (0.5 * (self.csr + self.csr.T)) @ scale)
+        with np.errstate(all="ignore"):  # what overflows warns nobody
+            scale = sp.diags_array(1.0 / np.sqrt(self.d))
+            return semidefinite(scale @ (0.5 * (self.csr + self.csr.T)) @ scale)
 
     @once
     def data(self) -> Data:

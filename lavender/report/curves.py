@@ -45,6 +45,13 @@ class Curve:
     low: tuple[float, ...] = ()  # of a band about the line, as `y`
     high: tuple[float, ...] = ()
 
+    @classmethod
+    def of(cls, solver: str, label: str, points: Iterable[tuple[float, float]], **more: Any) -> Curve:
+        """Through points; a residual of exactly zero is drawn at `TINY`, what is not finite breaks the line."""
+        x, y = zip(*points, strict=True)
+        drawn = tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in y)
+        return cls(solver, label, tuple(map(float, x)), drawn, **more)
+
     @property
     def front(self) -> Curve:
         """What was reached by each x: points in its order, each lower than all before."""
@@ -84,16 +91,8 @@ def work_precision(records: Records, case: str) -> Figure:
     for (name, solver, start), group in sorted(tables.pairs(records).items()):
         runs = _in_order_of_work([r for r in group if r.usable]) if name == case else []
         if runs:
-            curves.append(
-                Curve(
-                    solver,
-                    who(solver, start),
-                    tuple(r.time_min for r in runs),
-                    tuple(max(r.relative, TINY) for r in runs),
-                    tuple(r.asked for r in runs),
-                    thin=start != "cold",
-                )
-            )
+            points, asked = [(r.time_min, r.relative) for r in runs], tuple(r.asked for r in runs)
+            curves.append(Curve.of(solver, who(solver, start), points, notes=asked, thin=start != "cold"))
     return Figure(
         "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=_floor(records, [case]),
@@ -185,15 +184,7 @@ def budget_figure(records: Records, case: str) -> Figure:
     curves = []
     for (name, solver, start), points in sorted(tables.budgets(records).items()):
         if name == case:
-            curves.append(
-                Curve(
-                    solver,
-                    who(solver, start),
-                    tuple(float(n) for n, _ in points),
-                    tuple(max(r, TINY) for _, r in points),
-                    thin=start != "cold",
-                )
-            )
+            curves.append(Curve.of(solver, who(solver, start), points, thin=start != "cold"))
     return Figure(
         "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
         levels=tables.levels_of(records), floor=_floor(records, [case]),
@@ -208,15 +199,8 @@ def pass_figure(sequence: str, passes: list[tables.Pass]) -> Figure:
         for start, residuals in sorted(w.residuals.items()):
             values = w.times[start] if timed else residuals
             cold = start == "cold" and len(w.residuals) > 1
-            curves.append(
-                Curve(
-                    w.solver,
-                    f"{w.solver} (cold)" if cold else w.solver,
-                    tuple(float(i) for i in range(len(values))),
-                    tuple(max(v, TINY) if math.isfinite(v) else math.nan for v in values),
-                    thin=cold,
-                )
-            )
+            label = f"{w.solver} (cold)" if cold else w.solver
+            curves.append(Curve.of(w.solver, label, enumerate(values), thin=cold))
     asked = passes[0].asked
     return Figure(
         f"sequence {sequence} {asked}", f"{sequence}: {asked}", "step",
@@ -241,14 +225,7 @@ def profile_figure(profile: tables.Profile) -> Figure:
 
     shown = [name for name in sorted(profile.curves, key=standing) if standing(name)[0] < 0.0][:LINES]
     curves = [
-        Curve(
-            name,
-            name,
-            tuple(r for r, _ in profile.curves[name]),
-            tuple(100.0 * s for _, s in profile.curves[name]),
-            steps=True,
-        )
-        for name in shown
+        Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
     ]
     left = sum(bool(steps) and steps[-1][1] > 0.0 for steps in profile.curves.values()) - len(curves)
     return Figure(

@@ -2,6 +2,9 @@
 
     A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
 
+Of a contact y is along its normal alone, as Coulomb's law needs, and z = A^T y obeys z_n + mu |z_t| <= 0, where the sum
+of |z_t| stands for its norm: what that proves is so, but two tangents leave a few proofs unfound.
+
 Of islands that proves it for one: those that are wrong are asked one by one, since a bound above in another one is
 in nobody's way.
 """
@@ -13,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender._later import sparse as sp
+from lavender.cones import ROW
 from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
@@ -30,9 +35,9 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 @np.errstate(all="ignore")  # what overflows is judged
 def certify(log: SolveLog) -> None:
-    """Look for a proof that an LCP without upper bounds has no solution, whatever its A."""
+    """Look for a proof that a problem without upper bounds has no solution, whatever its A."""
     problem = log.problem
-    if problem.law not in ("linear", "lcp") or log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM):
+    if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM):
         return
     asked = 0
     for part, rows in _parts(log):
@@ -75,24 +80,38 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
     """What a linear program finds, y (m,), to be checked."""
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
-    # max b.y, A^T y <= 0 (= 0 on free rows), 0 <= y <= 1, in units of d.
+    # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
     cones = problem.cones
-    free = np.isneginf(cones.lower) & np.isposinf(cones.upper)
+    contact = np.repeat(cones.kind != ROW, np.diff(cones.ptr))
+    free = np.isneginf(cones.lower) & np.isposinf(cones.upper) & ~contact
+    tangent = contact.copy()
+    tangent[cones.ptr[:-1][cones.kind != ROW]] = False
     scale = 1.0 / np.sqrt(problem.d)
+    normal = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))
+    limit = cones.reach * scale[normal] / scale
+    rim = sp.csr_array(
+        (limit[tangent], (normal[tangent], np.arange(tangent.sum()))), (problem.m, int(tangent.sum()))
+    )
     at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
     if not (np.isfinite(at.data).all() and np.isfinite(scale * problem.b).all()):
         return None
-    bounds = np.stack([np.where(free, -1.0, 0.0), np.ones(problem.m)], 1)
+    unit = sp.eye_array(rim.shape[1], format="csr")
+    below = ~free & ~tangent
+    rows = [[at[below], rim[below]], [at[tangent], -unit], [-at[tangent], -unit]]
+    above = sp.vstack([sp.hstack(x) for x in rows]).tocsr()
+    level = sp.hstack([at[free], rim[free]]).tocsr()
+    low = np.concatenate([np.where(free, -1.0, 0.0), np.zeros(rim.shape[1])])
+    high = np.concatenate([np.where(tangent, 0.0, 1.0), np.full(rim.shape[1], np.inf)])
+    gain = np.concatenate([scale * problem.b, np.zeros(rim.shape[1])])
     options: dict[str, Any] = {"maxiter": CERTIFICATE_STEPS * problem.m}
     if deadline.is_set:
         options["time_limit"] = deadline.left(1e-3)
     found = linprog(
-        -(scale * problem.b),
-        A_ub=at[~free] if (~free).any() else None, b_ub=np.zeros(int((~free).sum())) if (~free).any() else None,
-        A_eq=at[free] if free.any() else None, b_eq=np.zeros(int(free.sum())) if free.any() else None,
-        bounds=bounds, method="highs", options=options,
+        -gain, A_ub=above, b_ub=np.zeros(above.shape[0]), A_eq=level, b_eq=np.zeros(level.shape[0]),
+        bounds=np.stack([low, high], 1), method="highs", options=options,
     )  # fmt: skip
     if found.x is None:
         return None
-    y: FloatArray = np.where((found.x > 0.0) | free, found.x, 0.0) * scale
+    x = found.x[: problem.m]
+    y: FloatArray = np.where((x > 0.0) | free, x, 0.0) * scale
     return y

@@ -20,7 +20,7 @@ from lavender.solvers.costs import BOTH_WAYS, METHODS, TABLE, Cost, Costs
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.newton_systems import general
-from lavender.solvers.schedule import AGAIN, remainder
+from lavender.solvers.schedule import BELIEVED, remainder
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.few.looks import Looks, sweeps_left
@@ -68,7 +68,7 @@ class Candidate:
 
     def run(self, work: float, others: float) -> bool:
         self.others = others
-        n = self.steps(AGAIN * work if self.again else work)
+        n = self.steps(BELIEVED * work if self.again else work)
         if n <= 0:
             return False
         before = self.log.best

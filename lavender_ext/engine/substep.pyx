@@ -238,16 +238,18 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
 
 cdef int32_t finish(engine_t* e) noexcept nogil:
     cdef int32_t i, shifted, unsolved
-    cdef const double* by = e.shift if e.head[H_STEPPER] == SOFT_STEP else e.dv
+    cdef const double* by = e.dv
     cdef double* out = e.setting + S_OUT
-    if e.head[H_STEPPER] == XPBD:
-        by = NULL
     out[0] = e.head[H_ITERATIONS]
     out[1] = 1.0 if e.head[H_WARM_START] else 0.0
     out[2] = e.head[H_CONTACTS]
     out[3] = e.head[H_MATCHES]
     for i in range(e.size[N_JOINT_ROW]):
         e.joint_impulse[i] = e.impulse[i]
+    if e.head[H_STEPPER] == SOFT_STEP:
+        by = e.shift
+    elif e.head[H_STEPPER] == XPBD:
+        by = NULL
     unsolved = unsolved_body(e)
     store_contacts(e)
     shifted = project_positions(e)

@@ -268,6 +268,38 @@ def mass_mismatch(const int32_t[::1] mptr, const int32_t[::1] midx, const double
     return gap / big if big > 0.0 else 0.0
 
 
+def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
+               const double[:, ::1] spatial, const double[::1] v):
+    """How far the spatial velocities c (n, 6) of bodies are from those that v (nv) makes, and the largest term.
+
+        c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
+
+    0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
+    """
+    cdef Py_ssize_t i, j, k
+    cdef double term, big = 0.0, gap = 0.0, filled = 0.0
+    scratch = np.zeros((spatial.shape[0], 6))
+    cdef double[:, ::1] made = scratch
+    if not body.shape[0] == axis.shape[0] == v.shape[0] or parent.shape[0] != spatial.shape[0]:
+        return -1.0, 0.0
+    for i in range(spatial.shape[0]):
+        if not 0 <= parent[i] < spatial.shape[0]:
+            return -1.0, 0.0
+    for j in range(v.shape[0]):
+        if not 0 <= body[j] < spatial.shape[0]:
+            return -1.0, 0.0
+        for k in range(6):
+            term = axis[j, k] * v[j]
+            made[body[j], k] += term
+            big = widest(big, term)
+            filled = widest(filled, axis[j, k])
+    for i in range(1, spatial.shape[0]):
+        for k in range(6):
+            gap = widest(gap, made[i, k] + spatial[parent[i], k] - spatial[i, k])
+            big = widest(big, spatial[i, k])
+    return (gap if filled != 0.0 else 0.0), big
+
+
 def row_gaps(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale,
              const double[::1] rhs, const double[::1] impulse, double dt, bint euler, const double[:] v,
              const double[:] vel, const double[:] free, const double[:] b, const double[:] push, const double[:] a,

@@ -9,7 +9,7 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing, judge_view, relative_of, rows_slack,
                                          scratch_of)
-from lavender_ext.judge.score cimport are_numbers, norms_of_rhs, relative, score_rows, score_t
+from lavender_ext.judge.score cimport are_numbers, is_at_floor, norms_of_rhs, relative, score_rows, score_t
 
 
 def slack(Data p, const double[::1] lam, double[::1] w):
@@ -29,6 +29,11 @@ def slack(Data p, const double[::1] lam, double[::1] w):
     else:
         with nogil:
             csr_slack(&p.blocks, &p.csr, &lam[0], &w[0])
+
+
+def at_floor(double relative_, double floor):
+    """`is_at_floor` of judge/score.pxd."""
+    return is_at_floor(relative_, floor)
 
 
 def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floor=True):

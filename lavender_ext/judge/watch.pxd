@@ -20,7 +20,7 @@ from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
-from lavender_ext.judge.score cimport are_numbers, relative, score_t
+from lavender_ext.judge.score cimport are_numbers, is_at_floor, relative, score_t
 
 
 cpdef enum:
@@ -125,7 +125,7 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         judge_view(v, s.best, s.w, s.e, s.v, True, &x)
         floor = against_start(s, x.floor_energy, x.floor_velocity)
-        if s.best_relative <= 2.0 * floor and floor < inf:
+        if is_at_floor(s.best_relative, floor):
             copy(s.best, lam, p.n_rows)
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.best_relative):
@@ -158,7 +158,7 @@ cdef inline int32_t confirmed(const watch_t* s, const view_t* v, const double* l
     if status == CONVERGED:
         return RUNNING
     floor = against_start(s, x.floor_energy, x.floor_velocity)
-    return AT_FLOOR if now <= 2.0 * floor and floor < 1.0 / 0.0 else STALLED
+    return AT_FLOOR if is_at_floor(now, floor) else STALLED
 
 
 cdef inline int32_t due(watch_t* s, const view_t* v, const view_t* confirm, double* lam, double tol, int32_t* step) noexcept nogil:

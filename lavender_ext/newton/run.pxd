@@ -13,7 +13,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.judge.measure cimport judge_view, relative_of
-from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.score cimport is_at_floor, relative, score_t
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.scaling cimport (lay_elements, lay_numbers, scale_elements, scaled_index, scaled_real, scaled_t)
 from lavender_ext.newton.system cimport system_t, system_times
@@ -364,7 +364,7 @@ cdef inline bint at_floor(newton_t* n) noexcept nogil:
     if n.best > 1e-5:
         return False
     found = judged(n, n.best_z, True)
-    return found <= 2.0 * n.floor < 1.0 / 0.0 and found < 1.0
+    return is_at_floor(found, n.floor)
 
 
 cdef inline void put_aside(newton_t* n, double best, const double* z) noexcept nogil:

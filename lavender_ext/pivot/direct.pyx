@@ -23,7 +23,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of
-from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.score cimport is_at_floor, relative, score_t
 from lavender_ext.pivot.direct cimport HALVED, PASSED, SPENT, direct_t
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivots_solve,
                                            pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
@@ -77,14 +77,13 @@ cdef void direct_begin(direct_t* t, const double* start) noexcept nogil:
 
 
 cdef int32_t is_good(const direct_t* t) noexcept nogil:
-    """To rounding, or to the floor, which above 1e-6 belongs to an impulse that ran away, not to the problem."""
-    cdef double floor = t.floor if t.floor < 1e-6 else 1e-6
-    return t.relative <= (floor if floor > t.least else t.least)
+    """To rounding, or to the floor where it excuses that."""
+    return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))
 
 
 cdef int32_t is_end(const direct_t* t) noexcept nogil:
     """The same; where every row is free, rounding is all that can be left."""
-    return is_good(t) or (t.linear and t.relative <= 2.0 * (t.floor if t.floor < 1e-6 else 1e-6) and t.relative < 1.0)
+    return is_good(t) or (t.linear and is_at_floor(t.relative, t.floor))
 
 
 cdef inline void clip_rows(const direct_t* t, const double* x, double* out) noexcept nogil:

@@ -31,6 +31,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.order cimport next_random
+from lavender_ext.judge.score cimport is_at_floor
 from lavender_ext.pivot.direct cimport (HALVED, Pivoting, direct_begin, direct_begin_passes, direct_pass, direct_rounds, direct_t,
                                         judge_now)
 from lavender_ext.pivot.lemke cimport DONE, LATE, PIVOTS, RAY, dictionary_t, lemke_t
@@ -454,7 +455,7 @@ cdef void lemke_begin(lemke_t* l) noexcept nogil:
 
 
 cdef inline int32_t is_good_enough(const direct_t* t) noexcept nogil:
-    return t.relative <= (2.0 * t.floor if 2.0 * t.floor > 1e-12 else 1e-12)
+    return t.relative <= 1e-12 or is_at_floor(t.relative, t.floor)
 
 
 cdef int32_t lemke_run(lemke_t* l, int32_t pivots) noexcept nogil:

@@ -459,6 +459,9 @@ def test_a_jacobian_that_did_not_make_the_data_is_refused(factor, stepped, movin
 def test_vectors_that_a_copy_did_not_fill_tell_nothing_of_the_jacobian():
     model, data = state()
     right = lv.io.from_mujoco(model, data)
+    data.cvel[:] = 0.0
+    assert lv.io.from_mujoco(model, data) == right
+    data.cdof[:] = 0.0
     data.efc_vel[:] = data.efc_b[:] = 0.0
     data.qfrc_constraint[:] = 0.0
     assert lv.io.from_mujoco(model, data) == right
@@ -469,12 +472,29 @@ def test_vectors_that_a_copy_did_not_fill_tell_nothing_of_the_jacobian():
 def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, integrator):
     model, data = state(jacobian=jacobian)
     model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    problem = lv.io.from_mujoco(model, data)
     for _ in range(20):
         mj.mj_step(model, data)
         if integrator != "RK4":  # whose qacc is that of no single pass
-            assert lv.io.from_mujoco(model, data).m > 0
+            stepped, made = lv.io.from_mujoco(model, data), problem.generalized
+            assert stepped.m == problem.m
+            np.testing.assert_allclose(stepped.generalized.v_free, made.v_free, atol=1e-12, rtol=0)
+            assert np.array_equal(stepped.b, problem.b)
         mj.mj_forward(model, data)
-        assert lv.io.from_mujoco(model, data).m > 0
+        problem = lv.io.from_mujoco(model, data)
+
+
+def test_joints_that_move_one_body_alike_hide_the_velocity_before_a_step():
+    hinges = '<joint axis="0 1 0" armature="1"/><joint axis="0 1 0" armature="2"/>'
+    model = mj.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body>{hinges}<geom size=".1" pos=".2 0 0"/></body></worldbody></mujoco>'
+    )
+    data = mj.MjData(model)
+    mj.mj_step(model, data)
+    with pytest.raises(lv.CapabilityError, match="run mj_forward"):
+        lv.io.from_mujoco(model, data)
+    mj.mj_forward(model, data)
+    assert lv.io.from_mujoco(model, data).generalized.nv == 2
 
 
 @pytest.mark.parametrize("step", [0.0, -0.004, np.nan, np.inf])

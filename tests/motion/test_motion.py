@@ -1,6 +1,7 @@
 """Motion errors: the bound against a truth in long double, distances that mean what they say, several motions."""
 
 import warnings
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -542,3 +543,58 @@ def test_bounds_of_tiny_impulses_do_not_vanish():
     error = lv.motion_error(problem, [2e-170, 1e-170])
     assert error.energy == pytest.approx(np.sqrt(0.5) * 1e-170, rel=1e-12, abs=0.0)
     assert error.bound >= error.energy
+
+
+# -- whose reference, which rows, at what size ----------------------------------------------------------
+
+
+def test_a_reference_that_ctrl_c_ended_is_not_kept(monkeypatch):
+    module = import_module("lavender.motion.reference")
+    p, real = problems("cone", 8), module.solve
+
+    def interrupted(*args, **more):
+        return replace(real(*args, **more), impulse=p.start(), status=lv.Status.INTERRUPTED)
+
+    monkeypatch.setattr(module, "solve", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        lv.motion_error(p, p.start())
+    monkeypatch.undo()
+    assert lv.motion_error(p, p.start()).relative == pytest.approx(1.0)
+
+
+def test_a_reference_of_another_problem_is_judged_anew():
+    a = [[2.0, 1.0], [1.0, 2.0]]
+    one, two = lv.Problem.lcp(a, [1.0, 0.5]), lv.Problem.lcp(a, [5.0, 5.0])
+    other = lv.motion.reference(one)
+    e = lv.motion_error(two, other.impulse, reference=other)
+    assert not e.reference.accepted
+    assert e.relative is None
+    assert e.bound >= lv.motion_error(two, other.impulse).energy > 1.0
+    assert lv.motion_error(one, other.impulse, reference=other).reference is other
+    with pytest.raises(lv.InputError, match="reference"):
+        lv.motion_error(lv.Problem.lcp([[1.0]], [1.0]), [1.0], reference=other)
+
+
+@pytest.mark.parametrize("form", ["matrix", "bodies"])
+def test_rows_of_ellipses_are_the_problems_own(form):
+    p = lv.Problem.contact(np.eye(3), [10.0, 9.0, 9.0], mu=[(0.5, 0.005)], friction="cone")
+    if form == "bodies":
+        p = lv.Problem.from_jacobian(
+            np.eye(3), np.eye(3), np.zeros(3), target=p.b, cones=p.cones, friction="cone"
+        )
+    x = lv.solve(p, tol=1e-13).impulse
+    y = x.copy()
+    y[2] *= 0.5
+    e = lv.motion_error(p, y)
+    assert e.rows == pytest.approx(np.abs(p.slack(y) - p.slack(x)).max(), rel=1e-6)
+    assert e.row == 2
+    assert e.row_name == p.row_name(2)
+
+
+@pytest.mark.parametrize("size", [1e-10, 1e-100, 1e150, 1e299])
+def test_all_motions_are_all_at_every_size(size):
+    p = suite.case("painleve").problem
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = lv.motions(replace(p, b=p.b * size))
+    assert (len(found), found.all) == (3, True)

@@ -263,6 +263,25 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
 
 
+def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
+    asked = []
+
+    def run(problem, impulse):
+        asked.append(problem)
+        raise KeyboardInterrupt
+
+    name = plug_in(run)
+    for ask in (
+        lambda: lv.solve_many([random_lcp(14)] * 3, name),
+        lambda: lv.cross_check(random_lcp(14), [name, "pgs"]),
+        lambda: lv.motions(random_lcp(14)).picks([name, "pgs"]),
+    ):
+        before = len(asked)
+        with pytest.raises(KeyboardInterrupt):
+            ask()
+        assert len(asked) == before + 1
+
+
 def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
     class Few:
         def solve(self, problem, impulse, tol):
@@ -294,6 +313,35 @@ def test_an_impulse_that_ran_away_is_at_no_floor(name):
             solution.raise_for_status()
     assert lv.cross_check(NO_MOTION, [name])[name].verdict in ("not solved", "no solution, as proved")
     assert not lv.motion.reference(NO_MOTION).accepted
+    if name == "auto":
+        assert solution.status is lv.Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("tangents", [1, 2])
+def test_a_certificate_of_normals_is_found_where_there_is_one_and_nowhere_else(tangents):
+    """Two contacts push against each other, or let go of each other."""
+    rng = np.random.default_rng(tangents)
+    jac = rng.normal(size=(2 * (1 + tangents), 3))
+    jac[1 + tangents] = -2.0 * jac[0]  # the second normal, against the first
+    b = 0.1 * rng.normal(size=len(jac))
+    for push, solved in ((-1.0, True), (1.0, False)):
+        b[0], b[1 + tangents] = push, push
+        problem = lv.Problem.contact(jac @ jac.T, b, [0.05, 0.02])
+        solution = lv.solve(problem)
+        assert not solution.contradicted
+        assert solution.success is solved
+        assert (solution.status is lv.Status.INFEASIBLE) is not solved, solution
+
+
+def test_every_test_of_the_floor_has_one_limit():
+    from lavender.residuals import FLOOR_MOST, at_floor
+
+    assert at_floor(FLOOR_MOST, 1.0)
+    assert not at_floor(np.nextafter(FLOOR_MOST, 1.0), 1.0)
+    assert at_floor(2e-9, 1e-9)
+    assert not at_floor(2.1e-9, 1e-9)
+    assert not at_floor(0.0, np.inf)
+    assert not at_floor(np.nan, 1.0)
 
 
 def test_an_impulse_no_better_than_none_is_excused_by_nobody():

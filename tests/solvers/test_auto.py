@@ -139,7 +139,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
         def run(self, impulse, tol, steps, again):
             asked.append(steps)
             clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
-            return self.ends, np.array([steps, 0, 0, 0, 0])
+            return self.ends, np.array([steps, 0, 0, 0])
 
     monkeypatch.setattr(general, "FLOP", 1e-8)
     monkeypatch.setattr("lavender.deadline.perf_counter", lambda: clock[0])

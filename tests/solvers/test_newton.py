@@ -72,7 +72,7 @@ def test_many_bodies_on_one_leave_half_of_the_rows():
     # the entries of a full factor and an eighth of its work.
     problem = wild(seed=7012).problem
     assert problem.matrix is not None
-    assert systems.BOUNDED_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
+    assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
     system = make_system(problem, "impulse")
     assert not system.dense
     assert system.sparse.work < 0.2 * problem.m**3 / 3.0
@@ -98,7 +98,7 @@ def system_in(problem, form):
     """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
     if form != "sparse":
         return make_system(problem, form)
-    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, BOUNDED_FILL=2.0):
+    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, EARLY_FILL=2.0):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system

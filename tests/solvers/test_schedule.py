@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lavender.solvers.schedule import AGAIN, BELIEVED, race, remainder
+from lavender.solvers.schedule import BELIEVED, race, remainder
 
 costs = st.floats(1e-3, 1e6)
 
@@ -39,8 +39,8 @@ class Anew(Fake):
 
     def run(self, work, others):
         assert self.counted and not self.over
-        self.over = AGAIN * work >= self.needs
-        last = min(AGAIN * work, self.needs)
+        self.over = BELIEVED * work >= self.needs
+        last = min(BELIEVED * work, self.needs)
         self.spent += last
         self.rest = 2.0 * last
         return True
@@ -75,12 +75,12 @@ def test_methods_that_begin_anew_count_for_their_longer_turns(made, anew):
     fakes = [(Anew if a else Fake)(e, c, []) for (e, c, _), a in zip(made, anew, strict=False)]
     race(list(fakes), lambda: any(f.over for f in fakes))
     (winner,) = (f for f in fakes if f.over)
-    others = sum((1.0 + AGAIN) if isinstance(f, Anew) else 2.0 for f in fakes if f is not winner)
+    others = sum((1.0 + BELIEVED) if isinstance(f, Anew) else 2.0 for f in fakes if f is not winner)
     for j in fakes:
         if j.needs < inf:
             # r_j never exceeds what was expected, or twice its last run, which is shorter than it needs.
             most = max(j.expected, 2.0 * j.needs)
-            own = AGAIN * most + most if isinstance(winner, Anew) else 2.0 * most
+            own = BELIEVED * most + most if isinstance(winner, Anew) else 2.0 * most
             assert sum(f.spent for f in fakes) <= (others * most + own) * (1.0 + 1e-9)
 
 

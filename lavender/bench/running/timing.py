@@ -28,7 +28,7 @@ from lavender.external.stopwatch import own_time
 from lavender.outcome import finish
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solution import Claim, Solution, Status
+from lavender.solution import Claim, Solution, Status, uninterrupted
 from lavender.solve import prepare, solve
 
 __all__ = ["Ask", "Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
@@ -188,12 +188,12 @@ def attempt(problem: Problem, task: Task, impulse: Any = None) -> Outcome | str:
         with _undisturbed(task.solver):
             begun = perf_counter()
             if task.way and task.guarded:
-                guard = _uninterrupted(_parts(problem, task, impulse))
+                guard = uninterrupted(_parts(problem, task, impulse))
             left = max(1, task.repeats - (guard is not None))
             while left and (guard is None or guard.status is not Status.TIME_LIMIT):
                 paces.append(pace())
                 if not task.way:
-                    parts = _uninterrupted(_parts(problem, task, impulse))
+                    parts = uninterrupted(_parts(problem, task, impulse))
                     runs.append((parts, parts.setup_time + parts.solve_time))
                 else:
                     with own_time(task.solver) as spent:
@@ -235,12 +235,6 @@ def outcome_of(
         pace=paced,
         reached=tuple(float(s.residual.relative) for s in made) if reached else (),
     )
-
-
-def _uninterrupted(solution: Solution) -> Solution:
-    if solution.status is Status.INTERRUPTED:
-        raise KeyboardInterrupt
-    return solution
 
 
 def _cut_short(solution: Solution | None, task: Task) -> bool:
@@ -285,7 +279,7 @@ def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) ->
         fresh = replace(fresh, guess=None, copy=False)
     begun = perf_counter()
     solution = solve(fresh, task.solver, **more)
-    return _uninterrupted(solution), perf_counter() - begun + task.lead
+    return uninterrupted(solution), perf_counter() - begun + task.lead
 
 
 def judged(problem: Problem, task: Task, found: Outcome | str) -> tuple[Record, FloatArray | None]:

@@ -350,7 +350,7 @@ static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out
       COPY(s->chosen, s->impulse, s->p.n_rows);
       out->method = s->options.method;
     }
-    if (best <= budget->tol || (best <= 2.0 * found.floor && best < 1.0 && found.relative == best)) {
+    if (best <= budget->tol || (judge_score_is_at_floor(best, found.floor) && found.relative == best)) {
       out->outcome = best <= budget->tol ? LAV_CONVERGED : LAV_FLOOR;
       break;
     }

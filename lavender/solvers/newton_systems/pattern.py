@@ -9,9 +9,7 @@ import numpy as np
 from lavender._arrays import IntArray
 from lavender._later import sparse as sp
 from lavender_ext.factor import graph, symbolic
-from lavender_ext.factor.dissection import dissection
 
-LEAF = 4  # bodies of a part that is dissected no further
 FEW_BODIES = 1500  # up to here bits hold the neighbours of a body
 
 
@@ -39,18 +37,6 @@ def postordered(n: int, node: IntArray, nptr: IntArray, nind: IntArray) -> tuple
     row = np.repeat(np.arange(n), np.diff(nptr))
     off = nind < row
     return _pattern(n, node, nind[off].astype(np.int64), row[off].astype(np.int64), rank)
-
-
-def dissected(n: int, node: IntArray, nptr: IntArray, nind: IntArray) -> tuple[IntArray, ...]:
-    """The same pattern in an order by nested dissection; `turned` as there."""
-    row = np.repeat(np.arange(n), np.diff(nptr))
-    off = nind < row
-    low, high = nind[off].astype(np.int64), row[off].astype(np.int64)
-    at, near = np.concatenate([high, low]), np.concatenate([low, high])
-    ptr = np.concatenate([[0], np.cumsum(np.bincount(at, minlength=n))]).astype(np.int32)
-    rank = np.empty(n, np.int64)
-    rank[dissection(ptr, near[np.argsort(at * n + near)].astype(np.int32), LEAF)] = np.arange(n)
-    return _pattern(n, node, low, high, rank)
 
 
 def _pattern(n: int, body: IntArray, low: Any, high: Any, rank: Any) -> tuple[IntArray, ...]:

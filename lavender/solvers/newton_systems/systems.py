@@ -17,7 +17,7 @@ from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.augmented import Augmented
-from lavender.solvers.newton_systems.pattern import block_pattern, dissected, postordered
+from lavender.solvers.newton_systems.pattern import block_pattern, postordered
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import symbolic
 from lavender_ext.newton.coupled import scaled_entries
@@ -25,8 +25,9 @@ from lavender_ext.newton.solve import Solve
 
 DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
 # Nonzero share s of A above which a dense factor is there sooner: of one full block of s^1/2 m rows, whose
-# multiply-adds cost a quarter there; and of bounded rows alone, of which dense factors take the free ones.
-DENSE_FILL, BOUNDED_FILL = 0.4, 0.25
+# multiply-adds cost a quarter there; and of bounded rows, of which dense factors take the free ones, and under
+# Coulomb's law, whose factors lack symmetry and lose pivots by panels.
+DENSE_FILL, EARLY_FILL = 0.4, 0.25
 DENSE_LIMIT = 6000  # rows; 288 MB of A
 # Multiply-adds of a factor over bodies from which dense panels beat block rows; a panel's columns up to which, and
 # share up to which (four times it for so few columns), zeros are held as numbers.
@@ -37,9 +38,9 @@ WIDE = os.environ.get("LAVENDER_BASELINE", "0") in (
 )  # four lanes where the machine has them: the same bits
 
 
-def is_full(nnz: int, m: int, bounded: bool) -> bool:
-    """Whether a dense factor of m rows and nnz entries is there sooner than panels; `bounded`: no cones."""
-    return nnz > (BOUNDED_FILL if bounded else DENSE_FILL) * m * m
+def is_full(nnz: int, m: int, cones: bool) -> bool:
+    """Whether a dense factor of m rows and nnz entries is there sooner than panels; `cones`: of the cone law."""
+    return nnz > (DENSE_FILL if cones else EARLY_FILL) * m * m
 
 
 def factor_cost(lptr: IntArray, s: int) -> float:
@@ -109,15 +110,6 @@ class VelocitySystem(System):
         structure = symbolic.factor_pattern(nptr, nind)
         self.cost = factor_cost(structure[0], s)
         if self.cost >= PANELS:
-            other = dissected(n, node, nptr, nind)
-            fill = symbolic.factor_pattern(*other[:2])
-            if factor_cost(fill[0], s) < self.cost:
-                nptr, nind, node, slot, again = other
-                turned, structure, self.cost = (
-                    (turned != again).astype(np.int32),
-                    fill,
-                    factor_cost(fill[0], s),
-                )
             nptr, nind, node, slot, again = postordered(n, node, nptr, nind)
             turned = (turned != again).astype(np.int32)
             structure = symbolic.factor_pattern(nptr, nind)
@@ -139,7 +131,9 @@ class MatrixSystem(System):
         if not solve.whole:
             a = a[solve.keep][:, solve.keep]
         self.symmetric = problem.is_symmetric
-        self.dense = m <= DENSE_ROWS or (is_full(a.nnz, m, not solve.has_friction) and m <= DENSE_LIMIT)
+        self.dense = m <= DENSE_ROWS or (
+            is_full(a.nnz, m, solve.has_friction and problem.law == "cone") and m <= DENSE_LIMIT
+        )
         # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `weights.py` has them.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
