@@ -51,8 +51,8 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: sleeps by the system's calls; `looks` calls the Python faces of kernels one after the other, `many` and `small` the
 #: kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python, `newton`
 #: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
-#: check sees, but for the logarithms by which `looks` guesses about sweeps; that of `direct`, `principal` and `watch`
-#: is cut out for the C library, which refuses what needs Python.
+#: check sees, but for the logarithms by which `looks` guesses about sweeps; that of `direct`, `lemke`,
+#: `principal`, `measure` and `watch` is cut out for the C library, which refuses what needs Python.
 EXEMPT = {
     "threaded": "threads",
     "looks": "calls kernels, guesses how long they will take",
@@ -61,7 +61,9 @@ EXEMPT = {
     "many": "allocates and calls kernels, computes nothing",
     "small": "allocates, copies islands out and calls kernels, computes nothing",
     "direct": "calls rounds of pivots by pointer; the C library has it whole",
+    "lemke": "calls the rounds of direct; the C library has it whole",
     "principal": "called by direct; the C library has it whole",
+    "measure": "thin entries of the judge for Python; the C library has it whole",
     "watch": "the loop of sweeps and checks for Python; the C library has it whole",
     "newton": "makes room for Python; its arithmetic is in the driver's core",
     "start": "makes room for Python; its arithmetic is in the substep's core",
