@@ -255,19 +255,15 @@ cdef inline void swap_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil
         y[k] = old
 
 
-cdef inline void swap_places(lemke_t* l, int32_t i, int32_t j) noexcept nogil:
-    cdef dictionary_t* d = &l.d
+cdef inline void swap_columns(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
     cdef double* x
     cdef double old
-    cdef int32_t k, row = l.row[i]
-    swap_rows(d, i, j)
+    cdef int32_t k
     for k in range(d.rows):
         x = d.t + k * d.width
         old = x[i]
         x[i] = x[j]
         x[j] = old
-    l.row[i] = l.row[j]
-    l.row[j] = row
 
 
 cdef inline double largest(const dictionary_t* d, int32_t i) noexcept nogil:
@@ -280,65 +276,70 @@ cdef inline double largest(const dictionary_t* d, int32_t i) noexcept nogil:
     return size
 
 
-cdef inline int32_t free_pivot(const lemke_t* l, int32_t end, int32_t* one) noexcept nogil:
-    """Of free rows before `end` the one, and the variable of another, whose entry is largest beside the row; or -1."""
+cdef inline int32_t free_pivot(const lemke_t* l, int32_t end, int32_t* one, int32_t* two) noexcept nogil:
+    """Free row `one` and free variable `two` before `end` whose entry is largest beside the row; 0 where there is none."""
     cdef const dictionary_t* d = &l.d
-    cdef int32_t i, j, first = l.bounded + l.caps, two = -1
+    cdef int32_t i, j, first = l.bounded + l.caps
     cdef double size, most = 1e-11
     for i in range(first, end):
         size = largest(d, i)
         for j in range(first, end):
             if fabs(d.t[i * d.width + j]) > most * size:
-                one[0], two, most = i, j, fabs(d.t[i * d.width + j]) / size
-    return two
+                one[0], two[0], most = i, j, fabs(d.t[i * d.width + j]) / size
+    return most > 1e-11
 
 
-cdef inline int32_t bounded_pivot(lemke_t* l, int32_t end, int32_t* one) noexcept nogil:
-    """Of free rows before `end` the one, and which other row, whose determinant is largest beside both; or -1."""
+cdef inline int32_t bounded_pivot(lemke_t* l, int32_t end, int32_t* one, int32_t* two) noexcept nogil:
+    """Of the other rows the one whose entries with free row `one` and free variable `two` are largest beside both; or -1.
+
+    Between these two there is no pivot: the determinant is the product of the entries.
+    """
     cdef dictionary_t* d = &l.d
-    cdef int32_t i, j, first = l.bounded + l.caps, two = -1
-    cdef double share, most = 1e-11
-    cdef double* x
-    cdef double* y
+    cdef int32_t i, j, r, c, first = l.bounded + l.caps, best = -1
+    cdef double share, across, most = 1e-11
+    cdef const double* y
     for i in range(end):
         d.t[i * d.width + d.n] = largest(d, i)          # z has no column yet
-    for i in range(first, end):
-        x = d.t + i * d.width
-        for j in range(first):
-            y = d.t + j * d.width
-            share = fabs(x[i] * y[j] - x[j] * y[i])
-            if share > most * x[d.n] * y[d.n]:
-                one[0], two, most = i, j, share / (x[d.n] * y[d.n])
-    return two
+    for j in range(first):
+        y = d.t + j * d.width
+        share, across, r, c = 0.0, 0.0, first, first
+        for i in range(first, end):
+            if fabs(d.t[i * d.width + j]) > share * d.t[i * d.width + d.n]:
+                share, r = fabs(d.t[i * d.width + j]) / d.t[i * d.width + d.n], i
+            if fabs(y[i]) > across * y[d.n]:
+                across, c = fabs(y[i]) / y[d.n], i
+        if share * across > most:
+            most, best, one[0], two[0] = share * across, j, r, c
+    return best
 
 
 cdef inline int32_t eliminate(lemke_t* l) noexcept nogil:
     """Free rows made basic for good, behind all others; how many places are left.
 
-    Each with the variable of a free row, which takes the place of its own; else with a row that is not free, whose w and
-    s exchange their parts.
+    What leaves with a free row has no part any more, since all w of free rows are 0: any of their variables may take its
+    place. Where none can, w and s of another row exchange their parts.
     """
     cdef dictionary_t* d = &l.d
-    cdef int32_t row, one = 0, two, end = d.n
+    cdef int32_t j, row, one = 0, two = 0, end = d.n
     while end > l.bounded + l.caps:
-        two = free_pivot(l, end, &one)
-        if two >= 0:
+        if free_pivot(l, end, &one, &two):
             pivot(d, one, two)
-            swap_rows(d, one, two)                      # what leaves has no part any more: all w of free rows are 0
-            one = two
         else:
-            two = bounded_pivot(l, end, &one)
-            if two < 0:
+            j = bounded_pivot(l, end, &one, &two)
+            if j < 0:
                 return end
-            pivot(d, one, two)
-            pivot(d, two, one)
-            swap_places(l, one, two)                    # each variable into its own place again
-            row = l.row[one]
-            l.row[one] = l.row[two]
-            l.row[two] = row
-            l.exchanged[two] = not l.exchanged[two]
+            pivot(d, one, j)
+            pivot(d, j, two)
+            swap_rows(d, one, j)
+            swap_columns(d, j, two)
+            l.exchanged[j] = not l.exchanged[j]
         end -= 1
-        swap_places(l, one, end)
+        swap_rows(d, one, two)                          # each variable into its own place again, and this one behind all
+        swap_rows(d, two, end)
+        swap_columns(d, two, end)
+        row = l.row[two]
+        l.row[two] = l.row[end]
+        l.row[end] = row
     return end
 
 
