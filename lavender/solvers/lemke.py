@@ -73,6 +73,7 @@ class Lemke:
                 state, paths, max_iter, tol, deadline, max(1, int(CHUNK_TIME / (ENTRY * n * n)))
             )
         finally:
+            paths.judge()
             found = state.rows.best
             if found is not None:
                 impulse[:] = found.impulse

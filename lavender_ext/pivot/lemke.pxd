@@ -44,4 +44,5 @@ cdef int64_t lemke_index(const blocks_t* p) noexcept nogil
 cdef void lemke_lay(lemke_t* l, direct_t* t, double* real, int32_t* index) noexcept nogil
 cdef void lemke_begin(lemke_t* l) noexcept nogil
 cdef int32_t lemke_run(lemke_t* l, int32_t pivots) noexcept nogil
+cdef void lemke_judge(lemke_t* l) noexcept nogil
 cdef void lemke_ray(const lemke_t* l, double* y) noexcept nogil

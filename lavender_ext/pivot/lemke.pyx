@@ -544,6 +544,12 @@ cdef int32_t lemke_run(lemke_t* l, int32_t pivots) noexcept nogil:
     return DONE
 
 
+cdef void lemke_judge(lemke_t* l) noexcept nogil:
+    """What a path stands at that is not followed further, which may be the best impulse."""
+    if l.stage == WALK:
+        take_values(l)
+
+
 cdef class Lemke:
     """Paths of one problem over the rows that exchange at their end.
 
@@ -575,6 +581,10 @@ cdef class Lemke:
         with nogil:
             code = lemke_run(&self.l, pivots)
         return self.rows.told(code)
+
+    def judge(self):
+        """Where the path stands, if it is not at its end."""
+        lemke_judge(&self.l)
 
     @property
     def ray(self):

@@ -98,6 +98,7 @@ static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
     code = pivot_lemke_lemke_run(l, is_timed(budget) && left > BATCH ? BATCH : left);
     if (code == pivot_lemke_DONE) return LAV_STALLED;
   } while (l->pivots < budget->iterations && !is_late(s, budget));
+  pivot_lemke_lemke_judge(l);
   return l->pivots < budget->iterations ? LAV_TIME_LIMIT : LAV_MAX_ITERATIONS;
 }
 
