@@ -35,7 +35,7 @@ SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a
 TABLES = ("lavender.solvers", "lavender.external")
 
 
-class Few(Protocol):
+class SmallCall(Protocol):
     """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
 
     @property
@@ -124,7 +124,7 @@ class SolverSpec:
     install: str = ""  # what to install where they are not
     bounded: str = ""  # of a method for free rows: what to take where rows are bounded
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
-    few: Few | None = (
+    small: SmallCall | None = (
         None  # problems of few rows with default options, in one compiled call; asked of our own alone
     )
     own = False  # of this package: others are handed copies, and what they return is checked (`lavender/foreign.py`)

@@ -492,8 +492,8 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
 
     Claim, counts and residual are put in words when somebody asks for them.
     """
-    few = spec.few
-    if few is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
+    small = spec.small
+    if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
         return None
     if not 0.0 < tol < math.inf:
         return None
@@ -510,7 +510,7 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
         )
     else:
         given = problem.impulse_array(impulse)
-    found = few.solve(problem, given, tol)
+    found = small.solve(problem, given, tol)
     if found is None:
         return None
     judged, counts = found
@@ -535,8 +535,8 @@ def of_batch(
 def _rest(
     problem: Problem, spec: SolverSpec, judged: Any, counts: Any, given: FloatArray | None
 ) -> dict[str, Any]:
-    assert spec.few is not None
-    claim = spec.few.claim(problem, counts, given, judged.relative)
+    assert spec.small is not None
+    claim = spec.small.claim(problem, counts, given, judged.relative)
     return {
         "residual": told(problem, judged),
         "iterations": claim.iterations,

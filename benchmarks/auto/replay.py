@@ -19,7 +19,7 @@ from lavender.solvers.costs import METHODS, Costs, candidates
 from lavender.solvers.methods import FIRST, Candidate, first_turn
 from lavender.solvers.schedule import race
 from lavender.solvers.structure import Structure
-from lavender_ext.few.looks import sweeps_left
+from lavender_ext.small.checked_sweeps import sweeps_left
 
 __all__ = ["CALL", "TURN", "regret", "replayed"]
 

@@ -415,7 +415,7 @@ SPEC = SolverSpec(
     exact=True,
     resumable=False,
     max_iter=1000,
-    few=DIRECT,
+    small=DIRECT,
     summary="factorisation; boxed LCP by block principal pivoting",
     reference="Golub, Van Loan 2013, chapter 4; Judice, Pires 1994, Computers and Operations Research 21",
 )

@@ -23,7 +23,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.schedule import BELIEVED, remainder
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
-from lavender_ext.few.looks import Looks, sweeps_left
+from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
 
 __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
@@ -149,7 +149,7 @@ class Resumed(Candidate):
 
 
 class Sweeps(Resumed):
-    """Accelerated sweeps, with looks at what they promise in compiled code (`lavender_ext/few/looks.pyx`)."""
+    """Accelerated sweeps, with looks at what they promise (`lavender_ext/small/checked_sweeps.pyx`)."""
 
     relative = 1.0  # residual of the last look
     least = 0.0  # ns that another method takes at least
@@ -162,7 +162,7 @@ class Sweeps(Resumed):
         """All that needs no impulse, and what is to be known when time is short."""
         problem = self.costs.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
-        self.state = Looks(problem.metric, operator(problem), problem.law == "cone", split)
+        self.state = CheckedSweeps(problem.metric, operator(problem), problem.law == "cone", split)
         self.count()
 
     def run_first(self, log: SolveLog) -> bool:

@@ -1,7 +1,7 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A, islands of few rows under friction (`lavender_ext/few/small.pyx`), generalised coordinates
-where Newton's method is counted to cost little (`lavender_ext/few/many.pyx`): what Python costs outweighs such a
+Few rows of bodies or of A, islands of few rows under friction (`lavender_ext/small/call.pyx`), generalised coordinates
+where Newton's method is counted to cost little (`lavender_ext/small/many.pyx`): what Python costs outweighs such a
 problem. The call ends with a solution or not at all: then the solver runs as on any problem, from the beginning.
 """
 
@@ -23,8 +23,8 @@ from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.weights import READ, of_law, rates, sweep_cost
-from lavender_ext.few.many import Gate, solve_first
-from lavender_ext.few.small import Bounded, Friction, Small
+from lavender_ext.small.call import Bounded, Friction, Small
+from lavender_ext.small.many import Gate, solve_first
 
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together.
@@ -101,8 +101,8 @@ def _make(problem: Problem) -> Small | None:
 
 
 @dataclass(frozen=True)
-class Few:
-    """What `SolverSpec.few` holds: small problems as that solver solves them."""
+class SmallCall:
+    """What `SolverSpec.small` holds: small problems as that solver solves them."""
 
     name: str
     gate: Gate | None  # what it may cost over generalised velocities; None: not at all
@@ -228,6 +228,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = Few("auto", gate(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
-DIRECT = Few("direct", None, True)
-NEWTON = Few("newton", gate(MOST, MOST), False)
+AUTO = SmallCall("auto", gate(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
+DIRECT = SmallCall("direct", None, True)
+NEWTON = SmallCall("newton", gate(MOST, MOST), False)

@@ -283,12 +283,14 @@ def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
 
 
 def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
-    class Few:
+    class SmallCall:
         def solve(self, problem, impulse, tol):
             raise AssertionError("asked")
 
     register(
-        lv.SolverSpec(name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", few=Few())
+        lv.SolverSpec(
+            name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", small=SmallCall()
+        )
     )
     assert lv.solve(random_lcp(15), "few", max_iter=2000).success
     assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0

@@ -20,7 +20,7 @@ from lavender.solvers.methods import Sweeps
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.structure import Structure
 from lavender.suite.build import Bodies, Contacts, contact_problem
-from lavender_ext.few import looks
+from lavender_ext.small import checked_sweeps
 
 NAMES = (
     "stack(n=200)",
@@ -165,13 +165,13 @@ def test_sweeps_that_cost_more_than_counted_end_in_time(pace, monkeypatch):
     Auto().ready(state, 1e-3)
     state.sweeps.least = 1e9  # nothing else ends in time
     monkeypatch.setattr("lavender.deadline.perf_counter", lambda: now[0])
-    original, each = looks.run, 1e-9 * pace * state.sweeps.cost.each
+    original, each = checked_sweeps.run, 1e-9 * pace * state.sweeps.cost.each
 
     def run(data, watch, impulse, n, *more):
         now[0] += n * each
         return original(data, watch, impulse, n, *more)
 
-    monkeypatch.setattr(looks, "run", run)
+    monkeypatch.setattr(checked_sweeps, "run", run)
     log = SolveLog(problem, 1e-300, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
     assert not state.sweeps.run_first(log)
@@ -185,7 +185,7 @@ def test_looks_are_at_what_is_swept_and_what_is_below_tol_is_the_judges():
     """Of J and M where A is swept a look at A costs a sweep, one at J and M ten."""
     problem = random_general(5, contacts=6)
     reference(problem)
-    made = looks.Looks(problem.metric, problem.data, problem.law == "cone", 0)
+    made = checked_sweeps.CheckedSweeps(problem.metric, problem.data, problem.law == "cone", 0)
     impulse = problem.start()
     made.run(impulse, 1.0, 4, 1e-300, 4, 32, np.inf)
     assert made.now.data is problem.data is not problem.metric

@@ -27,7 +27,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.few.friction cimport SHORT, ask_t, part_t, solve_part, work_of
+from lavender_ext.small.friction cimport SHORT, ask_t, part_t, solve_part, work_of
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.local import gauss_seidel

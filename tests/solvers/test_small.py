@@ -22,9 +22,9 @@ from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
 from lavender.solvers.costs import candidates
 from lavender.solvers.newton_systems import general
-from lavender.solvers.small import AT_ONCE, AUTO, ISLAND, Few, call_ends_within, velocities_cost
+from lavender.solvers.small import AT_ONCE, AUTO, ISLAND, SmallCall, call_ends_within, velocities_cost
 from lavender.solvers.structure import Structure
-from lavender_ext.few.many import solve_first
+from lavender_ext.small.many import solve_first
 
 SHORT = ("auto", "direct", "newton")
 TIMES = ("setup_time", "solve_time", "_rest")
@@ -119,16 +119,16 @@ def test_most_of_them_do_take_the_short_way():
     took = 0
     for kind in KINDS:
         for seed in range(6):
-            took += registry.get("auto").few.solve(draw(kind, seed), None, 1e-6) is not None
+            took += registry.get("auto").small.solve(draw(kind, seed), None, 1e-6) is not None
     assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
 
 
 @pytest.mark.parametrize("solver", ["auto", "direct"])
-def test_few_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver):
+def test_small_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver):
     g = np.random.default_rng(4).normal(size=(12, 7))
     a = g @ g.T
     problem = lv.Problem.linear(0.5 * (a + a.T), a @ np.ones(12))
-    assert registry.get(solver).few.solve(problem, None, 1e-9) is not None
+    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["rank"] == 7
@@ -137,12 +137,12 @@ def test_few_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver
 
 @pytest.mark.parametrize("solver", ["auto", "direct"])
 @pytest.mark.parametrize("seed", [5793, 6452, 7592])
-def test_few_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
+def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
     problem = wild(seed=seed).problem
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
-    assert registry.get(solver).few.solve(problem, None, 1e-9) is not None
+    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
@@ -157,7 +157,7 @@ def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, to
     assert said, found.message
     assert found.work["pivots"] == int(said[1]) + int(said[2])
     assert found.iterations > int(said[2])
-    assert registry.get("direct").few.solve(problem, None, tol) is None  # which is exchanges alone
+    assert registry.get("direct").small.solve(problem, None, tol) is None  # which is exchanges alone
 
 
 @pytest.mark.parametrize("most", [200, 293, 294])
@@ -173,7 +173,7 @@ def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
     assert solution.success or most < 294
 
 
-def test_few_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
+def test_small_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
     problem = wild(seed=7375).problem
     found = check(problem, "auto", tol=1e-6)
     assert found.success and found.residual.relative > 1e-13
@@ -224,7 +224,7 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
     problem = wild(seed=seed).problem
     assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.gate) is None
     fresh = replace(problem, copy=False)
-    assert registry.get("auto").few.solve(fresh, None, 1e-6) is None
+    assert registry.get("auto").small.solve(fresh, None, 1e-6) is None
     assert fresh.derived.vain is not None
     check(problem, "auto", tol=1e-6)
 
@@ -299,18 +299,18 @@ def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
     stack = forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone")
     no_answer = lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone")
     problem = side_by_side([stack, no_answer])
-    assert registry.get("auto").few.solve(fresh(problem), None, 1e-6) is None
+    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is None
     found = lv.solve(problem)
     assert found.status.name == "INFEASIBLE" and found.certificate is not None
 
 
 def test_islands_are_no_one_call_where_that_may_take_too_long():
     problem = forms(stacks(40, 2, 0.4, False))["matrix"]
-    assert registry.get("auto").few.solve(fresh(problem), None, 1e-6) is not None
+    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is not None
     assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
     pile = stacks(3, 1 + ISLAND // 12, 0.4, False)  # 12 rows for each cube
-    assert registry.get("auto").few.solve(pile, None, 1e-6) is None
-    assert registry.get("newton").few.solve(fresh(problem), None, 1e-6) is None
+    assert registry.get("auto").small.solve(pile, None, 1e-6) is None
+    assert registry.get("newton").small.solve(fresh(problem), None, 1e-6) is None
 
 
 def test_islands_where_doing_nothing_is_right_from_a_warm_start():
@@ -365,7 +365,7 @@ def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
     main = threading.get_ident()
 
     def interrupt():
-        while sys._current_frames()[main].f_code is not Few.solve.__code__:
+        while sys._current_frames()[main].f_code is not SmallCall.solve.__code__:
             pass
         _thread.interrupt_main()
 

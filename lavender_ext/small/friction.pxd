@@ -13,7 +13,7 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
-from lavender_ext.few.room cimport has_room
+from lavender_ext.small.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE

@@ -29,7 +29,7 @@ cpdef double sweeps_left(double done, double before, double now, double tol) noe
     return done * log(now / (tol if tol > 1e-16 else 1e-16)) / gain if gain > 0.0 else INFINITY
 
 
-cdef class Looks:
+cdef class CheckedSweeps:
     """Sweeps of `anderson` in the order given, from the first one on, and what the last look at them found.
 
     Parameters
