@@ -51,7 +51,7 @@ def test_the_factor_of_a_tree_hardly_fills_in_whatever_the_order_of_its_velociti
     assert len(np.unique(mixed.trees)) == sum(p < 0 for p in parent)
 
 
-def test_small_velocities_keep_the_order_given():
+def test_few_velocities_keep_the_order_given():
     """A search for another order costs more than all the factors of a robot whose root slides in two directions."""
     rng = np.random.default_rng(5)
     mass = np.diag(np.full(9, 3.0))

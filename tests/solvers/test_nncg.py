@@ -28,7 +28,7 @@ def test_stack_has_its_closed_form(name, sweep):
     np.testing.assert_allclose(solution.impulse, exact, rtol=1e-7)
 
 
-def test_smaller_sweeps_than_pgs():
+def test_fewer_sweeps_than_pgs():
     problem, _ = stack(20)
     sweeps = {
         key: lv.solve(problem, *key[:1], tol=1e-9, max_iter=50_000, **dict(key[1:])).work["sweeps"]
