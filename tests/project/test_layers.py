@@ -22,7 +22,7 @@ KERNEL_LEVELS = [
     {"accelerate", "engine"},
     {"warm"},
     {"driver", "host"},
-    {"few"},
+    {"small"},
 ]
 KERNEL_HEIGHT = {name: height for height, level in enumerate(KERNEL_LEVELS) for name in level}
 
