@@ -22,7 +22,8 @@ from random_problems import (
 from worked import python
 
 import lavender as lv
-from lavender._later import issparse, sparse
+from lavender.generalized import issparse
+from lavender.generalized import sp as late
 
 I2 = np.eye(2)
 
@@ -412,7 +413,7 @@ def test_impulses_of_another_kind_of_contact_are_not_carried():
 
 
 def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
-    for again in (copy.copy(sparse), pickle.loads(pickle.dumps(sparse))):
+    for again in (copy.copy(late), pickle.loads(pickle.dumps(late))):
         assert again.csr_array is sp.csr_array
 
     class Foreign:
