@@ -1,6 +1,7 @@
 """Parts of SciPy that are loaded when something of them is first used: they would be half of `import lavender`.
 
-`from lavender._later import sparse as sp` stands where one would write `import scipy.sparse as sp`.
+`from lavender._later import sparse as sp` stands where one would write `import scipy.sparse as sp`. What is likely to
+be used while the clock of a solve runs is loaded before, by `load`.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["issparse", "lapack", "sparse"]
+__all__ = ["issparse", "lapack", "load", "sparse"]
 
 
 class _Later:
@@ -18,6 +19,8 @@ class _Later:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_name" or name.startswith("__"):  # of a copy that is being made
+            raise AttributeError(name)
         value = getattr(import_module(self._name), name)
         setattr(self, name, value)
         return value
@@ -30,6 +33,12 @@ else:
     sparse, lapack = _Later("scipy.sparse"), _Later("scipy.linalg.lapack")
 
 
+def load(*more: str) -> None:
+    """Load sparse arrays, LAPACK and further modules, if they are not."""
+    for name in ("scipy.sparse", "scipy.linalg.lapack", *more):
+        import_module(name)
+
+
 def issparse(value: object) -> bool:
     """Whether `value` is a sparse array or matrix of SciPy; what cannot be one loads nothing."""
-    return hasattr(value, "tocsr") and bool(sparse.issparse(value))
+    return hasattr(type(value), "tocsr") and bool(sparse.issparse(value))

@@ -205,10 +205,18 @@ def remember(problem: Problem, last: measure.Judged) -> None:
     problem.derived.judged = last
 
 
-def known(problem: Problem, impulse: FloatArray) -> float | None:
-    """Relative residual of doing nothing, or of what `remember` was given, where `impulse` is that, bit for bit."""
+def remembered(problem: Problem, impulse: FloatArray) -> measure.Judged | None:
+    """What `remember` was given, if that is of `impulse`, bit for bit, and judged by the problem itself."""
     last = problem.derived.judged
-    if last is not None and measure.same_bits(last.impulse, impulse):
+    if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
+        return None
+    return last
+
+
+def known(problem: Problem, impulse: FloatArray) -> float | None:
+    """Relative residual of doing nothing, or of what is `remembered`, where `impulse` is that, bit for bit."""
+    last = remembered(problem, impulse)
+    if last is not None:
         return float(last.relative)
     start: float = problem.metric.start_relative
     return start if start >= 0.0 and measure.same_bits(problem._start, impulse) else None
@@ -264,8 +272,8 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
         return unstretched(problem, residual(problem.disk, problem.on_disk(impulse), precision))
-    last, problem.derived.judged = problem.derived.judged, None
-    if last is None or last.data is not problem.metric or not measure.same_bits(last.impulse, impulse):
+    last, problem.derived.judged = remembered(problem, impulse), None
+    if last is None:
         last = judged(problem, impulse)
     found = told(problem, last)
     return found if precision == "float64" else _in_float32(problem, found, impulse)

@@ -33,7 +33,16 @@ from lavender.outcome import (
 )
 from lavender.problem import Problem, check_problem
 from lavender.registry import SMALL_ROWS, SolverSpec, State, get
-from lavender.residuals import Residual, reference, residual, told, unstretched
+from lavender.residuals import (
+    Residual,
+    judged,
+    reference,
+    remember,
+    remembered,
+    residual,
+    told,
+    unstretched,
+)
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
@@ -456,7 +465,10 @@ class _Loop:
         best = getattr(state, "best", None)
         if best is None or best[1] is None:
             return
-        if not residual(self.problem, self.impulse).relative <= best[0]:
+        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse.copy())
+        if last.relative <= best[0]:
+            remember(self.problem, last)  # for the result
+        else:
             self.impulse[:] = best[1]
 
     def _record(self) -> bool:

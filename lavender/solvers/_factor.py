@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._later import lapack
+from lavender._later import lapack, load
 from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
 from lavender.problem import Problem
@@ -200,6 +200,8 @@ class LUFactor:
         self.scale, scaled = _scaled(problem)
         self.sparse = problem.csr.nnz < DENSE_SHARE * m * m or m > DENSE_LIMIT
         self.a: Any = scaled if self.sparse else scaled.toarray()
+        if self.sparse:
+            load("scipy.sparse.linalg")
 
     def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
         self.free = np.flatnonzero(place >= 0)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender._later import load
 from lavender._later import sparse as sp
 from lavender.deadline import Deadline, Stopwatch
 from lavender.errors import InputError
@@ -279,6 +280,7 @@ class ADMM:
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
+        load()
         try:
             return AdmmState(problem, self.memory)
         except _Failed as failure:

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
+from lavender._later import load
 from lavender.deadline import Deadline
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SolverSpec
+from lavender.registry import SMALL_ROWS, SolverSpec
 from lavender.solution import Claim, Status
 from lavender.solvers.certify import certify
 from lavender.solvers.costs import Costs, Plan, candidates
@@ -65,6 +66,8 @@ class Auto:
     def prepare(self, problem: Problem) -> State:
         if self.plan is not None:
             self.plan.check(problem)
+        if problem.derived.vain is not None or (problem.m > SMALL_ROWS and problem.matrix is not None):
+            _load(problem)
         return State(problem)
 
     def update(self, state: State, problem: Problem) -> State:
@@ -73,6 +76,8 @@ class Auto:
     def ready(self, state: State, time_limit: float) -> None:
         """Before the clock of a limit [s] starts: set up the compiled call, and sweeps where others may not end."""
         state.call = call_ends_within(state.problem, time_limit)
+        if not state.call or state.problem.m > SMALL_ROWS:
+            _load(state.problem)
         if state.call and state.problem.generalized is None:
             prepared(state.problem)
         if state.problem.m and self.plan is None and not state.problem.cones.has_round:
@@ -114,6 +119,12 @@ class Auto:
             log.end()
         impulse[:] = log.impulse
         return log.claim()
+
+
+def _load(problem: Problem) -> None:
+    """What those who follow the compiled call may factor with."""
+    lu = problem.matrix is not None and not problem.is_symmetric
+    load(*(["scipy.sparse.linalg"] if lu else []))
 
 
 def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:

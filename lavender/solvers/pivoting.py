@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._later import lapack
+from lavender._later import lapack, load
 from lavender.deadline import Deadline, Stopwatch
 from lavender.problem import Problem
 from lavender.residuals import reference
@@ -60,6 +60,8 @@ class PivotState:
     def __init__(self, problem: Problem, like: PivotState | None = None) -> None:
         self.problem = problem
         self.symmetric = problem.is_symmetric
+        if problem.m > SMALL_SIZE:
+            load()  # for factors, and for proofs that there is no solution
         factor: Factor | None = None
         if self.symmetric:
             same = like is not None and like.symmetric and _same_pattern(like.problem, problem)

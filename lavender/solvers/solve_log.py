@@ -11,7 +11,7 @@ from lavender._arrays import FloatArray, IntArray
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem
-from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember
+from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
 from lavender.solvers.small import told
@@ -60,7 +60,12 @@ class SolveLog:
         return relative
 
     def take(self, last: Judged) -> float:
-        """Keep what was judged if it is the best, for who judges the result as well; its relative residual."""
+        """Keep what was judged if it is the best, for who judges the result as well; its relative residual.
+
+        A that was formed bears no solution out: rounding made it another problem.
+        """
+        if last.relative <= self.tol and last.data is not self.problem.metric:
+            last = Judged(self.problem.metric, last.impulse)
         relative = float(last.relative)
         if relative < self.best:
             self.best, self.impulse = relative, last.impulse
@@ -122,6 +127,9 @@ class SolveLog:
     def at_floor(self) -> bool:
         if self.best > FLOOR_MOST:
             return False
+        last = remembered(self.problem, self.impulse)
+        if last is not None:
+            return at_floor(last.relative, last.floor)
         return at_floor(*quick(self.problem, self.impulse, *self._room, True))
 
     @cached_property

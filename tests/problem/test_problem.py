@@ -22,6 +22,8 @@ from random_problems import (
 from worked import python
 
 import lavender as lv
+from lavender.generalized import issparse
+from lavender.generalized import sp as late
 
 I2 = np.eye(2)
 
@@ -408,3 +410,15 @@ def test_impulses_of_another_kind_of_contact_are_not_carried():
     impulse = np.ones(disk.m)
     np.testing.assert_array_equal(disk.carry((disk, impulse)), impulse)
     np.testing.assert_array_equal(box.carry((disk, impulse)), box.start())
+
+
+def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
+    for again in (copy.copy(late), pickle.loads(pickle.dumps(late))):
+        assert again.csr_array is sp.csr_array
+
+    class Foreign:
+        def __getattr__(self, name):
+            raise RuntimeError(name)
+
+    assert not issparse(Foreign())
+    assert issparse(sp.eye_array(2))

@@ -185,6 +185,63 @@ print("scipy" in sys.modules)
     assert python("-c", code).stdout.strip() == "False"
 
 
+LATE = """
+import sys
+import numpy as np, lavender as lv
+from lavender.solve import _Loop
+
+class Watch:
+    running = False
+    def find_spec(self, name, *_):
+        if self.running and name.partition(".")[0] == "scipy":
+            raise AssertionError(name)
+
+watch, call, rng = Watch(), _Loop._call, np.random.default_rng(0)
+sys.meta_path.insert(0, watch)
+
+def watched(*given):
+    watch.running = True
+    try:
+        return call(*given)
+    finally:
+        watch.running = False
+
+_Loop._call = watched
+solver, kind = sys.argv[1:]
+m, b = 120, rng.normal(size=120)
+full, mu = rng.normal(size=(m, m + 20)), np.full(m // 3, 0.5)
+few = 8.0 * np.eye(m)
+few[np.arange(m), rng.permutation(m)] += 0.5
+jac, mass, v, cones = full[:, :60], np.eye(60), b[:60], lv.Cones.contacts(mu)
+problem = {
+    "linear": lambda: lv.Problem.linear(full @ full.T, b),
+    "lcp": lambda: lv.Problem.lcp(full @ full.T, b),
+    "few entries": lambda: lv.Problem.lcp(few + few.T, b),
+    "asymmetric": lambda: lv.Problem.lcp(few, b),
+    "singular": lambda: lv.Problem.lcp(jac @ jac.T, b),
+    "coulomb": lambda: lv.Problem.contact(full @ full.T, b, mu),
+    "cone": lambda: lv.Problem.contact(full @ full.T, b, mu, friction="cone"),
+    "generalised": lambda: lv.Problem.from_jacobian(jac, mass, v, cones=cones),
+}[kind]()
+assert lv.solve(problem, solver, time_limit=10.0).work
+"""
+
+
+@pytest.mark.parametrize(
+    ("solver", "kinds"),
+    [
+        ("auto", "linear, lcp, few entries, asymmetric, singular, coulomb, cone, generalised"),
+        ("direct", "linear, lcp, few entries, asymmetric, singular"),
+        ("lemke", "lcp, asymmetric, singular"),
+        ("newton", "lcp, coulomb, generalised"),
+        ("admm", "lcp, cone, generalised"),
+    ],
+)
+def test_the_clock_of_a_limit_holds_no_import_of_scipy(solver, kinds):
+    for kind in kinds.split(", "):
+        python("-c", LATE, solver, kind)
+
+
 def test_public_names_are_there():
     assert len(lavender.__all__) == len(set(lavender.__all__))
     for name in lavender.__all__:

@@ -285,3 +285,29 @@ def test_a_body_of_huge_inverse_inertia_is_refused_by_no_solver():
     solution = lv.solve(problem, "admm")
     assert solution.status in (lv.Status.NUMERICAL_ERROR, lv.Status.CONVERGED)
     lv.solve(problem, "auto")
+
+
+def test_a_start_that_solves_a_as_it_was_formed_is_judged_by_the_problem():
+    # Masses over 15 decades: forming A of J and M rounds more than the tolerance, which lies between both residuals.
+    rng = np.random.default_rng(40)
+    jac, q = rng.normal(size=(30, 90)), np.linalg.qr(rng.normal(size=(90, 90)))[0]
+    mass = (q * 10.0 ** -rng.uniform(0, 15, 90)) @ q.T
+    problem = lv.Problem.from_jacobian(
+        jac, 0.5 * (mass + mass.T) + 1e-15 * np.eye(90), rng.normal(size=90), cones=lv.Cones.free(30)
+    )
+    formed = lv.Problem(problem.b, problem.cones, problem.delassus())
+    start = lv.solve(formed, "direct", tol=1e-14).impulse
+    exact, rounded = lv.residual(problem, start).relative, lv.residual(formed, start).relative
+    assert rounded < exact
+    log = SolveLog(problem, (exact * rounded) ** 0.5, 100, by=formed.metric)
+    assert log.offer(start) == log.best == exact
+
+
+@pytest.mark.parametrize("solver", ["auto", "pgs"])
+def test_the_result_is_not_judged_twice(solver, monkeypatch):
+    problem = lv.Problem.contact(4.0 * np.eye(90) + 0.01, np.linspace(-1.0, 1.0, 90), np.full(30, 0.5))
+    found = []
+    judged = lv.residuals.judged
+    monkeypatch.setattr("lavender.residuals.judged", lambda *given: found.append(1) or judged(*given))
+    assert lv.solve(problem, solver, max_iter=150, time_limit=10.0).success
+    assert not found  # what the solver had judged last is what it hands over
