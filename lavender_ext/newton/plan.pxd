@@ -4,8 +4,8 @@ Bounded rows: exchanges from the warm start and from the solution of H z = g, an
 decades. Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
-interior point, ended by rounds; closed loops of joints through the augmented system; rounds from the answer of the
-convex relaxation; the first walk for what is left of the budget.
+interior point, ended by rounds; closed loops of joints through the augmented system, with two shares of phi's derivative;
+rounds from the answer of the convex relaxation; the first walk for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -41,9 +41,9 @@ cdef enum:
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
 
 
-cdef inline double share_of() noexcept nogil:
-    """Of phi's derivative."""
-    return 0.7
+cdef inline double share_of(int32_t second) noexcept nogil:
+    """Of phi's derivative. The second is for closed loops alone, whose augmented system no rounds follow."""
+    return 0.95 if second else 0.7
 
 
 cdef inline double cone_delta() noexcept nogil:
@@ -194,7 +194,7 @@ cdef inline void go_convex(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_de_saxce(newton_t* n, int32_t augmented) noexcept nogil:
-    n.tries.at = 0
+    n.tries.at = n.tries.second = 0
     n.tries.augmented = augmented
     enter(n, DE_SAXCE)
 
@@ -206,11 +206,15 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
     if x.at == 0:
         x.at = 1
         n.s.augmented = x.augmented
-        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of())
+        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x.second))
         n.s.augmented = 0
         begin_approach(n, COULOMB, x.augmented)
         return
     best = n.look.lowest if x.at == 1 else end_apart(n, n.look.kept)
+    if x.augmented and not x.second and not over(n):
+        x.at = 0
+        x.second = 1
+        return
     if over(n) or x.augmented or x.at == 3:
         leave(n)
         return

@@ -142,6 +142,7 @@ cdef struct pursuit_t:
 cdef struct tries_t:            # De Saxce's interior point
     int32_t at
     int32_t augmented
+    int32_t second              # of two shares of phi's derivative
 
 
 cdef struct newton_t:           # may not move once it is furnished
