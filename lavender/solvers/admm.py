@@ -104,10 +104,7 @@ class AdmmState:
         self.panels: Any = None  # analysed, of the matrix
         self.lu = self.full = False  # L U, and of a matrix with an entry everywhere
         if _is_over_bodies(problem):
-            try:
-                form = problem.velocity_form()
-            except InputError as error:
-                raise _Failed(str(error)) from None
+            form = problem.velocity_form()
             # In the metric of D = diag d of the judge, which is the scale of the form.
             self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
             return
