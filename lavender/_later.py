@@ -25,6 +25,9 @@ class _Later:
         setattr(self, name, value)
         return value
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Later, (self._name,)
+
 
 if TYPE_CHECKING:
     from scipy import sparse

@@ -93,7 +93,7 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
         (limit[tangent], (normal[tangent], np.arange(tangent.sum()))), (problem.m, int(tangent.sum()))
     )
     at = (problem.csr.T.multiply(scale[:, None])).multiply(scale[None, :]).tocsr()
-    if not (np.isfinite(at.data).all() and np.isfinite(scale * problem.b).all()):
+    if not all(np.isfinite(x).all() for x in (at.data, rim.data, scale * problem.b)):
         return None
     unit = sp.eye_array(rim.shape[1], format="csr")
     below = ~free & ~tangent

@@ -413,6 +413,7 @@ def test_impulses_of_another_kind_of_contact_are_not_carried():
 
 
 def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
+    assert late.csgraph  # a module of its own, which has been used
     for again in (copy.copy(late), pickle.loads(pickle.dumps(late))):
         assert again.csr_array is sp.csr_array
 
