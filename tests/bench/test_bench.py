@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from random_problems import spd, touching
 from stacks import chain, moving_stack, stack
+from worked import python
 
 import lavender as lv
 from lavender import bench, registry
@@ -494,3 +495,15 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
     assert bench.read(path).records == known.records
     again = bench.finals(problems, asks, bench.run(problems, ["pgs"], plan, path), plan, path)
     assert again.records == known.records
+
+
+def test_scipys_own_blas_has_one_thread_while_something_is_timed_though_it_is_loaded_late():
+    said = python(
+        "-c",
+        "from lavender.bench.running.timing import one_thread\n"
+        "from threadpoolctl import threadpool_info\n"
+        "with one_thread():\n"
+        "    import scipy.linalg.lapack\n"
+        "    print({pool['num_threads'] for pool in threadpool_info()})",
+    ).stdout
+    assert said.strip() == "{1}"

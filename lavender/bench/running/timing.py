@@ -22,6 +22,7 @@ import numpy as np
 
 from lavender import registry
 from lavender._arrays import FloatArray
+from lavender._later import load
 from lavender.bench.line import asked_of
 from lavender.bench.record import ERROR, CaseInfo, Record, measurement_key
 from lavender.external.stopwatch import own_time
@@ -110,9 +111,10 @@ def _warm_up(solver: str) -> None:
 
 @cache
 def _thread_pools(solver: str) -> Any:
-    # Looking for the libraries reads /proc, a few milliseconds: once a solver, when its own are loaded.
+    # Looking for the libraries reads /proc, a few milliseconds: once a solver, when its own are loaded, and SciPy's.
     from threadpoolctl import ThreadpoolController
 
+    load()
     return ThreadpoolController()
 
 
