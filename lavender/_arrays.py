@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import isfinite
 from typing import Any
 
@@ -54,7 +54,7 @@ def as_array(
     Raises
     ------
     InputError
-        Not numeric, complex, of another shape, or not finite where it must be.
+        Not numeric, complex, of another shape, with masked entries, or not finite where it must be.
     """
     # What most callers give: nothing to convert, and no word to be made.
     if dtype is np.float64:
@@ -74,6 +74,10 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
+    masked = np.argwhere(np.ma.getmaskarray(value)) if np.ma.isMaskedArray(value) else ()
+    if len(masked):
+        where = ", ".join(map(str, masked[0]))
+        raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")
     if (
         dtype is np.int32
         and given.dtype.kind == "f"
@@ -126,6 +130,13 @@ def whole_number(what: str, value: object, low: int = 0, high: int | None = 2**3
         upto = "" if high is None else f" to {high}"
         raise InputError(f"{what} is {value!r}; a whole number from {low}{upto} is needed")
     return int(value)
+
+
+def flag(what: str, value: object) -> bool:
+    """`value` as True or False, and nothing else."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{what} is {value!r}; True or False is needed")
+    return bool(value)
 
 
 def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many: str = "") -> sp.csr_array:
@@ -186,6 +197,16 @@ def check_not_negative(what: str, array: np.ndarray) -> None:
     if gate.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
+
+
+def words_for(what: str, given: Any, count: int) -> tuple[str, ...]:
+    """A word for each of `count` things that `what` names."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise InputError(f"names of {what} are {given!r}; a sequence of {count} words is needed")
+    words = tuple(map(str, given))
+    if len(words) != count:
+        raise InputError(f"{len(words)} names for {count} {what}; one for each is needed")
+    return words
 
 
 def equal(x: object, y: object) -> bool:

@@ -23,7 +23,10 @@ def plain(value, tuple shape, bint finite, bint copy):
     cdef bint fits
     if type(value) is not ndarray or not value.flags.c_contiguous:
         return None
-    PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    try:
+        PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    except ValueError:                                  # dates have no buffer
+        return None
     fits = view.format[0] == 100 and view.format[1] == 0 and view.ndim == len(shape)    # "d"
     if fits:
         for i in range(view.ndim):

@@ -20,7 +20,7 @@ def says(status, **more):
 
 # Worked out anew at each call, and the caller's own.
 ANEW = {
-    "n_tangents", "n_together", "apart_rows", "spin_rows", "rolling_rows", "reach", "coefficients", "stretch",
+    "n_tangents", "contact_rows", "friction_rows", "normal_rows", "n_together", "apart_rows", "spin_rows", "rolling_rows", "reach", "coefficients", "stretch",
     "parents",
 }  # fmt: skip
 
