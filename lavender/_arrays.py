@@ -74,8 +74,8 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
-    masked = np.argwhere(np.ma.getmaskarray(value)) if np.ma.isMaskedArray(value) else ()
-    if len(masked):
+    if np.ma.is_masked(value):
+        masked = np.argwhere(np.ma.getmaskarray(value))
         where = ", ".join(map(str, masked[0]))
         raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")
     if (
