@@ -1,4 +1,4 @@
-"""One gate for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
+"""One check for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lavender._later import sparse as sp
 from lavender.errors import InputError
-from lavender_ext.core import gate
+from lavender_ext.core import checks
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -25,7 +25,7 @@ FLOAT64, INT32 = np.dtype(np.float64), np.dtype(np.int32)
 def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
     if len(given) != len(wanted):
         return False
-    for n, s in zip(wanted, given, strict=True):  # noqa: SIM110 - a generator takes as long as the rest of the gate
+    for n, s in zip(wanted, given, strict=True):  # noqa: SIM110 - a generator takes as long as the rest of the check
         if n is not None and n != s:
             return False
     return True
@@ -58,7 +58,7 @@ def as_array(
     """
     # What most callers give: nothing to convert, and no word to be made.
     if dtype is np.float64:
-        made = gate.plain(value, shape, finite, copy)
+        made = checks.plain(value, shape, finite, copy)
         if made is not None:
             return made
         if type(value) is float and isfinite(value) and len(shape) == 1 and shape[0] is not None:
@@ -194,7 +194,7 @@ def check_not_nan(what: str, array: np.ndarray) -> None:
 
 def check_not_negative(what: str, array: np.ndarray) -> None:
     plain = array.ndim == 1 and array.dtype is FLOAT64 and array.flags.c_contiguous
-    if gate.has_negative(array) if plain else array.size and array.min() < 0:
+    if checks.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
 

@@ -1,6 +1,6 @@
-"""The gate of arrays for what most callers give: float64 that lies together, of the shape asked for.
+"""Checks of arrays for what most callers give: float64 that lies together, of the shape asked for.
 
-Nothing is said here of what is wrong: where a function says no, the long way looks again, decides, and finds the words.
+Nothing is said here of what is wrong: where a function says no, the long way checks again, decides, and finds the words.
 """
 from cpython.buffer cimport PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer
 from libc.math cimport fabs
