@@ -12,7 +12,6 @@ from lavender.bench.store import Records
 from lavender.report import contents, tables
 from lavender.report.curves import Figures
 from lavender.report.findings import Report
-from lavender.report.moved import robustness_by_speed
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
@@ -72,8 +71,8 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
         "engines": contents.engine_table(report.engines),
-        "moved": None if campaign else contents.moved_table(records),
-        "speed_advice": None if campaign else contents.speed_table(records),
+        "moved": None if campaign else contents.moved_table(report),
+        "speed_advice": None if campaign else contents.speed_table(report),
         "noise": NOISE,
         "residual_noise": RESIDUAL_NOISE,
         "level": levels[len(levels) // 2],
@@ -100,7 +99,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "campaign": campaign,
         "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
         "robustness_by_speed": contents.robustness_table(
-            robustness_by_speed(records) if campaign else [], report.speeds, " m/s"
+            tables.robustness(report.by_speed) if campaign else [], report.speeds, " m/s"
         ),
         "sequences": {
             name: contents.pass_table(passes).without("sequence", "steps")
