@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -14,6 +14,8 @@ from lavender.errors import InputError
 
 if TYPE_CHECKING:
     from lavender.bench import Event, Item, Plan, Records
+
+    P = TypeVar("P", bound=Plan)
 
 __all__ = ["Measured", "measure", "run_campaign"]
 
@@ -59,7 +61,7 @@ def check_named(items: Sequence[Item]) -> None:
             item.forget()
 
 
-def plan_of(asked: Mapping[str, Any], kind: type[Plan], **more: Any) -> Plan:
+def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     """The plan that the options of `plan_options` mean; those without a default leave the plan's.
 
     Raises
