@@ -20,7 +20,7 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     """
     cones = problem.cones
     if problem.rows is not None:
-        return graph.body_components(block_bodies(problem), problem.rows.n_bodies)
+        return graph.body_components(problem.rows.block_bodies, problem.rows.n_bodies)
     if problem.generalized is not None:
         return graph.tree_components(problem.derived.view)
     block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
@@ -31,16 +31,15 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
 def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
     """Blocks of each island, in order, from the island of each block (k,)."""
     order = np.argsort(label, kind="stable").astype(np.int32)
-    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
 
 
-def block_bodies(problem: Problem) -> IntArray:
-    """Bodies of each block (k, 2), -1 static; only with rows."""
-    rows = problem.rows
-    assert rows is not None
-    if rows.n_joints == 0:
-        return rows.contact_body
-    return np.concatenate([rows.joint_body, rows.contact_body])
+def rows_of_each(problem: Problem, ptr: IntArray) -> list[IntArray]:
+    """Rows of each island of A, in order; those from ptr[i] to ptr[i + 1] belong together whatever A says."""
+    part = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
+    indptr, indices, _ = problem._compressed
+    count, label = graph.matrix_components(ptr, part, indptr, indices)
+    return blocks_of_each(count, label[part])
 
 
 def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
