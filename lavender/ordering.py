@@ -30,8 +30,20 @@ from lavender_ext.core.order import (
     graph_colors,
     stable_order,
 )
+from lavender_ext.factor.graph import matrix_components
 
-__all__ = ["ENGINE_ORDERS", "ORDERS", "Order", "block_order", "body_ranks", "colors", "levels", "local_order"]
+__all__ = [
+    "ENGINE_ORDERS",
+    "ORDERS",
+    "Order",
+    "block_order",
+    "blocks_of_each",
+    "body_ranks",
+    "colors",
+    "levels",
+    "local_order",
+    "rows_of_each",
+]
 
 # The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
@@ -211,6 +223,20 @@ def colors(problem: Problem) -> IntArray:
         graph.indptr.astype(np.int32),
         graph.indices.astype(np.int32),
     )
+
+
+def rows_of_each(problem: Problem, ptr: IntArray) -> list[IntArray]:
+    """Rows of each island of A, in order; those from ptr[i] to ptr[i + 1] belong together whatever A says."""
+    part = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
+    indptr, indices, _ = problem._compressed
+    count, label = matrix_components(ptr, part, indptr, indices)
+    return blocks_of_each(count, label[part])
+
+
+def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
+    """Blocks of each island, in order, from the island of each block (k,)."""
+    order = np.argsort(label, kind="stable").astype(np.int32)
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
 
 
 def _block_graph(problem: Problem) -> sp.csr_array:

@@ -24,11 +24,11 @@ from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
+from lavender.ordering import rows_of_each
 from lavender.problem import Problem, check_problem
 from lavender.problem.operators import semidefinite
 from lavender.residuals import residual
 from lavender.solve import solve
-from lavender.solvers.islands import rows_of_each
 from lavender_ext.pivot.direct import Pivoting
 
 __all__ = ["Redundancy", "redundancy"]

@@ -48,8 +48,8 @@ import numpy as np
 from lavender._arrays import FloatArray, IntArray
 from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
+from lavender.ordering import rows_of_each
 from lavender.problem import Problem
-from lavender.solvers.islands import rows_of_each
 
 __all__ = ["Uniqueness", "uniqueness"]
 

@@ -28,20 +28,6 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     return graph.matrix_components(cones.ptr, block, indptr, indices)
 
 
-def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
-    """Blocks of each island, in order, from the island of each block (k,)."""
-    order = np.argsort(label, kind="stable").astype(np.int32)
-    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
-
-
-def rows_of_each(problem: Problem, ptr: IntArray) -> list[IntArray]:
-    """Rows of each island of A, in order; those from ptr[i] to ptr[i + 1] belong together whatever A says."""
-    part = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
-    indptr, indices, _ = problem._compressed
-    count, label = graph.matrix_components(ptr, part, indptr, indices)
-    return blocks_of_each(count, label[part])
-
-
 def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
     """Row numbers of these blocks, in order."""
     ptr = problem.cones.ptr
