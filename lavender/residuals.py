@@ -232,31 +232,30 @@ def quick(
 
 
 def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None) -> Residual:
-    """Judge an impulse (m,) [N s].
+    """Measure the error of an impulse (m,) [N s]: the judge that every solve uses, for any impulse.
 
     Parameters
     ----------
     problem : Problem
     impulse : (m,) N s
-        Non-finite entries are allowed here and give an infinite relative residual.
+        Entries that are not finite are allowed and give an infinite relative residual.
     precision : {"float64", "float32"}, optional
-        In which the impulse was made: its floor, and with it the verdict. Default: `problem.precision`. The error
-        itself is always measured in float64.
+        Precision in which the impulse was computed. It decides the floor, and with it the verdict. Default:
+        `problem.precision`. The error itself is always measured in float64.
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or holds no numbers; another precision.
+        `impulse` has the wrong length or is not numeric, or `precision` is another word.
 
     Examples
     --------
     >>> import numpy as np
     >>> import lavender as lv
     >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 0.3])
-    >>> exact = np.array([1.7 / 3.0, 0.0])  # of a solver that has missed nothing ...
-    >>> lv.residual(problem, np.float32([0.5, 0.0]), precision="float32").verdict
+    >>> lv.residual(problem, np.float32([0.5, 0.0]), precision="float32").verdict  # the solution
     'at its floor'
-    >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")
+    >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")  # 2 % short of it
     >>> early.verdict, early.excess > 1e4
     ('stopped early', True)
     """

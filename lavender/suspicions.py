@@ -49,27 +49,27 @@ class Suspicion:
 
 
 def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
-    """What looks like a mistake in a problem's data, or in impulses that a solver found for it.
+    """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
-    Looks at signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys
-    and the guess; solves nothing. A suspicion is no error: hooks have normals against their arms, conveyors targets on
-    tangents. None is no proof either.
+    Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
+    the guess. It solves nothing. A suspicion need not be an error: a hook has normals against its arms, a conveyor has
+    targets on tangents. An empty result proves nothing.
 
     Parameters
     ----------
     problem : Problem
     impulse : (m,) N s, optional
-        A solution to look at; default: the problem's guess.
+        A solution to examine; default: the problem's guess.
 
     Returns
     -------
     tuple of Suspicion
-        Empty where nothing stands out.
+        Empty if nothing is suspicious.
 
     Raises
     ------
     InputError
-        Not a problem, or impulses of another shape.
+        `problem` is not a Problem, or `impulse` has another shape.
 
     Examples
     --------
