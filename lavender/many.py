@@ -1,8 +1,8 @@
 """Many problems in one call: the results of `solve` on each, with the same bits.
 
-Problems in generalised coordinates go through one compiled loop without the interpreter, those of few rows each through
-its own compiled call; what that leaves, and every other problem, is solved one by one. Solutions are put in words when
-somebody asks.
+Problems in generalised coordinates are solved in one compiled loop without the interpreter, small problems by one
+compiled call each. Problems that these do not solve, and all others, are solved one by one. The descriptive fields of
+a solution (claim, counts, names) are made when they are first read.
 """
 
 from __future__ import annotations

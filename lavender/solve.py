@@ -52,7 +52,7 @@ FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled s
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
-# What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
+# Errors of arithmetic on valid numbers: they become a result with the error as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
 INTERRUPTED = Status.INTERRUPTED
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
@@ -402,7 +402,7 @@ class _Loop:
         return claim
 
     def _call(self, max_iter: int, time_limit: float | None) -> Claim:
-        """At most so many iterations of the solver; what its arithmetic could not do is a claim."""
+        """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
         try:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
@@ -417,9 +417,9 @@ class _Loop:
         records = self.records is not None or self.callback is not None
         claim = NOTHING_DONE
         if self.time_limit is not None:
-            chunk = 1  # what a solver takes need not be what is counted: over J and M some sweep over A
+            chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
             if hasattr(self.solver, "until"):
-                # Of what cannot be cut into chunks: a factor that would end too late is not begun.
+                # For work that cannot be cut into chunks: a factorisation that would end too late is not begun.
                 self.solver.until(self.state, Deadline(self.time_limit))
         try:
             if records and self._record():
@@ -503,9 +503,9 @@ def next_count(n: int) -> int:
 
 
 def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
-    """What the solver makes of few rows in one compiled call, judged there; None where it leaves that to `Prepared`.
+    """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
 
-    Claim, counts and residual are put in words when somebody asks for them.
+    The fields of claim, counts and residual are made when they are first read.
     """
     small = spec.small
     if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
@@ -513,7 +513,7 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
     if not 0.0 < tol < math.inf:
         return None
     if problem.cones.has_ellipse or (problem.m > SMALL_ROWS and problem.generalized is None):
-        return None  # of islands, which may take long: who hears Ctrl-C asks for these
+        return None  # islands may take long: they are solved where Ctrl-C is heard
     start = perf_counter()
     if impulse is None:
         given = problem.guess
