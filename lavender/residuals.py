@@ -156,7 +156,7 @@ class Residual:
         return p.disk.metric.weight * np.abs(p.on_disk(self.error))
 
     def __str__(self) -> str:
-        worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
+        worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
         text = (
             f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
         )

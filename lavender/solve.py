@@ -111,6 +111,7 @@ def solve(
     InputError
         `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
     """
+    check_problem(problem)  # first, for those who pass A and b
     spec = get(solver)
     if max_iter is None and time_limit is None and callback is None and not (history or options):
         made = solve_small(problem, spec, impulse, tol)
