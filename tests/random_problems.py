@@ -203,6 +203,11 @@ def good(solution, tol=1e-12):
     return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
 
 
+def sweeps(problem, name, n, **options):
+    """Impulse after n iterations."""
+    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
+
+
 def spd(n, seed=0):
     a = np.random.default_rng(seed).normal(size=(n, n))
     return a @ a.T / n + np.eye(n), np.random.default_rng(seed + 1).normal(size=n)

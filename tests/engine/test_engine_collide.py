@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worked import after
 
 import lavender as lv
 from lavender.engine.layout import HEAD
@@ -236,9 +237,7 @@ def test_jointed_bodies_touch_only_when_asked_to():
 
 
 def settled(**more):
-    sim = lv.Simulation(lv.Scene("stack", **more))
-    for _ in range(60):
-        sim.step()
+    sim = after(60, "stack", **more)
     return sim
 
 

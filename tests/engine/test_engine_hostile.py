@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from worked import python
+from worked import after, python
 
 import lavender as lv
 from lavender.engine import check
@@ -29,9 +29,7 @@ def trajectory(sim, steps):
 
 def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared(tmp_path):
     # one bit of one entry: nothing else can notice
-    sim = lv.Simulation(lv.Scene("bridge", n=4, patch_radius=0.1))
-    for _ in range(5):
-        sim.step()
+    sim = after(5, "bridge", n=4, patch_radius=0.1)
     assert set(check.GIVEN) | set(check.CARRIED) | {"head", "setting", "ptr"} == set(KEPT)
     for name in check.GIVEN:
         if not sim.state.a[name].size:
@@ -75,9 +73,7 @@ def test_fields_of_a_snapshot_have_their_types(field, value, tmp_path):
     ("name", "solver"), [("pile", {}), ("bridge", {}), ("pyramid", {"solver": "newton"})]
 )
 def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name, solver):
-    sim = lv.Simulation(lv.Scene(name, **solver))
-    for _ in range(30):
-        sim.step()
+    sim = after(30, name, **solver)
     shot = sim.snapshot()
     sim.restore(shot)
     again = sim.snapshot()

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from worked import after
 
 import lavender as lv
 from lavender.engine import stepping
@@ -80,9 +81,7 @@ def test_asking_for_the_problem_changes_no_state(name):
 @pytest.mark.parametrize("warm", [True, False])
 @pytest.mark.parametrize("name", ["stack", "pyramid", "spinner", "bridge"])
 def test_the_eight_values_are_the_judges_on_the_normal_rows(name, warm):
-    sim = lv.Simulation(lv.Scene(name, warm_start=warm, substeps=1, **SCENES[name]))
-    for _ in range(40):
-        sim.step()
+    sim = after(40, name, warm_start=warm, substeps=1, **SCENES[name])
     problem = sim.constraint_problem()
     normal = problem.cones.ptr[:-1][problem.cones.kind > 0]
     solver = sim.step()[0]["solver"]
@@ -107,9 +106,7 @@ def test_without_contacts_the_residuals_are_zero():
 
 
 def test_names_keys_and_guess_travel_with_the_problem():
-    sim = lv.Simulation(lv.Scene("bridge", n=4))
-    for _ in range(60):
-        sim.step()
+    sim = after(60, "bridge", n=4)
     problem = sim.constraint_problem()
     assert problem.row_name(3) == "hinge 0, axis 3"
     assert problem.row_name(len(problem.rows.jac)).startswith("plank") and "load" in problem.row_name(
@@ -168,9 +165,7 @@ def assert_same(a, b):
 @pytest.mark.parametrize("name", SCENES)
 def test_repeat_runs_and_restored_runs_have_the_same_bits(name, tmp_path):
     scene = lv.Scene(name, order="random", seed=3, **SCENES[name])
-    sim = lv.Simulation(scene)
-    for _ in range(15):
-        sim.step()
+    sim = after(15, scene)
     sim.set_solver_iterations(7)
     sim.set_warm_start(name != "stack")
     state = sim.snapshot()
@@ -344,9 +339,7 @@ def test_the_residual_of_all_rows_is_the_judges():
     ("name", "more"), [("stack", {"friction": 0.0}), ("ramp", {}), ("chain", {}), ("table", {})]
 )
 def test_exported_problems_can_be_solved_to_the_floor(name, more):
-    sim = lv.Simulation(lv.Scene(name, **more))
-    for _ in range(10):
-        sim.step()
+    sim = after(10, name, **more)
     problem = sim.constraint_problem()
     if problem.law in ("linear", "lcp"):
         solution = lv.solve(problem, "direct", tol=1e-10)
@@ -360,9 +353,7 @@ def test_exported_problems_can_be_solved_to_the_floor(name, more):
     [("stack", {"friction": 0.0}), ("pyramid", {"base": 3, "friction": 0.0}), ("four_bar", {"motor": 1.0})],
 )
 def test_osqp_finds_the_same_body_velocities(name, more):
-    sim = lv.Simulation(lv.Scene(name, **more))
-    for _ in range(5):
-        sim.step()
+    sim = after(5, name, **more)
     problem = sim.constraint_problem()
     found = lv.solve(problem, "osqp", tol=1e-9)
     exact = lv.solve(problem, "direct", tol=1e-12)

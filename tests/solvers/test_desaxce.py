@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from random_problems import good, random_contact_problem, seeds
 from twins import block_diagonal
+from worked import after
 
 import lavender as lv
 from lavender.solvers.newton_systems import systems
@@ -121,10 +122,7 @@ ONE = {"substeps": 1, "order": "given"}
 
 def problem_in(scene, step, **parameters):
     """What `step + 1` steps of a scene lead to, without its warm start."""
-    sim = lv.Simulation(lv.Scene(scene, **parameters))
-    for _ in range(step + 1):
-        sim.step()
-    return dataclasses.replace(sim.constraint_problem(), guess=None)
+    return dataclasses.replace(after(step + 1, scene, **parameters).constraint_problem(), guess=None)
 
 
 @pytest.mark.parametrize(
