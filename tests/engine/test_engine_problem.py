@@ -228,16 +228,21 @@ def test_substeps_are_steps_of_a_fraction():
     assert one.time == pytest.approx(two.time, rel=1e-15)
 
 
+def with_room(state, pairs, contacts):
+    """The same state in arrays of so much room."""
+    size = state.size.copy()
+    size[8:10] = pairs, contacts
+    tight = type(state)(size)
+    for name, array in state.a.items():
+        goal = tight.a[name]
+        goal[...] = array[tuple(slice(n) for n in goal.shape)]
+    return tight
+
+
 def test_arrays_grow_without_changing_the_trajectory():
     scene = lv.Scene("pile", n=60, kind="boxes")
     sim, tight = lv.Simulation(scene), lv.Simulation(scene)
-    small = tight.state.size.copy()
-    small[8:10] = 3  # room for three pairs and three contacts
-    state = type(tight.state)(small)
-    for name, array in tight.state.a.items():
-        goal = state.a[name]
-        goal[...] = array[tuple(slice(n) for n in goal.shape)]
-    tight.state = state
+    tight.state = with_room(tight.state, 3, 3)
     for _ in range(80):
         a, b = sim.step()[0], tight.step()[0]
         np.testing.assert_array_equal(a["positions"], b["positions"])
@@ -246,12 +251,7 @@ def test_arrays_grow_without_changing_the_trajectory():
 
 def test_what_lacks_room_says_so_before_any_state_has_changed():
     sim = lv.Simulation("stack")
-    size = sim.state.size.copy()
-    size[9] = 5
-    state = type(sim.state)(size)
-    for name, array in sim.state.a.items():
-        goal = state.a[name]
-        goal[...] = array[tuple(slice(n) for n in goal.shape)]
+    state = with_room(sim.state, sim.state.size[8], 5)
     before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
     assert state.kernel.substeps(3) == (1, 0)
     assert state.head[HEAD["need_contacts"]] == 24
