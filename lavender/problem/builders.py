@@ -80,7 +80,7 @@ class Builders(Operators):
         if np.ndim(mu) == 0:
             each = 3 + turns
             mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
-        mu = as_array("mu", np.asarray(mu), (None,))
+        mu = as_array("mu", mu, (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
