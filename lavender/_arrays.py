@@ -74,7 +74,7 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
-    if np.ma.is_masked(value):
+    if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy loads its module when it is first named
         masked = np.argwhere(np.ma.getmaskarray(value))
         where = ", ".join(map(str, masked[0]))
         raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")

@@ -507,7 +507,7 @@ sys.meta_path.insert(0, Finder())
     ("way", "module"),
     [
         (("-m", "lavender"), "numpy"),
-        (("-m", "lavender"), "lavender.cli.solve"),
+        (("-m", "lavender"), "lavender.cli.solvers"),
         (("-m", "lavender.cli"), "lavender.problem"),
         (("-m", "lavender.cli"), "lavender.cli.options"),
     ],
