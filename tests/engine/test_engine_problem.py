@@ -347,7 +347,7 @@ def test_the_residual_of_all_rows_is_the_judges():
     ],
 )
 def test_exported_problems_can_be_solved_to_the_floor(name, more):
-    problem = after(10, name, **more).constraint_problem()
+    problem = after(5, name, **more).constraint_problem()
     if problem.law in ("linear", "lcp"):
         solution = lv.solve(problem, "direct", tol=1e-10)
         other = lv.solve(problem, "osqp", tol=1e-9)
