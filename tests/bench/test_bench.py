@@ -181,7 +181,7 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     assert into[0].records == kept
 
 
-def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
+def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path):
     path = tmp_path / "records.jsonl"
     full = OSError(28, "No space left on device")
     counter = itertools.count()

@@ -3,7 +3,6 @@
 import _thread
 import os
 import threading
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from lavender.engine.layout import HEAD
 from lavender.engine.state import KEPT, State
 from lavender.registry import specs
 
-HERE = Path(__file__).resolve().parent.parent
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
 
 
@@ -26,7 +24,7 @@ def trajectory(sim, steps):
 # -- snapshots -----------------------------------------------------------------------------------------
 
 
-def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared(tmp_path):
+def test_every_array_of_a_snapshot_that_the_scene_gives_is_compared():
     # one bit of one entry: nothing else can notice
     sim = after(5, "bridge", n=4, patch_radius=0.1)
     assert set(check.GIVEN) | set(check.CARRIED) | {"head", "setting", "ptr"} == set(KEPT)
@@ -194,8 +192,6 @@ def caller(register):
 
 
 def test_what_a_solver_calls_from_inside_a_step_is_refused(caller):
-    sim = lv.Simulation("stack")
-    calls = (sim.step, sim.snapshot, sim.constraint_problem, sim.reset, lambda: sim.set_warm_start(False))
     refused = []
 
     def inside():

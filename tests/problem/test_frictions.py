@@ -52,7 +52,7 @@ def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
     touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)
 
 
-def test_things_show_themselves_shortly_and_in_notebooks(tmp_path):
+def test_things_show_themselves_shortly_and_in_notebooks():
     problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
     assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
     solution = lv.solve(problem, "pgs", history=True)

@@ -309,7 +309,7 @@ def test_large_finite_numbers_are_finite():
 # -- the registry --------------------------------------------------------------------------------------------
 
 
-def test_ctrl_c_from_a_real_signal(tmp_path):
+def test_ctrl_c_from_a_real_signal():
     code = (
         "import _thread, threading, numpy as np, lavender as lv\n"
         "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"

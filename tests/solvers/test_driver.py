@@ -1,7 +1,6 @@
 """Room, start and step: the same method without Python, in any number of turns, and in WebAssembly."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from lavender.certificates import check_certificate
 from lavender_ext.driver.driver import Driver
 
 MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
-ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 def driven(problem, tol=1e-9, budget=1500, work=10**6):

@@ -40,7 +40,7 @@ def test_the_table_has_at_most_four_candidates_for_each_law_and_operator():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_plan_is_counted_and_a_solve_goes_by_it(name, monkeypatch):
+def test_a_plan_is_counted_and_a_solve_goes_by_it(name):
     problem = suite.case(name).problem
     plan = lv.explain(problem, tol=1e-6)
     assert plan == lv.explain(suite.case(name).problem, tol=1e-6)

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from random_problems import warmed
 from worked import after
 
 import lavender as lv
@@ -44,11 +45,9 @@ def drawn():
     for seed in range(90):
         problem = wild(seed=seed, rows=ROWS).problem
         yield f"wild {seed}", problem
-        solution = lv.solve(problem, tol=1e-9)
-        if solution.success:
-            rng = np.random.default_rng(seed)
-            b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
-            yield f"wild {seed}, warm", problem.updated(b=b, guess=solution.impulse)
+        warm = warmed(problem, seed)
+        if warm is not None:
+            yield f"wild {seed}, warm", warm
 
 
 @pytest.fixture(scope="module")
