@@ -254,7 +254,7 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     printed, said = process.communicate(timeout=600)
     assert process.returncode == 130, said
     assert b"Traceback" not in said
-    assert b"goes on from here" in printed
+    assert b"continues from here" in printed
     assert (out / "index.html").exists()
     kept = [json.loads(line) for line in records.read_text().splitlines()]
     assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)

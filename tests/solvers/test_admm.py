@@ -112,7 +112,7 @@ def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
         assert state.full
         r = np.linspace(-1.0, 1.0, m)
         x = state.factor[2][0].solve(r)
-        np.testing.assert_allclose(state.matrix @ x + state.rho * x, r, atol=1e-12)
+        np.testing.assert_allclose(state.matrix @ x + state.splitting.rho * x, r, atol=1e-12)
     # A minute is enough for 60 rows on any machine; of 1200 the factor is expected to take longer than 50 ms.
     solution = prepared.solve(time_limit=60.0 if m == 60 else 0.05, max_iter=30)
     assert (solution.status is lv.Status.TIME_LIMIT and solution.iterations == 0) == (m > 1000)

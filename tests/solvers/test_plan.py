@@ -123,7 +123,7 @@ def test_the_command_shows_plans_and_gives_them_as_data(capsys):
         main(["explain", "stack(n=200)", "granularF(n=4)"])
     assert end.value.code in (0, None)
     shown = capsys.readouterr().out
-    assert "first direct" in shown and "granularF(n=4)" in shown
+    assert "first turn: direct" in shown and "granularF(n=4)" in shown
     with pytest.raises(SystemExit):
         main(["explain", "stack(n=200)", "--json", "--tol", "1e-9"])
     plan = lv.Plan.of(json.loads(capsys.readouterr().out))

@@ -17,6 +17,7 @@ TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
 REFUSED = {
     "no problem": (lambda: lv.solve(np.eye(2), "pgs"), lv.InputError, "Problem"),
+    "a matrix and a vector": (lambda: lv.solve(np.eye(2), [1.0, -1.0]), lv.InputError, "Problem.lcp"),
     "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
     "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
     "an option of others": (lambda: lv.solve(TINY, "direct", order="reverse"), lv.CapabilityError, "order"),
