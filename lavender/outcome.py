@@ -46,6 +46,9 @@ def finish(
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
         status = DIVERGED
+    elif status is CONVERGED and tol < relative == judged.floor:
+        status = DIVERGED
+        message = f"{message}; beside such impulses float64 loses b".removeprefix("; ")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
     elif problem.operator not in spec.operators and (

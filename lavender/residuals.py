@@ -10,6 +10,9 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
               float64 costs; no solver can promise less than about twice that
     success   relative <= tol
 
+Where rounding A lambda alone costs more than doing nothing and as much as all of b, float64 cannot tell A lambda - b
+from A lambda: the floor is then the relative residual, unless that is more. An impulse that ran away is no solution.
+
 Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
 norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.
 

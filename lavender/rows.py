@@ -201,6 +201,13 @@ class Rows:
         """Number of contacts, c: the blocks after the joints."""
         return len(self.contact_body)
 
+    @property
+    def block_bodies(self) -> IntArray:
+        """(k, 2) bodies of each block, joints first; -1 is static."""
+        if self.n_joints == 0:
+            return self.contact_body
+        return np.concatenate([self.joint_body, self.contact_body])
+
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
         tangents = cones.n_tangents[self.n_joints :]

@@ -98,7 +98,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.text import count
-    from lavender.report.write import write_all
+    from lavender.report.write import write
 
     for limit in asked["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -125,7 +125,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write_all(found, out, figures=not asked["no_figures"])
+    index = write(found, out, figures=not asked["no_figures"])
     if asked["paper"]:
         from lavender.report.paper import write_paper
 

@@ -376,23 +376,20 @@ class Scene:
 
     def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **more: Any) -> int:
         """Add a box of whole edges `size` (3,) [m]; `more` as in `add_body`. Returns its number."""
-        edges = numbers("size of a box [m]", size, 3)
-        if not (edges > 0.0).all():
-            raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
-        return self.add_body(mass, shape=Box(tuple(edges.tolist())), **more)
+        return self.add_body(mass, shape=Box(size), **more)
 
     def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **more: Any) -> int:
         """Add a sphere of `radius` [m]; `more` as in `add_body`. Returns its number."""
-        return self.add_body(mass, shape=Sphere(number("radius of a sphere [m]", radius, above=0.0)), **more)
+        return self.add_body(mass, shape=Sphere(radius), **more)
 
     def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **more: Any) -> int:
         """Add a static half-space normal.x <= offset [m]; `more`: name, friction, restitution, patch_radius."""
-        n = unit("normal of a plane", normal)
-        d = number("offset of a plane [m]", offset)
+        plane = Plane(normal, offset)
         for key in ("position", "quaternion", "velocity", "angular_velocity", "inertia", "mass"):
             if key in more:
                 raise InputError(f"a plane is static and has no {key}; give normal and offset")
-        return self.add_body(0.0, static=True, shape=Plane(tuple(n.tolist()), d), position=d * n, **more)
+        place = plane.offset * np.array(plane.normal)
+        return self.add_body(0.0, static=True, shape=plane, position=place, **more)
 
     # -- joints ---------------------------------------------------------------------------------
 

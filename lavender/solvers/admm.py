@@ -30,7 +30,6 @@ from lavender.solution import Claim, Status
 from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
-from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.newton_systems.systems import DENSE_FILL, factor_cost
 from lavender.solvers.sweeping import claim, watch_over
@@ -127,7 +126,7 @@ class AdmmState:
             return _FULL * m**3 / 3.0
         if self.kind == _BODIES:
             assert problem.rows is not None
-            nptr, nind = body_pattern(block_bodies(problem), problem.rows.n_bodies)[:2]
+            nptr, nind = body_pattern(problem.rows.block_bodies, problem.rows.n_bodies)[:2]
             return _PANELS_WORK * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
         return _PANELS_WORK * self.panels.work if m else 0.0
 

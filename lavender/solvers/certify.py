@@ -18,9 +18,10 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
 from lavender.deadline import Deadline
+from lavender.ordering import blocks_of_each
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender.solvers.islands import blocks_of_each, restrict, rows_of
+from lavender.solvers.islands import restrict, rows_of
 from lavender.solvers.solve_log import SolveLog
 
 __all__ = ["certify"]

@@ -18,7 +18,6 @@ from lavender.registry import SMALL_ROWS
 from lavender.solvers import weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
-from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.small import AT_ONCE, prepared, velocities_cost
@@ -41,8 +40,9 @@ class Structure:
 
     @cached_property
     def sweep(self) -> float:
-        """Multiply-adds of one sweep."""
-        return float(sweep_work(self.problem))
+        """Multiply-adds of one sweep; a block that is solved exactly costs each of its rows as much as it has."""
+        p, work = self.problem, float(sweep_work(self.problem))
+        return work * p.m / (3.0 * p.n_blocks) if p.law == "cone" and p.cones.has_rolling else work
 
     @cached_property
     def entries(self) -> float:
@@ -72,7 +72,7 @@ class Structure:
         p = self.problem
         if p.rows is None or not p.rows.n_bodies:
             return False
-        return 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) > 3 * p.n_blocks
+        return 4 * graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) > 3 * p.n_blocks
 
     # -- factors of A ------------------------------------------------------------------------------
 
@@ -111,7 +111,7 @@ class Structure:
         """Of A in the order of blocks, or of a tree."""
         p = self.problem
         assert p.rows is not None
-        bodies, n = block_bodies(p), p.rows.n_bodies
+        bodies, n = p.rows.block_bodies, p.rows.n_bodies
         width = float(graph.body_spread(p.cones.ptr, bodies, n) + 1)
         if self._loops <= TREE:
             of = np.repeat(bodies, np.diff(p.cones.ptr), axis=0)
@@ -159,7 +159,7 @@ class Structure:
         p = self.problem
         if p.rows is None or p.rows.n_bodies == 0:
             return 1.0
-        return max(1.0, graph.body_pairs(block_bodies(p), p.rows.n_bodies, False) / p.rows.n_bodies)
+        return max(1.0, graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, False) / p.rows.n_bodies)
 
     # -- velocities of generalised coordinates -----------------------------------------------------
 

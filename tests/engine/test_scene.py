@@ -8,7 +8,7 @@ import pytest
 
 import lavender as lv
 from lavender.engine.layout import SIZE
-from lavender.scene import SCENES
+from lavender.scene import SCENES, Box, Plane, Sphere
 from lavender.scene.parts import quaternion, rotation
 
 
@@ -141,6 +141,11 @@ def test_contacts_of_one_scene_may_have_different_rows():
         (lambda s: s.add_body(velocity=(0, 0, 1j)), "velocity .* complex"),
         (lambda s: s.add_body(inertia=np.ma.array([1.0, 1.0, 1.0], mask=[0, 0, 1])), "inertia .* no value"),
         (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
+        (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
+        (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),
+        (lambda s: s.add_body(shape=Box((1.0, -1.0, 1.0))), "positive edges"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
         (lambda s: s.add_box(static="no"), "static .* True or False"),
         (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), collide="no"), "collide"),
         (lambda s: s.add_body(quaternion=(1, 0, 0)), "quaternion"),

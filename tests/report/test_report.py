@@ -239,7 +239,7 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
         ),
     )
     assert said.leaders == ("auto", "pgs")
-    text = html.unescape(report.write(found, tmp_path, figures=False, times=[1e-3, 1.0]).read_text())
+    text = html.unescape(report.write(Report(found, None, [1e-3, 1.0]), tmp_path, figures=False).read_text())
     assert text.index(said.sentences[0]) < text.index(said.code[0]) < text.index("<table")
     nobody = verdict(records_of(record("a", "x", 1.0, 0.5)))
     assert nobody.text == "Nobody brings any of your stack to 1e-6."
@@ -319,7 +319,7 @@ def test_time_budgets_are_those_given_and_the_sweeps_are_named(tmp_path):
         1e-6: ("pgs", "90 sweeps"),
     }
     assert {t: a.best.solver for t, a in line.by_time.items()} == {0.5: "pgs", 5.0: "direct"}
-    text = report.write(found, tmp_path, figures=False, times=[0.5, 5.0]).read_text()
+    text = report.write(Report(found, None, [0.5, 5.0]), tmp_path, figures=False).read_text()
     assert "<th>in 500 ms</th><th>in 5.00 s</th>" in text.replace("\n", "")
     assert "| in 500 ms | in 5.00 s |" in (tmp_path / "summary.md").read_text()
 
@@ -553,7 +553,7 @@ def test_changes_beyond_noise_are_named(tmp_path):
         "x": "slower", "y": "same", "z": "reached", "w": "lost", "v": "same",
     }  # fmt: skip
     assert found["v"].noise == 2.0  # its repeats spread by half
-    text = report.write(new, tmp_path, figures=False, old=old).read_text()
+    text = report.write(Report(new, old), tmp_path, figures=False).read_text()
     assert "Against the earlier run" in text
     assert text.count("slower 3 times") == 2  # to both levels
     # A case whose numbers have changed is not compared.
