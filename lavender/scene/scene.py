@@ -220,21 +220,21 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
 
 
 class Scene:
-    """Bodies and joints with their parameters: a named scene of the gallery, or an empty one to build.
+    """Bodies, joints and parameters of a simulation: a named scene of the gallery, or an empty one to fill.
 
     Parameters
     ----------
     name : str, optional
-        A scene of the gallery, or another that `named_scene` has registered; None: empty.
+        A scene of the gallery, or one registered by `named_scene`. None: an empty scene.
     **parameters
-        Those of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
+        The fields of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
 
     Raises
     ------
     UnknownName
-        No such scene or parameter; the message names the nearest.
+        No such scene or parameter; the message suggests the nearest name.
     InputError
-        A value that makes no sense.
+        A value that is not valid.
 
     Examples
     --------
