@@ -283,7 +283,10 @@ class ProblemData:
 def check_problem(problem: Any) -> None:
     """Raise where what stands for a problem is none."""
     if not isinstance(problem, ProblemData):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+        raise InputError(
+            f"problem is a {type(problem).__name__}; a lavender.Problem is needed: make one by Problem.lcp(A, b), "
+            "linear, contact, from_rows or from_jacobian"
+        )
 
 
 def _many(n: int, what: str) -> str:

@@ -134,7 +134,7 @@ def _head(first: Choice, reached: str, what: str) -> str:
 
 
 def _sure(race: Race) -> list[str]:
-    """How often the choice wins, and who is as good."""
+    """How often the choice wins, and which solvers are as good."""
     if len(race.ranking) < 2:
         return []
     share = f"It wins in {100 * race.shares[0]:.0f} % of resamplings"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, flag, number, whole_number
+from lavender._arrays import FloatArray, as_array, flag, number, shape_of, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
@@ -90,7 +90,7 @@ class Parameters:
         for name, allowed in RANGES.items():
             put(self, name, number(name, getattr(self, name), **allowed))
         gravity: Any = self.gravity
-        if np.ndim(gravity) == 0:
+        if shape_of("gravity", gravity) == ():
             gravity = (0.0, 0.0, -number("gravity", gravity))
         put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
         for name in ("solver_options", "stepper_options"):
@@ -220,21 +220,21 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
 
 
 class Scene:
-    """Bodies and joints with their parameters: a named scene of the gallery, or an empty one to build.
+    """Bodies, joints and parameters of a simulation: a named scene of the gallery, or an empty one to fill.
 
     Parameters
     ----------
     name : str, optional
-        A scene of the gallery, or another that `named_scene` has registered; None: empty.
+        A scene of the gallery, or one registered by `named_scene`. None: an empty scene.
     **parameters
-        Those of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
+        The fields of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
 
     Raises
     ------
     UnknownName
-        No such scene or parameter; the message names the nearest.
+        No such scene or parameter; the message suggests the nearest name.
     InputError
-        A value that makes no sense.
+        A value that is not valid.
 
     Examples
     --------
@@ -575,9 +575,10 @@ def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
 
 
 def _tensor(label: str, given: Any) -> FloatArray:
-    if np.shape(given) not in ((3,), (3, 3)):
+    shape = shape_of(f"inertia of {label}", given)
+    if shape not in ((3,), (3, 3)):
         raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed")
-    x = as_array(f"inertia of {label} [kg m^2]", given, np.shape(given))
+    x = as_array(f"inertia of {label} [kg m^2]", given, shape)
     if x.ndim == 1:
         x = np.diag(x)
     scale = np.abs(x).max()

@@ -4,6 +4,7 @@ import dataclasses
 import html
 import html.parser
 import io
+import json
 import math
 import random
 import re
@@ -11,12 +12,14 @@ import re
 import numpy as np
 import pytest
 from rich.console import Console
+from stacks import chain
 
 import lavender as lv
 from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run
 from lavender.report import curves, tables
 from lavender.report.curves import overall_figure
+from lavender.report.engine import contestants
 from lavender.report.findings import Report
 from lavender.report.paper import write_paper
 from lavender.report.terminal import print_report
@@ -347,29 +350,13 @@ def test_claims_failures_and_spreads():
     assert tables.Spread("a", "x", 8, {"given": 1e-16, "reverse": 4e-15}, floor=2e-15).factor == 2.0
 
 
-@pytest.mark.parametrize(
-    ("t", "text"),
-    [
-        (1.0, "1.00 s"),
-        (0.0123, "12.3 ms"),
-        (1e-3, "1.00 ms"),
-        (4.5e-5, "45.0 µs"),
-        (9e-8, "0.09 µs"),
-        (123.4, "123 s"),
-    ],
-)
-def test_times_have_three_digits_and_a_unit(t, text):
-    assert seconds(t) == text
-    assert seconds(math.inf) == "–"
-
-
-def test_ratios_say_no_more_than_they_know():
+def test_numbers_are_written_with_what_they_know():
+    assert [seconds(t) for t in (1.0, 0.0123, 1e-3, 4.5e-5, 9e-8, 123.4, math.inf)] == [
+        "1.00 s", "12.3 ms", "1.00 ms", "45.0 µs", "0.09 µs", "123 s", "–",
+    ]  # fmt: skip
     assert [times(x) for x in (1.34, 85.0, 1234.4, 7.3e13, math.nan)] == [
         "1.3 times", "85 times", "1234 times", "10^14 times", "–",
     ]  # fmt: skip
-
-
-def test_residuals_have_two_digits():
     assert [residual(x) for x in (3.44e-7, 0.0, math.inf, 1.0)] == ["3.4e-7", "0", "inf", "1.0e0"]
 
 
@@ -497,8 +484,7 @@ def test_a_step_that_nobody_was_asked_for_is_missed_and_a_folder_may_have_the_na
 
 
 def test_sequences_are_compared_carried_against_cold(tmp_path):
-    a = np.diag(np.full(6, 2.0)) - np.diag(np.ones(5), 1) - np.diag(np.ones(5), -1)
-    problems = [lv.Problem.lcp(a, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
+    problems = [lv.Problem.lcp(chain(6).matrix, np.ones(6) * (1 + 0.001 * i)) for i in range(4)]
     plan = bench.Plan(levels=(1e-6,), budgets=(5,), repeats=1)
     records = bench.run(bench.sequence(problems, "load"), ["pgs", "direct"], plan)
     budget, level, exact = tables.passes(records)
@@ -579,3 +565,27 @@ def test_a_full_disk_leaves_the_page_of_the_last_time(tmp_path, monkeypatch):
         report.write(records_of(record("b", "pgs", 2.0, 1e-7)), tmp_path, figures=False)
     assert index.read_text() == before
     assert not list(tmp_path.glob(".*"))  # nor is a half of a page left
+
+
+@pytest.mark.parametrize(
+    "worst, level, name", [(1e-2, 1e-3, "pgs"), (1e-5, 1e-6, "newton"), (1e-9, 1e-6, "newton")]
+)
+def test_an_engine_stands_beside_the_fastest_to_a_level_as_good_as_its_own(tmp_path, worst, level, name):
+    lines = [
+        {"rows": 3, "seconds": 1e-4, "relative": e, "solver": "newton", "verdict": ""}
+        for e in (worst, worst / 2)
+    ]
+    (tmp_path / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    times = {"pgs": {1e-3: 1e-6, 1e-6: 5e-3}, "newton": {1e-3: 1e-3, 1e-6: 2e-3}}
+    found = records_of(
+        *(
+            record(f"{tmp_path.name}[{step}]", solver, time, tol / 2, tol=tol)
+            for step in (0, 1)
+            for solver, levels in times.items()
+            for tol, time in levels.items()
+        )
+    )
+    (engine,) = contestants([str(tmp_path)], found)
+    assert engine.ours == f"{name}, cold, to {level:g}"
+    assert engine.our_seconds == times[name][level]
+    assert engine.our_worst == level / 2

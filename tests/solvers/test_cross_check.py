@@ -9,8 +9,6 @@ import lavender as lv
 from lavender import check, registry, suite
 from lavender.check import cross_check
 
-ITERATIVE = ["pgs", "jacobi", "sequential_impulses"]
-
 
 def bounded_problem(seed, stiff=0.3, contacts=8):
     """Joints with and without bounds, contacts without friction; every row a little compliant."""
@@ -141,6 +139,8 @@ def test_unknown_names():
         cross_check(problem, ["pgs"], reference="osq")
     with pytest.raises(lv.InputError, match="no solver 'direct' in this check"):
         cross_check(problem, ["pgs"])["direct"]
+    with pytest.raises(lv.InputError, match=r"a lavender\.Problem is needed"):
+        lv.cross_check(None)
     with pytest.raises(lv.InputError, match="tol"):
         cross_check(problem, ["pgs"], tol=-1.0)
 
