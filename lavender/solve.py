@@ -383,6 +383,8 @@ class _Loop:
     time: float = 0.0  # s, of the solver alone
     done: int = 0  # iterations
     work: dict[str, int] = field(default_factory=dict)
+    broken: bool = False  # the solver did not return
+    next_record: int = 0  # iterations
 
     def run_once(self, max_iter: int) -> Claim:
         start_point = self.impulse.copy()
@@ -409,8 +411,6 @@ class _Loop:
             self.broken = True
             return Claim(NUMERICAL_ERROR, 0, {}, _last_words(error))
 
-    broken = False  # the solver did not return
-
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
         chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
@@ -427,7 +427,7 @@ class _Loop:
             while self.done < max_iter:
                 n = min(chunk, max_iter - self.done)
                 if records:
-                    n = min(n, self._next_record - self.done)
+                    n = min(n, self.next_record - self.done)
                 start = perf_counter()
                 claim = self._call(n, None)
                 elapsed = perf_counter() - start
@@ -435,7 +435,7 @@ class _Loop:
                 self.done += claim.iterations
                 for kind, count in claim.work.items():
                     self.work[kind] = self.work.get(kind, 0) + count
-                stopped = records and self.done == self._next_record and self._record()
+                stopped = records and self.done == self.next_record and self._record()
                 if claim.status is not MAX_ITERATIONS:
                     break
                 if claim.iterations < 1:
@@ -478,10 +478,8 @@ class _Loop:
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self._next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
+        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
-
-    _next_record = 0
 
     def _total(self, claim: Claim) -> Claim:
         if claim.iterations == self.done and claim.work == self.work:

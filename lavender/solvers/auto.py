@@ -29,6 +29,7 @@ from lavender.solvers.methods import Candidate, Sweeps, in_short_time, make
 from lavender.solvers.schedule import race
 from lavender.solvers.small import AUTO, call_ends_within, prepared
 from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.structure import Structure
 
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free. Under limits of 1 and 10 ms, residuals from stale guesses are then 1.8 and 1.3 times smaller. The
@@ -40,9 +41,10 @@ ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, tak
 
 @dataclass
 class State:
-    """What `auto` has prepared: nothing, except sweeps and their costs under a time limit."""
+    """What `auto` has prepared: nothing, except sweeps and what costs are counted from under a time limit."""
 
     problem: Problem
+    structure: Structure | None = None
     sweeps: Sweeps | None = None
     call: bool = True  # the compiled call may be made
     log: SolveLog | None = None  # of the solve that has ended, as long as it is not told
@@ -82,7 +84,8 @@ class Auto:
         if state.call and state.problem.generalized is None:
             prepared(state.problem)
         if state.problem.m and self.plan is None and not state.problem.cones.has_round:
-            state.sweeps = in_short_time(state.problem, 1e9 * time_limit)
+            costs = Costs(state.problem)
+            state.structure, state.sweeps = costs.structure, in_short_time(costs, 1e9 * time_limit)
 
     def run(
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
@@ -106,7 +109,7 @@ class Auto:
         state.log = log
         try:
             if max_iter > 0 and log.best > tol:
-                solve(log, self.plan, sweeps)
+                solve(log, self.plan, sweeps, state.structure)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
         return NOTHING_TOLD
@@ -128,17 +131,18 @@ def _load(problem: Problem) -> None:
     load(*(["scipy.sparse.linalg"] if lu else []))
 
 
-def solve(log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None) -> None:
-    """To the end, by a plan where one is given; `sweeps`: what is set up for a time limit."""
+def solve(
+    log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None, structure: Structure | None = None
+) -> None:
+    """To the end, by a plan where one is given; `sweeps`, `structure`: what is set up for a time limit."""
     if log.done() if sweeps is None else not sweeps.run_first(log):
         return
     with np.errstate(all="ignore"):  # what overflows is judged
-        others(log, plan, [] if sweeps is None else [sweeps])
+        others(log, plan, structure, [] if sweeps is None else [sweeps])
 
 
-def others(log: SolveLog, plan: Plan | None, begun: list[Candidate]) -> None:
+def others(log: SolveLog, plan: Plan | None, structure: Structure | None, begun: list[Candidate]) -> None:
     """All candidates, of which one may have begun, and at last the certificate."""
-    structure = begun[0].costs.structure if begun else None
     costs = Costs(log.problem, log.tol, structure=structure, plan=plan)
     names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
     race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)

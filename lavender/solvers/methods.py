@@ -12,7 +12,6 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.deadline import CHUNK_TIME, Deadline
-from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
@@ -154,8 +153,8 @@ class Sweeps(Resumed):
     relative = 1.0  # residual of the last check
     least = 0.0  # ns, lower bound of the cost of any other method
     told = 0, 0  # sweeps and restarts of the turns before
-    alone = False  # the first turn has all of the time,
-    before = 1.0  # the residual that it begins at,
+    alone = False  # the first turn has all of the time that is left,
+    before, begun = 1.0, 0  # the residual and the sweeps that it begins at,
     claim: Claim  # and what came of it
 
     def set_up(self) -> None:
@@ -171,15 +170,27 @@ class Sweeps(Resumed):
         Return whether another may follow. If not, nothing but sweeps runs here; `end` judges the last impulse when the
         clock has stopped.
         """
-        self.log, self.before = log, log.best
-        deadline, each = log.deadline, 1e-9 * self.cost.each
-        half = 0.5 * (deadline.left() or 0.0)
+        self.log = log
+        half = 0.5 * (log.deadline.left() or 0.0)
         self.alone = 1e9 * half <= self.costs.sure * self.least
-        if not self.alone:
-            deadline = Deadline(half)
         self.begin()
-        if self.alone:
-            log.end = self.end
+        if not self.alone:
+            self.sweep(Deadline(half))
+            if log.done():
+                return False
+            if not log.ends_late(self.least):
+                if not self.has_done(self.claim):
+                    self.rest = np.inf
+                return True
+            self.alone = True  # these took so long that no other fits
+        log.end = self.end
+        self.sweep(log.deadline)
+        return False
+
+    def sweep(self, deadline: Deadline) -> None:
+        """As many sweeps as end in time."""
+        log, each = self.log, 1e-9 * self.cost.each
+        self.before, self.begun = log.best, self.state.done
         try:
             pace = self.state.within(
                 self.impulse, self.relative, min(log.left, MOST), log.tol, FIRST, deadline.left, each, PROBE,
@@ -189,25 +200,21 @@ class Sweeps(Resumed):
         finally:
             if not self.alone:
                 self.end()
-        if self.alone or log.ends_late(self.least) or log.done():
-            return False
-        if not self.has_done(self.claim):
-            self.rest = np.inf
-        return True
 
     def end(self) -> None:
-        """Offer and note the result of the first turn."""
+        """Offer and note the result of these sweeps."""
         log, looks = self.log, self.state
+        done = looks.done - self.begun
         if looks.best is not None:
             log.take(looks.best)
         if self.alone:
             log.by = log.problem.metric
             log.offer(self.impulse)
-            log.timed_out = looks.done < log.left
+            log.timed_out = done < log.left
         self.relative = log.best if looks.now is None else looks.now.relative
         self.status = STATUS[looks.status]
         self.close()
-        self.claim = Claim(self.status, looks.done, self.work)
+        self.claim = Claim(self.status, done, self.work)
         log.note(self.name, self.claim, self.before)
 
     def begin(self) -> None:
@@ -370,10 +377,15 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
-def in_short_time(problem: Problem, limit: float) -> Sweeps | None:
-    """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take."""
-    costs = Costs(problem)
+def in_short_time(costs: Costs, limit: float) -> Sweeps | None:
+    """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take.
+
+    Where others may follow, velocities are analysed here, before the clock starts: that takes as long as many sweeps.
+    """
+    problem = costs.problem
     least = min(map(costs.floor, TABLE[problem.operator][problem.law]))
+    if 0.5 * limit > costs.sure * least:
+        costs.structure.kernel  # noqa: B018
     if limit > costs.sure**2 * least:
         return None
     sweeps = Sweeps("anderson", None, costs, get("anderson"))
