@@ -48,7 +48,7 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
     if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, 0.0
-    return (s.energy, s.velocity, relative(s.energy, s.velocity, p.start_energy, p.start_velocity),
+    return (s.energy, s.velocity, relative_of(&s, &w[0], p.blocks.n_rows, p.start_energy, p.start_velocity),
             relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity))
 
 
