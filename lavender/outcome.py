@@ -53,9 +53,11 @@ def finish(
     ):
         status = STALLED
         message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
-    elif status is CONVERGED and spec.own and relative > tol and judged.floor >= 1.0:
+    elif status is CONVERGED and spec.own and tol < relative == judged.floor:
         status = STALLED
-        message = f"{message}; the impulse ran away: rounding it hides all that its test saw".removeprefix("; ")
+        message = f"{message}; the impulse ran away: rounding it hides all that its test saw".removeprefix(
+            "; "
+        )
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
         status = FLOOR
     certificate = claim.certificate
