@@ -50,7 +50,7 @@ COLD = (
     "engine/arrays",
     "generalized/export",
     "core/blocks",
-    "core/gate",
+    "core/checks",
     "core/order",
     "factor/graph",
     "factor/narrow",

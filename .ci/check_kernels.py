@@ -49,14 +49,14 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
 #: sleeps by the system's calls; `checked_sweeps` calls the Python faces of kernels one after the other, `many` and
-#: `call` the kernels themselves, and allocate what these need; `gate` and `blocks` look at arrays of Python, `newton`
+#: `call` the kernels themselves, and allocate what these need; `checks` and `blocks` read arrays of Python, `newton`
 #: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
 #: check sees, but for the logarithms by which `checked_sweeps` guesses about sweeps; that of `direct`, `lemke`,
 #: `principal`, `measure` and `watch` is cut out for the C library, which refuses what needs Python.
 EXEMPT = {
     "threaded": "threads",
     "checked_sweeps": "calls kernels, guesses how long they will take",
-    "gate": "reads arrays of Python, computes nothing",
+    "checks": "reads arrays of Python, computes nothing",
     "blocks": "reads and fills arrays of Python, computes nothing",
     "many": "allocates and calls kernels, computes nothing",
     "call": "allocates, copies islands out and calls kernels, computes nothing",

@@ -16,8 +16,9 @@ Node. All of them by the adapters of `lavender phenomena`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -117,43 +118,38 @@ class Contestant:
     substeps: bool = False
     options: Mapping[str, Any] = field(default_factory=dict)  # of the engine, of ours of the scene
 
+    def step(self, build: Callable[..., Scene], tower: Tower) -> Stepping:
+        """The engine with a scene that takes ours' settings; of the tower step, sweeps, substeps and order count."""
+        if self.module == "own":
+            asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
+            return engine("own", build(dt=tower.dt, substeps=tower.substeps, **asked, **self.options))
+        sweeps = self.default if tower.sweeps is None else tower.sweeps
+        options = {"dt": tower.dt, **self.options, **({self.sweeps: sweeps} if self.sweeps else {})}
+        options |= {"substeps": tower.substeps or 1} if self.substeps else {}
+        return engine(self.module, build(), **options)
+
     def make(self, tower: Tower) -> Standing:
         """The engine with a tower."""
-        if self.module == "own":
-            return self._ours(tower)
-        sweeps = (self.default if tower.sweeps is None else tower.sweeps) if self.sweeps else 0
-        options = {"dt": tower.dt, **self.options}
-        options |= {self.sweeps: sweeps} if self.sweeps else {}
-        options |= {"substeps": tower.substeps or 1} if self.substeps else {}
-        made = engine(self.module, Scene("stack", n=tower.boxes, friction=FRICTION), **options)
-        return Standing(made, self.name, sweeps, getattr(made, "substeps", options.get("substeps", 1)))
-
-    def _ours(self, tower: Tower) -> Standing:
-        asked = {"solver_iterations": tower.sweeps, "order": tower.order} if self.sweeps else {}
-        scene = Scene(
-            "stack",
-            n=tower.boxes,
-            dt=tower.dt,
-            friction=FRICTION,
-            substeps=tower.substeps,
-            **asked,
-            **self.options,
-        )
-        made: Any = engine("own", scene)
-        p = scene.parameters
+        made: Any = self.step(partial(Scene, "stack", n=tower.boxes, friction=FRICTION), tower)
+        if self.module != "own":
+            sweeps = (self.default if tower.sweeps is None else tower.sweeps) if self.sweeps else 0
+            parts = (tower.substeps or 1) if self.substeps else getattr(made, "substeps", 1)
+            return Standing(made, self.name, sweeps, parts)
+        p = made.scene.parameters
         name = f"{self.name}, {p.order}" if self.sweeps and tower.order is not None else self.name
         return Standing(made, name, made.sim.solver_iterations if self.sweeps else 0, p.substeps)
 
 
-#: Engines by the name that `--engines` takes.
+_ELLIPTIC = {"cone": "elliptic", "tree": False}
+#: Engines by the name that `--engines` takes. Joints of others are constraints between bodies, as ours are.
 ENGINES: dict[str, Contestant] = {
     "lavender": Contestant("lavender", substeps=True),
     "newton": Contestant("lavender newton", sweeps="", options={"solver": "newton"}),
     "soft_step": Contestant("lavender soft_step", substeps=True, options={"stepper": "soft_step"}),
     "avbd": Contestant("lavender avbd", substeps=True, options={"stepper": "avbd"}),
     "lavendersim": Contestant("lavendersim", "lavender_sim", "lavendersim", 22),
-    "mujoco_newton": Contestant("mujoco Newton", "mujoco", "mujoco", sweeps="", options={"cone": "elliptic"}),
-    "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options={"cone": "elliptic"}),
+    "mujoco_newton": Contestant("mujoco Newton", "mujoco", "mujoco", sweeps="", options=_ELLIPTIC),
+    "mujoco_pgs": Contestant("mujoco PGS", "mujoco", "mujoco", 100, options=_ELLIPTIC),
     "pybullet": Contestant("pybullet", "bullet", "pybullet", 50, substeps=True, options={"bodies": True}),
     "rapier": Contestant(
         "rapier", "node", PACKAGES_OF_NODE["rapier"], 4, sweeps="iterations", options={"engine": "rapier"}

@@ -68,11 +68,12 @@ PLAN = bench.Plan(LEVELS, budgets=(4, 16, 64), repeats=2, time_limit=0.1, warm=F
 BACKENDS = ("osqp", "scs", "piqp", "clarabel", "clarabel_cone")
 NEAR = 1.25  # times the fastest: differences below say nothing on a machine that does other work
 ADVICE = (
-    "Who brings most cases of a structure to a level, and of those the fastest by shifted geometric mean of time:\n"
-    "the number shown; in brackets on how many cases, where not on all. In a time: who serves most (half of\n"
-    "the start's residual is left at most), of those the residual at the 90th percentile.\n"
-    f"≈ are as good within noise ({NOISE:g} times in time, {RESIDUAL_NOISE:g} in residual). The same records as\n"
-    "[a report's page](REPORT)."
+    "The first table has the solver that brings the most cases of a structure to each level and, of those that bring\n"
+    "as many, is the fastest. The number is the shifted geometric mean of its times; brackets show on how many cases,\n"
+    "if not on all. The second table has the solver that serves the most cases within each time (a case is served if\n"
+    "at most half of the start's residual is left); the number is the residual at the 90th percentile. Solvers\n"
+    f"after ≈ are as good within noise (a factor of {NOISE:g} in time, {RESIDUAL_NOISE:g} in residual).\n"
+    "[A report's page](REPORT) shows the same records."
 )
 LAW_NAMES = {
     "linear": "linear systems",
@@ -204,19 +205,20 @@ def abilities(spec):
         ("reads", "; ".join(text for name, text in reads.items() if name in spec.operators)),
         (
             "ends",
-            "after finitely many steps or at rounding, whatever `tol`"
+            "after finitely many steps or at rounding accuracy, independently of `tol`"
             if spec.exact
-            else "where its test at `tol` is met",
+            else "when its convergence test at `tol` is met",
         ),
-        ("runs", "in steps that can be stopped and continued" if spec.resumable else "in one call"),
+        ("runs", "in steps that can be interrupted and continued" if spec.resumable else "in one call"),
         (
             "takes",
-            "; ".join(text for name, text in yes.items() if getattr(spec, name)) or "neither start nor order",
+            "; ".join(text for name, text in yes.items() if getattr(spec, name))
+            or "neither a start nor an order",
         ),
         ("budget", f"{spec.max_iter:,} iterations unless `max_iter=` says otherwise"),
     ]
     if spec.delegates:
-        rows.append(("hands over", "to other solvers; its message and `work` say to which"))
+        rows.append(("calls", "other solvers; its message and `work` name them"))
     if spec.requires:
         rows.append(("needs", f"`pip install {spec.install or ' '.join(spec.requires)}`"))
     if spec.reference:
@@ -253,7 +255,7 @@ def standing(records, solver):
         cells.append(residual(mine.best) + (" (floor)" if mine.at_floor else ""))
         rows.append(cells)
     if not rows:
-        return "Not measured here: it is not installed, or takes none of the cases."
+        return "Not measured here: it is not installed, or accepts none of the cases."
     lines = []
     for level, cases in best.items():
         if cases:
@@ -268,8 +270,8 @@ def standing(records, solver):
         said = "In the measurements of this build another solver was faster on every case, to every level."
     head = ("case", *(f"to {level_name(x)}" for x in LEVELS), "best residual")
     note = (
-        "Times are set-up and solve; in brackets, relative to the fastest *other* solver (`auto` aside); "
-        "– was not reached."
+        "Times include set-up and solve; brackets: relative to the fastest *other* solver (`auto` excluded); "
+        "–: not reached."
     )
     return f"{said}\n\n{table(head, rows)}\n\n{note}"
 
@@ -278,7 +280,7 @@ def solver_page(site, spec, records, figures):
     """One page: formula and remarks from the module, abilities and options from the SPEC, curves from the records."""
     module = importlib.import_module(_module_of(spec))
     title = f"# {spec.name}\n\n{spec.summary[:1].upper() + spec.summary[1:]}."
-    parts = [title, docstrings.markdown(module.__doc__ or ""), "## What it takes", abilities(spec)]
+    parts = [title, docstrings.markdown(module.__doc__ or ""), "## Problems and arguments", abilities(spec)]
     if spec.options:
         rows = [(f"`{name}`", text) for name, text in spec.options.items()]
         parts += ["## Options", table(("option", "meaning"), rows)]
@@ -326,7 +328,7 @@ def solver_pages(site, records, figures):
     ]
     site.write(
         "solvers/index.md",
-        "# Solvers\n\nEvery name that `lavender.solve` takes. *Reads*: rows (body velocities), the matrix A "
+        "# Solvers\n\nEvery name that `lavender.solve` accepts. *Reads*: rows (body velocities), the matrix A "
         "(formed where it was not given), or both.\n*Exact*: ends after finitely many "
         "steps. *Resumable*: n₁ and then n₂ iterations give the bits of n₁ + n₂.\n\n"
         + table(("name", "laws", "reads", "exact", "resumable", ""), rows)
@@ -337,7 +339,7 @@ def solver_pages(site, records, figures):
     parts = [
         "# Backends of other packages",
         docstrings.markdown(sys.modules["lavender.external.backends"].__doc__),
-        "Each runs under its own name. What is not installed says what to install. Options of all of them:",
+        "Each runs under its own name. One that is not installed says what to install. Options of all of them:",
         table(
             ("option", "meaning"),
             [(f"`{n}`", t) for n, t in next(s for s in others if s.options).options.items()],
@@ -399,8 +401,8 @@ def measured_page(site, records, figures):
             f"{len(records)} runs on {len(records.cases)} cases of `lavender.suite`, made while these pages were "
             f"built: {run.cpu}, {run.threads} thread,\nlavender {run.lavender}, Python {run.python}, {shown}. "
             f"Minimum of {PLAN.repeats} repeats, set-up and solve together, at most {seconds(PLAN.time_limit)}\n"
-            "a solve. It is a glance, not a benchmark: `lavender report` on your own problems says more. Every run, "
-            "mean and claim, with the cases, is in\n[the report](report.html) of these records."
+            "a solve. This is a small measurement, not a benchmark: `lavender report` on your own problems says more. "
+            "Every run, mean and claim, with the cases, is in\n[the report](report.html) of these records."
         ),
         "## By structure",
         structures.replace("REPORT", "report.html"),

@@ -1,8 +1,8 @@
-"""One gate for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
+"""One check for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from math import isfinite
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lavender._later import sparse as sp
 from lavender.errors import InputError
-from lavender_ext.core import gate
+from lavender_ext.core import checks
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -25,7 +25,7 @@ FLOAT64, INT32 = np.dtype(np.float64), np.dtype(np.int32)
 def _fits(given: tuple[int, ...], wanted: tuple[int | None, ...]) -> bool:
     if len(given) != len(wanted):
         return False
-    for n, s in zip(wanted, given, strict=True):  # noqa: SIM110 - a generator takes as long as the rest of the gate
+    for n, s in zip(wanted, given, strict=True):  # noqa: SIM110 - a generator takes as long as the rest of the check
         if n is not None and n != s:
             return False
     return True
@@ -54,11 +54,11 @@ def as_array(
     Raises
     ------
     InputError
-        Not numeric, complex, of another shape, or not finite where it must be.
+        Not numeric, complex, of another shape, with masked entries, or not finite where it must be.
     """
     # What most callers give: nothing to convert, and no word to be made.
     if dtype is np.float64:
-        made = gate.plain(value, shape, finite, copy)
+        made = checks.plain(value, shape, finite, copy)
         if made is not None:
             return made
         if type(value) is float and isfinite(value) and len(shape) == 1 and shape[0] is not None:
@@ -74,6 +74,10 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
+    if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy loads its module when it is first named
+        masked = np.argwhere(np.ma.getmaskarray(value))
+        where = ", ".join(map(str, masked[0]))
+        raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")
     if (
         dtype is np.int32
         and given.dtype.kind == "f"
@@ -126,6 +130,13 @@ def whole_number(what: str, value: object, low: int = 0, high: int | None = 2**3
         upto = "" if high is None else f" to {high}"
         raise InputError(f"{what} is {value!r}; a whole number from {low}{upto} is needed")
     return int(value)
+
+
+def flag(what: str, value: object) -> bool:
+    """`value` as True or False, and nothing else."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{what} is {value!r}; True or False is needed")
+    return bool(value)
 
 
 def as_csr(name: str, given: Any, *, copy: bool = True, unit: str = "", too_many: str = "") -> sp.csr_array:
@@ -183,9 +194,19 @@ def check_not_nan(what: str, array: np.ndarray) -> None:
 
 def check_not_negative(what: str, array: np.ndarray) -> None:
     plain = array.ndim == 1 and array.dtype is FLOAT64 and array.flags.c_contiguous
-    if gate.has_negative(array) if plain else array.size and array.min() < 0:
+    if checks.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
+
+
+def words_for(what: str, given: Any, count: int) -> tuple[str, ...]:
+    """A word for each of `count` things that `what` names."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise InputError(f"names of {what} are {given!r}; a sequence of {count} words is needed")
+    words = tuple(map(str, given))
+    if len(words) != count:
+        raise InputError(f"{len(words)} names for {count} {what}; one for each is needed")
+    return words
 
 
 def equal(x: object, y: object) -> bool:

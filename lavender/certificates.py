@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.cones import ROW
 from lavender.problem import Problem
 
 __all__ = ["check_certificate"]
@@ -80,9 +79,9 @@ def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
     pull = np.zeros(problem.m)
     np.multiply(z, bound, out=pull, where=z != 0.0)
     normal, limit, size = _rims(problem, z)
-    most, first = z.copy(), c.ptr[:-1][c.kind != ROW]
+    most, first = z.copy(), c.normal_rows
     np.add.at(most, normal, limit * size)
-    pull[np.repeat(c.kind != ROW, np.diff(c.ptr))] = 0.0
+    pull[c.contact_rows] = 0.0
     # What pulls along tangents alone is beyond its own zero already; against a normal it may be rounding.
     pull[first] = np.where(most[first] > np.where(z[first] == 0.0, 0.0, zero[first]), np.inf, 0.0)
     return pull
@@ -90,9 +89,8 @@ def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
 
 def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
     c = problem.cones
-    contact_rows = np.repeat(c.kind != ROW, np.diff(c.ptr))
     bad = ((y > 0.0) & np.isfinite(c.upper)) | ((y < 0.0) & np.isfinite(c.lower))
-    bad[contact_rows] = False
+    bad[c.contact_rows] = False
     if bad.any():
         i = int(np.flatnonzero(bad)[0])
         return f"y[{i}] = {y[i]:.2e} leaves the bounds of {problem.row_name(i)}"
@@ -103,7 +101,7 @@ def _recession_violation(problem: Problem, y: FloatArray) -> str | None:
             return (
                 f"y is not along the normal of {problem.row_name(int(across[0]))}, as Coulomb friction needs"
             )
-    first = c.ptr[:-1][c.kind != ROW]
+    first = c.normal_rows
     out = np.concatenate([first[y[first] < 0.0], normal[size > limit * y[normal] * (1 + 1e-12)]])
     if len(out):
         return f"y leaves the cone of {problem.row_name(int(out.min()))}"

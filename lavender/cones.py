@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from lavender._arrays import (
     FloatArray,
@@ -220,6 +221,7 @@ class Cones:
         made = kernels.bounded_rows(lower, upper)
         if made is not None:
             return cls._of(made)
+        lower = as_array("lower", lower, (None,), finite=False, unit="N s")
         m = len(lower)
         return cls(
             np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
@@ -228,10 +230,7 @@ class Cones:
     @classmethod
     def free(cls, m: int) -> Cones:
         """m unbounded rows, each its own block: a linear system."""
-        made = kernels.free_rows(m)
-        if made is None:
-            raise InputError(f"m is {m}; a number of rows from 0 to 2^31 - 2 is needed")
-        return cls._of(made)
+        return cls._of(kernels.free_rows(whole_number("m", m, high=2**31 - 2)))
 
     @classmethod
     def contacts(
@@ -285,9 +284,7 @@ class Cones:
         elif pair and not box:
             mu, ratio = _axes(mu)
             sides = 0 if ratio is None else CONTACT_ELLIPSE
-        if type(mu) is not float:
-            mu = np.asarray(mu, float)
-        given = len(mu) if isinstance(mu, np.ndarray) and mu.ndim else 1
+        given = 1 if type(mu) is float or np.ndim(mu) == 0 else len(mu)
         k = given if count is None else whole_number("count", count)
         if type(mu) is not float or not 0.0 <= mu < np.inf:
             mu = _not_negative("mu", mu, k)
@@ -413,6 +410,23 @@ class Cones:
         return replace(self, kind=kind, patch_radius=radius)
 
     @property
+    def contact_rows(self) -> npt.NDArray[np.bool_]:
+        """(m,) whether a row is a contact's."""
+        return np.repeat(self.kind != ROW, np.diff(self.ptr))
+
+    @property
+    def friction_rows(self) -> npt.NDArray[np.bool_]:
+        """(m,) whether a row is a contact's other than its normal."""
+        found = self.contact_rows
+        found[self.ptr[:-1]] = False
+        return found
+
+    @property
+    def normal_rows(self) -> IntArray:
+        """(c,) the normal row of each contact."""
+        return np.asarray(self.ptr[:-1][self.kind != ROW])
+
+    @property
     def reach(self) -> FloatArray:
         """(m,) largest impulse of each row over lambda_n: mu, mu r on `apart_rows`, mu_r on rolling; 0 on others."""
         size = np.diff(self.ptr)
@@ -515,9 +529,14 @@ def _fitting(kind: IntArray, size: IntArray) -> IntArray:
     return kind
 
 
+def _mu_array(mu: Any) -> FloatArray:
+    """Finite, of any shape."""
+    return as_array("mu", mu, (None,) * np.ndim(mu))
+
+
 def _sides(mu: Any) -> tuple[Any, FloatArray]:
     """mu_1 (float or (k,)) of boxes and mu_2 / mu_1, (1,) or (k,), from mu: scalar, (k,) or (k, 2)."""
-    given = as_array("mu", np.asarray(mu, float), (None,) * np.ndim(mu))
+    given = _mu_array(mu)
     check_not_negative("mu", given.ravel())
     if given.ndim < 2:
         return mu, np.ones(1)
@@ -531,7 +550,7 @@ def _sides(mu: Any) -> tuple[Any, FloatArray]:
 
 def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
     """mu_1 (k,) of ellipses and mu_2 / mu_1 (k,), None where all are disks, from mu (k, 2)."""
-    given = as_array("mu", np.asarray(mu, float), (None,) * np.ndim(mu))
+    given = _mu_array(mu)
     check_not_negative("mu", given.ravel())
     if given.ndim != 2 or given.shape[1] != 2:
         raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")

@@ -15,7 +15,17 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, as_array, as_csr, borrowed, equal, precision_of, read_only
+from lavender._arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    as_csr,
+    borrowed,
+    equal,
+    precision_of,
+    read_only,
+    words_for,
+)
 from lavender._later import issparse
 from lavender._later import sparse as sp
 from lavender.errors import InputError
@@ -109,10 +119,7 @@ class Generalized:
     ) -> None:
         put = self.__dict__
         n = len(v_free)
-        if names is not None:
-            names = tuple(map(str, names))
-            if len(names) != n:
-                raise InputError(f"{len(names)} names for {n} velocities; one for each is needed")
+        names = None if names is None else words_for("velocities", names, n)
         put["v_free"], put["names"], put["order"] = v_free, names, None
         operator = kernels.Operator(*jac, *mass)
         if operator.fill > 0 and operator.failed < 0 and _worth_ordering(operator.work, len(mass[1])):

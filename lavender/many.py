@@ -74,7 +74,7 @@ def solve_many(
     check_budget(spec, tol, max_iter, options.get("time_limit"))
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
-    together = spec.own and spec.small is not None and spec.small.gate is not None and not options
+    together = spec.own and spec.small is not None and spec.small.limits is not None and not options
     together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     at = [
         i
@@ -119,6 +119,6 @@ def _batch(
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
     assert spec.small is not None
-    work = Batch(views, given, tol, spec.small.gate)
+    work = Batch(views, given, tol, spec.small.limits)
     seconds = (perf_counter() - begin) / max(1, len(at))
     work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)

@@ -31,7 +31,7 @@ __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "regist
 
 
 # Modules whose SPECS are registered first, by name: they import this one.
-SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `few` is asked first
+SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `small` is tried first
 TABLES = ("lavender.solvers", "lavender.external")
 
 
@@ -39,7 +39,7 @@ class SmallCall(Protocol):
     """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
 
     @property
-    def gate(self) -> Any:
+    def limits(self) -> Any:
         """What it may cost over generalised velocities."""
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:

@@ -40,11 +40,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, read_only
+from lavender._arrays import ArrayLike, FloatArray, as_array, read_only
 from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.generalized import Generalized
-from lavender.problem import PRECISIONS, Problem
+from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender_ext.judge import measure
 
 __all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
@@ -260,14 +260,12 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
     >>> early.verdict, early.excess > 1e4
     ('stopped early', True)
     """
+    check_problem(problem)
     precision = problem.precision if precision is None else precision
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
-    try:
-        if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
-            impulse = np.ascontiguousarray(impulse, float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"impulse is not an array of numbers ({error})") from None
+    if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
+        impulse = as_array("impulse", impulse, (None,), finite=False, unit="N s")
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:

@@ -19,7 +19,7 @@ from lavender._arrays import (
 from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import InputError
-from lavender_ext.core import gate
+from lavender_ext.core import checks
 
 __all__ = ["Rows"]
 
@@ -122,7 +122,7 @@ class Rows:
         n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
         c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
-        if not gate.counts_up(ptr):
+        if not checks.counts_up(ptr):
             raise InputError(
                 "joint_ptr must start with 0 and increase: the first row of each joint, then the "
                 "number of joint rows"
@@ -140,7 +140,7 @@ class Rows:
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
             object.__setattr__(self, name, body)
-            if gate.are_pairs(body, len(self.inv_mass), name == "contact_body"):
+            if checks.are_pairs(body, len(self.inv_mass), name == "contact_body"):
                 continue
             if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
                 stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
@@ -157,7 +157,7 @@ class Rows:
         check_not_negative("inv_mass", self.inv_mass)
         if self.copy:
             object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
-        if not gate.are_frames(self.normal, self.tangent):
+        if not checks.are_frames(self.normal, self.tangent):
             self._take_frames()
         object.__setattr__(self, "copy", True)  # of what was given here
 
@@ -256,7 +256,7 @@ class Rows:
 
 def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
     """Tensors (n, 3, 3) that bodies have, made whole where float32 left symmetry or eigenvalues of 0 a little off."""
-    if gate.are_definite(tensors):
+    if checks.are_definite(tensors):
         return tensors
     size = np.abs(tensors).max(axis=(1, 2))
     skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))

@@ -216,10 +216,8 @@ def _targets(p: Problem) -> Iterator[Suspicion]:
     if motion is None or not contact.any():
         return
     u, target = motion
-    normal = c.ptr[:-1][contact]
-    tangent = np.repeat(contact, np.diff(c.ptr))
-    tangent[normal] = False
-    joints = int(np.count_nonzero(np.repeat(~contact, np.diff(c.ptr))))
+    normal, tangent = c.normal_rows, c.friction_rows
+    joints = int(np.count_nonzero(~c.contact_rows))
     if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
         reason = f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none with the {joints} "
         yield _of(p, "targets", reason + "targets of joints put first, where their rows stand")

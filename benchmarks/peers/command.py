@@ -14,12 +14,11 @@ import click
 from benchmarks.output import folder_of, write_json
 from benchmarks.peers import engines as peer_engines
 from benchmarks.peers import race
-from benchmarks.peers.contest import Result, ours
+from benchmarks.peers.adapters import Result, contestants, ours
 from benchmarks.peers.engines import Step
 from benchmarks.peers.problems import PROBLEMS, problems
 from benchmarks.peers.tables import engines_table, solvers_tables
 from lavender.bench import machine
-from lavender.bench.peers.adapters import contestants
 
 __all__ = ["command"]
 

@@ -8,17 +8,19 @@ beside it, and the judge's residual where the engine's problem is known: ours, a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
-from importlib.util import find_spec
+from dataclasses import dataclass, replace
+from functools import partial
 from time import process_time
 from typing import Any
 
 import numpy as np
 
+from benchmarks import stand
+from benchmarks.stand import Contestant, Tower
 from lavender.errors import UnknownName
-from lavender.phenomena.engines import Stepping, engine
+from lavender.phenomena.engines import engine, lacks
 from lavender.problem import Problem
 from lavender.scene import Scene
 
@@ -48,11 +50,11 @@ class Step:
     scene: str
     engine: str
     accurate: bool  # iterates to its own tolerance; else a fixed number of sweeps
-    time: float  # s of CPU of one step, least batch; nan: left out, `note` says why
-    contacts: int
-    depth: float  # m, deepest penetration; of a chain the largest gap of a joint, nan where it is not known
-    speed: float  # m/s, largest of a body
-    relative: float  # -, the judge's, of the last step; nan where the engine's problem is not known
+    time: float = NAN  # s of CPU of one step, least batch; nan: left out, `note` says why
+    contacts: int = 0
+    depth: float = NAN  # m, deepest penetration; of a chain the largest gap of a joint, nan: not known
+    speed: float = NAN  # m/s, largest of a body
+    relative: float = NAN  # -, the judge's, of the last step; nan where the engine's problem is not known
     note: str = ""
 
 
@@ -60,49 +62,16 @@ def _scene(name: str, **more: Any) -> Scene:
     if name not in SCENES:
         raise UnknownName("scene", name, SCENES)
     of, parameters = SCENES[name]
-    return Scene(of, dt=DT, **parameters, **more)
+    return Scene(of, **parameters, **more)
 
 
-@dataclass(frozen=True)
-class Mode:
-    """An engine with its name and setting."""
-
-    name: str  # {} stands for the number of sweeps
-    module: str  # of `lavender.phenomena.engines`
-    options: Mapping[str, Any] = field(default_factory=dict)
-    scene: Mapping[str, Any] = field(default_factory=dict)  # asked of the scene, of our own
-
-    @property
-    def accurate(self) -> bool:
-        """It iterates to its own tolerance."""
-        return "{}" not in self.name
-
-    def make(self, scene: str, sweeps: int) -> Stepping:
-        """With a scene of `SCENES`; `sweeps` where it takes a number of them."""
-        own = self.module == "own"
-        counted = {} if self.accurate else {"solver_iterations" if own else "sweeps": sweeps}
-        built = _scene(scene, **self.scene, **(counted if own else {}))
-        return engine(self.module, built, **self.options, **({} if own else counted))
-
-
-#: What each engine needs installed, and its modes. Joints of others are constraints between bodies, as ours are.
-ENGINES: dict[str, tuple[str | None, tuple[Mode, ...]]] = {
-    "lavender": (
-        None,
-        (Mode("lavender, {} sweeps", "own"), Mode("lavender newton", "own", scene={"solver": "newton"})),
-    ),
-    "mujoco": (
-        "mujoco",
-        (
-            Mode("mujoco PGS elliptic, {} sweeps", "mujoco", {"cone": "elliptic", "dt": DT, "tree": False}),
-            *(
-                Mode(f"mujoco Newton {cone}", "mujoco", {"cone": cone, "dt": DT, "tree": False})
-                for cone in ("elliptic", "pyramidal")
-            ),
-        ),
-    ),
-    "pybullet": ("pybullet", (Mode("pybullet, {} sweeps", "bullet", {"dt": DT, "bodies": True}),)),
+#: Engines and modes, of those of the towers: friction in elliptic cones where they have a choice.
+ENGINES: dict[str, Contestant] = {
+    name: stand.ENGINES[name] for name in ("lavender", "newton", "mujoco_pgs", "mujoco_newton", "pybullet")
 }
+ENGINES["mujoco_pyramidal"] = replace(
+    ENGINES["mujoco_newton"], name="mujoco Newton pyramidal", options={"cone": "pyramidal", "tree": False}
+)
 
 
 def export(scene: str, cone: str = "elliptic", settle: int = 120) -> Problem:
@@ -153,47 +122,39 @@ def measure_scene(
     for name in engines:
         if name not in ENGINES:
             raise UnknownName("engine", name, ENGINES)
-    known = [ENGINES[name] for name in engines]
-    modes = [mode for needs, some in known if not needs or find_spec(needs) for mode in some]
+    asked = Tower(0, DT, sweeps)
+    known = [ENGINES[name] for name in engines if not lacks(ENGINES[name].needs)]
     notes: dict[int, str] = {}
     with ExitStack() as stack:
         made = []
-        for mode in modes:
-            made.append(mode.make(scene, sweeps))
+        for one in known:
+            made.append(one.step(partial(_scene, scene), asked))
             stack.callback(made[-1].close)
         size = np.ones(len(made), int)
-        for i, one in enumerate(made):
+        for i, stepping in enumerate(made):
             start = process_time()
             for done in range(settle):
-                one.step()
+                stepping.step()
                 if process_time() - start > SETTLE_LIMIT:
                     notes[i] = f"did not settle: {done + 1} of {settle} steps in {SETTLE_LIMIT:g} s of CPU"
                     break
             size[i] = max(1, min(200, int(BATCH / max((process_time() - start) / max(settle, 1), 1e-6))))
         best = np.full(len(made), np.inf)
         for _ in range(rounds):
-            for i, one in enumerate(made):
+            for i, stepping in enumerate(made):
                 if i in notes:
                     continue
                 start = process_time()
-                one.advance(size[i])
+                stepping.advance(size[i])
                 best[i] = min(best[i], (process_time() - start) / size[i])
         found = []
-        for i, (mode, one) in enumerate(zip(modes, made, strict=True)):
+        for i, (one, stepping) in enumerate(zip(known, made, strict=True)):
+            name = f"{one.name}, {sweeps} sweeps" if one.sweeps else one.name
             if i in notes:
-                left: dict[str, Any] = {
-                    "time": NAN,
-                    "contacts": 0,
-                    "depth": NAN,
-                    "speed": NAN,
-                    "relative": NAN,
-                    "note": notes[i],
-                }
-            else:
-                one.step()
-                contacts, depth, relative = one.left()
-                speed = float(np.linalg.norm(one.state()[2][:, :3], axis=1).max(initial=0.0))
-                left = {"time": float(best[i]), "contacts": contacts, "depth": depth, "speed": speed}
-                left["relative"] = relative
-            found.append(Step(scene=scene, engine=mode.name.format(sweeps), accurate=mode.accurate, **left))
+                found.append(Step(scene, name, not one.sweeps, note=notes[i]))
+                continue
+            stepping.step()
+            contacts, depth, relative = stepping.left()
+            speed = float(np.linalg.norm(stepping.state()[2][:, :3], axis=1).max(initial=0.0))
+            found.append(Step(scene, name, not one.sweeps, float(best[i]), contacts, depth, speed, relative))
         return found

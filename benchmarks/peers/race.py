@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from time import monotonic
 from typing import Any
 
-from benchmarks.peers.contest import SCRATCH, TARGETS, Result
-from lavender.bench.peers.adapters import Contestant
+from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
 from lavender.bench.running.timing import one_thread
 from lavender.external.running import quiet
 from lavender.problem import Problem

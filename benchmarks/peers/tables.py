@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from benchmarks.output import markdown
-from benchmarks.peers.contest import SCIPY, SCRATCH, TARGETS, Result
+from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
 from lavender.report.tables import geometric_mean
 from lavender.report.text import residual, seconds

@@ -326,8 +326,8 @@ def mass_ratio(problem: Problem) -> float:
         x = problem.rows.inv_mass
     else:
         c = problem.cones
-        rows = np.flatnonzero(np.repeat(c.kind == ROW, np.diff(c.ptr)))
-        x = problem.d[np.concatenate([rows, c.ptr[:-1][c.kind != ROW]])]
+        rows = np.flatnonzero(~c.contact_rows)
+        x = problem.d[np.concatenate([rows, c.normal_rows])]
     x = x[x > 0.0]
     return float(x.max() / x.min()) if len(x) else 1.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import sys
@@ -11,36 +12,38 @@ import click
 
 from lavender import _starting
 from lavender._version import __version__
-from lavender.cli.bench import bench
-from lavender.cli.cases import cases
-from lavender.cli.check import check
-from lavender.cli.doctor import doctor
-from lavender.cli.explain import explain
-from lavender.cli.export import export
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
-from lavender.cli.phenomena import phenomena
-from lavender.cli.record import record
-from lavender.cli.reference import reference
-from lavender.cli.report import report
-from lavender.cli.run import run
-from lavender.cli.solve import solve
-from lavender.cli.solvers import solvers
 from lavender.errors import LavenderError
-from lavender.web.command import view, web
 
 __all__ = ["cli", "main"]
 
+#: Name -> the module that has the command.
+COMMANDS = {
+    name: f"lavender.cli.{name}"
+    for name in ("bench", "cases", "check", "doctor", "explain", "export", "phenomena", "record", "reference",
+                 "report", "run", "solve", "solvers")
+} | dict.fromkeys(("view", "web"), "lavender.web.command")  # fmt: skip
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+
+class Commands(click.Group):
+    """Commands by name, each imported when it is asked for."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Every name."""
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The command of that name in its module."""
+        if cmd_name not in COMMANDS:
+            return None
+        command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
+        return command
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
     """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
-
-
-for _command in (
-    report, bench, check, solve, explain, reference, solvers, cases, run, record, phenomena, export, web, view, doctor,
-):  # fmt: skip
-    cli.add_command(_command)
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from lavender.cli.options import Asked, bytes_of, console, one_thread
+import click
+
+from lavender.cli.options import bytes_of, console, one_thread, was_given
 from lavender.errors import InputError
 
 if TYPE_CHECKING:
     from lavender.bench import Event, Item, Plan, Records
 
-__all__ = ["Measured", "check_named", "measure", "run_campaign"]
+    P = TypeVar("P", bound=Plan)
+
+__all__ = ["Measured", "measure", "run_campaign"]
 
 
 @dataclass(frozen=True)
@@ -57,22 +61,27 @@ def check_named(items: Sequence[Item]) -> None:
             item.forget()
 
 
-def measure(
-    files: Sequence[str],
-    asked: Asked,
-    plan: Plan,
-    path: Path,
-    sequence: bool | None = None,
-    fresh: bool = False,
-    *,
-    given: Callable[[str], bool] = lambda name: False,
-) -> Measured:
+def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
+    """The plan that the options of `plan_options` mean; those without a default leave the plan's.
+
+    Raises
+    ------
+    InputError
+        A level, budget or limit that means nothing.
+    """
+    names = ("levels", "budgets", "motion", "speed_levels", "orders")
+    return kind(**{name: asked[name] for name in names if asked[name] is not None}, **more)
+
+
+def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
     """Run with a progress bar, then time the lines that a report would print, in turns.
 
     Parameters
     ----------
-    given : callable (name)
-        Whether an option stands on the command line.
+    context : of the command, with its options
+    files : files, folders, names of the suite
+    path : of the records
+    sweeps : budgets with which a solver is to be named
 
     Raises
     ------
@@ -83,13 +92,19 @@ def measure(
     from lavender.report.contenders import time_lines
 
     one_thread()
-    bench.solver_names(asked.solvers)  # before anything is loaded: names first
-    if sequence and not files:
+    asked = context.params
+    bench.solver_names(asked["solvers"])  # before anything is loaded: names first
+    if asked["sequence"] and not files:
         raise InputError("--sequence needs a folder of problem files, one for each step")
+    limits = {"pass_limit": asked["pass_limit"]} if asked["pass_limit"] is not None else {}
+    # without files: all of the suite in a minute
+    limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
+    more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}
+    plan = plan_of(asked, bench.Plan, **limits, **more)
     reused = 0
     with bench.Store(path) as store:
-        items = bench.resolve(files, sequence)
-        if given("pass_limit") and not any(item.sequence for item in items):
+        items = bench.resolve(files, asked["sequence"])
+        if was_given(context, "pass_limit") and not any(item.sequence for item in items):
             raise InputError("--pass-limit has no effect without a sequence: leave it out")
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
@@ -103,8 +118,8 @@ def measure(
 
             stopped = False
             try:
-                more: dict[str, Any] = {"watch": watch, "fresh": fresh, "memory": bytes_of(asked.memory)}
-                bench.run(items, asked.solvers, plan, store, into=found, **more)
+                more = {"watch": watch, "fresh": asked["fresh"], "memory": bytes_of(asked["memory"])}
+                bench.run(items, asked["solvers"], plan, store, into=found, **more)
                 time_lines(items, found[0], plan, store, **more)
             except KeyboardInterrupt:
                 stopped = True
@@ -112,29 +127,17 @@ def measure(
     return Measured(found[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def run_campaign(
-    words: Sequence[str],
-    asked: Asked,
-    path: Path,
-    *,
-    workers: int,
-    backend: str,
-) -> Measured:
-    """Run a campaign with a progress bar; raises as `measure`."""
+def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> Measured:
+    """Run a campaign with a progress bar; `asked` are the options. Raises as `measure`."""
     from lavender import bench
 
     one_thread()
     check_named(bench.resolve(words))
-    plan = bench.CampaignPlan(
-        levels=asked.levels, budgets=asked.budgets, orders=asked.orders or (), motion=asked.motion,
-        speed_levels=asked.speed_levels,
-    )  # fmt: skip
+    plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
+    more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
     with bench.Store(path) as store, _Progress() as watch:
         try:
-            made = bench.campaign(
-                words, asked.solvers, plan, store, workers=workers, backend=backend, watch=watch,
-                memory=bytes_of(asked.memory),
-            )  # fmt: skip
+            made = bench.campaign(words, asked["solvers"], plan, store, watch=watch, **more)
         except KeyboardInterrupt:
             return Measured(bench.read(path).latest(), True)
         return Measured(made, False)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,8 +14,6 @@ from lavender.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from lavender.bench import Plan
-
     _ParamType = click.ParamType[Any]  # generic for type checkers since click 8.2, never for click 8.1
 else:
     _ParamType = click.ParamType
@@ -27,7 +23,6 @@ __all__ = [
     "EXIT_INFEASIBLE",
     "EXIT_INTERRUPTED",
     "EXIT_UNMET",
-    "Asked",
     "ManyValues",
     "Names",
     "Numbers",
@@ -216,41 +211,6 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         refuse_unused(context, ["memory"], "where no solver of another package runs")
 
 
-@dataclass(frozen=True)
-class Asked:
-    """What the options of a plan say, by their names."""
-
-    solvers: tuple[str, ...] | None
-    levels: tuple[float, ...]
-    motion: bool
-    speed_levels: tuple[float, ...]
-    budgets: tuple[int, ...]
-    orders: tuple[str, ...] | None
-    repeats: int
-    time_limit: float | None
-    pass_limit: float | None
-    memory: float | None
-
-    def plan(self, files: Sequence[str], times: Sequence[float] = (), sweeps: Sequence[int] = ()) -> Plan:
-        """The plan that they mean.
-
-        Raises
-        ------
-        InputError
-            A level, budget or limit that means nothing.
-        """
-        from lavender.bench import Plan
-
-        names = ("levels", "budgets", "repeats", "motion", "speed_levels")
-        more = {name: getattr(self, name) for name in names}
-        # without files: all of the suite in a minute
-        more["time_limit"] = (1.0 if files else 0.25) if self.time_limit is None else self.time_limit
-        for name in ("orders", "pass_limit"):
-            if getattr(self, name) is not None:
-                more[name] = getattr(self, name)
-        return Plan(times=times, sweeps=sweeps, **more)
-
-
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": Names(), "help": "Solvers by name; all that are installed if not given."}),
     ("--levels", {"type": Numbers(), "default": "1e-3,1e-6,1e-9", "show_default": True,
@@ -275,17 +235,10 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
 
 
 def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of what is measured, which the command gets as one argument `asked`."""
-
-    @functools.wraps(command)
-    def collected(*args: Any, **given: Any) -> Any:
-        asked = Asked(**{f.name: given.pop(f.name) for f in fields(Asked)})
-        return command(*args, asked=asked, **given)
-
-    made: Callable[..., Any] = collected
+    """The options of what is measured."""
     for name, what in reversed(PLAN_OPTIONS):
-        made = click.option(name, **what)(made)
-    return made
+        command = click.option(name, **what)(command)
+    return command
 
 
 def bytes_of(gigabytes: float | None) -> int | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
-    Asked,
     ManyValues,
     Numbers,
     Seeds,
@@ -82,20 +80,7 @@ __all__ = ["report"]
 @click.option("--paper", is_flag=True, help="Also PDF figures, LaTeX tables and the method, in OUT/paper.")
 @click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
 @click.pass_context
-def report(
-    context: click.Context,
-    /,
-    files: tuple[str, ...],
-    asked: Asked,
-    out: Path,
-    campaign: bool,
-    compare: Path | None,
-    time_budgets: tuple[float, ...],
-    tables: bool,
-    paper: bool,
-    no_figures: bool,
-    **given: Any,
-) -> None:
+def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked: Any) -> None:
     """Speed against error: every solver on every case, to each level and at each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
@@ -115,36 +100,33 @@ def report(
     from lavender.report.text import count
     from lavender.report.write import write_all
 
-    for limit in time_budgets:
+    for limit in asked["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
-    _refuse_unused(context, files, asked.solvers)
+    _refuse_unused(context, files, asked["solvers"])
     taken: set[Path] = set()
-    how = {name: given[name] for name in ("steps", "every", "controls")}
-    files = tuple(_recorded(f, out, taken, given["fresh"], how) for f in files)
-    old = None if compare is None else bench.read(compare)
-    sweeps = asked.budgets if was_given(context, "budgets") else ()
+    how = {name: asked[name] for name in ("steps", "every", "controls")}
+    files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
+    old = None if asked["compare"] is None else bench.read(asked["compare"])
+    sweeps = asked["budgets"] if was_given(context, "budgets") else ()
     path = out / "records.jsonl"
     again = [f for f in files if f.endswith(".jsonl")]
     if again:
         if len(files) > 1:
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
         done = Measured(bench.read(again[0]), False)
-    elif campaign:
-        words = bench.seeds(files, len(given["seeds"]), given["seeds"].start)
-        done = run_campaign(words, asked, path, workers=given["workers"], backend=given["backend"])
+    elif asked["campaign"]:
+        done = run_campaign(asked, bench.seeds(files, len(asked["seeds"]), asked["seeds"].start), path)
     else:
-        plan = asked.plan(files, time_budgets, sweeps)
-        more = {"sequence": given["sequence"], "fresh": given["fresh"], "given": partial(was_given, context)}
-        done = measure(files, asked, plan, path, **more)
-    engines = [] if campaign else contestants(files, done.records.latest())
-    found = Report(done.records, old, time_budgets, sweeps, engines)
-    print_report(found, console(), whole=tables)
+        done = measure(context, files, path, sweeps)
+    engines = [] if asked["campaign"] else contestants(files, done.records.latest())
+    found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
+    print_report(found, console(), whole=asked["tables"])
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write_all(found, out, figures=not no_figures)
-    if paper:
+    index = write_all(found, out, figures=not asked["no_figures"])
+    if asked["paper"]:
         from lavender.report.paper import write_paper
 
         _say(f"figures, tables and method of a paper: {write_paper(found, out / 'paper')}")

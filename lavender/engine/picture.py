@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number, whole_number
 from lavender.engine.film import Film
 from lavender.errors import InputError
-from lavender.io.stored import write_atomically, write_figure
+from lavender.io.stored import as_path, write_atomically, write_figure
 from lavender.scene.parts import rotation
 from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
@@ -47,7 +47,7 @@ def save_picture(
     turn: float = 0.45,
     tilt: float = 0.22,
     size: float = 3.0,
-    rate: int = 30,
+    rate: float = 30,
 ) -> Path:
     """Write a film, or several by name (beside each other, in a strip below each other), as pictures.
 
@@ -55,15 +55,16 @@ def save_picture(
     nearest that whole hundredths of a second allow). `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly
     spaced. `turn` and `tilt` [rad] say where the eye is, `size` [inch] how wide one frame is.
     """
-    path = Path(path)
+    path = as_path(path)
     suffix = path.suffix.lower()
     if suffix not in PICTURES:
         raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
     films = film if isinstance(film, Mapping) else {"": film}
     if not films or not all(len(one) for one in films.values()):
         raise InputError("the film has no frames; step first")
-    if not (isinstance(frames, int) and frames >= 1 and rate > 0.0 and 0.5 <= size <= 50.0):
-        raise InputError("frames must be at least 1, rate positive and size 0.5 to 50 inch")
+    frames, rate = whole_number("frames", frames, 1), number("rate [1/s]", rate, above=0.0)
+    size = number("size [inch]", size, low=0.5, high=50.0)
+    turn, tilt = number("turn [rad]", turn), number("tilt [rad]", tilt)
     if suffix == ".mp4" and which("ffmpeg") is None:
         raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
     stages = [Stage(one, turn, tilt, name) for name, one in films.items()]

@@ -17,7 +17,7 @@ import numpy as np
 
 from lavender.engine.check import well_formed
 from lavender.errors import InputError
-from lavender.io.stored import as_path, framed, unframed, whole_file, write_atomically
+from lavender.io.stored import framed, unframed, whole_file, write_atomically
 from lavender_ext.engine.arrays import N_SIZES, lengths
 
 __all__ = ["Snapshot"]
@@ -50,12 +50,12 @@ class Snapshot:
         lengths_of = [len(getattr(self, name)) for name, _ in ARRAYS]
         body = framed(MAGIC, {"version": VERSION, **header, "lengths": lengths_of}) + b"".join(arrays)
         checksum = hashlib.sha256(body).digest()
-        write_atomically(as_path(path), lambda part: _write(part, body + checksum))
+        write_atomically(path, lambda part: _write(part, body + checksum))
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Snapshot:
         """Read a file written by `save`."""
-        data = whole_file(as_path(path), "the snapshot")
+        data = whole_file(path, "the snapshot")
         if not data.startswith(MAGIC):
             raise InputError(f"{str(path)!r} is not a lavender snapshot")
         body, checksum = data[:-32], data[-32:]

@@ -14,6 +14,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 import numpy as np
 
 from lavender._arrays import FloatArray, whole_number
+from lavender._arrays import flag as checked
 from lavender.engine.export import problem_of
 from lavender.engine.film import Film
 from lavender.engine.judge import judged, moved
@@ -182,9 +183,7 @@ class Stepping:
     @alone
     def set_warm_start(self, flag: bool) -> None:
         """Warm starting from the next step on; the cache is kept up to date either way."""
-        if not isinstance(flag, (bool, np.bool_)):
-            raise InputError(f"warm_start is {flag!r}; True or False is needed")
-        self.state.head[HEAD["warm_start"]] = bool(flag)
+        self.state.head[HEAD["warm_start"]] = checked("warm_start", flag)
 
     @alone
     def reset(self, seed: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:

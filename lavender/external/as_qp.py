@@ -447,9 +447,7 @@ class _Parts:
                 bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
                 known[i] = True
                 fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
-        friction = np.repeat(c.kind != ROW, size)
-        friction[c.ptr[:-1]] = False
-        known[friction] = c.reach[friction] == 0.0
+        known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
         kept = np.flatnonzero(~known)
         d = problem.d[kept]
         if not unit_diagonal and len(d):

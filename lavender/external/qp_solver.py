@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, flag
 from lavender.errors import CapabilityError, InputError
 from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
@@ -43,8 +43,7 @@ class QPSolver:
             raise InputError(
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
-        if not isinstance(self.isolate, bool):
-            raise InputError(f"isolate is {self.isolate!r}; True or False is needed")
+        flag("isolate", self.isolate)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> QP:

@@ -62,7 +62,6 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
     InputError
         Not there, truncated, of another format, inconsistent; or HDF5 without h5py.
     """
-    path = as_path(path)
     start = first_bytes(path)
     if start[:2] == b"PK":
         return npz.read(path, max_bytes=max_bytes)

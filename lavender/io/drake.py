@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.io.pinocchio import closing_speed, told
@@ -98,11 +98,10 @@ def _problem(
         raise InputError(
             "the plant is continuous; one with a time step is needed (MultibodyPlant(time_step=dt))"
         )
-    dt, correction = step if dt is None else float(dt), float(correction)
+    dt = step if dt is None else number("dt", dt)
     if not math.isclose(dt, step, rel_tol=1e-12):
         raise InputError(f"dt is {dt:g} s, the plant's own step {step:g} s; they must be one")
-    if not 0.0 <= correction <= 1.0:
-        raise InputError(f"correction is {correction:g}; a share in [0, 1] is needed")
+    correction = number("correction", correction, low=0.0, high=1.0)
     if plant.num_constraints() > 0:
         raise CapabilityError(
             f"the plant has {plant.num_constraints()} constraints (couplers, distances, balls, welds); joints, "

@@ -470,7 +470,7 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
     reasons = []
     if np.any(c.kind == ROW):
         free = np.isneginf(c.lower) & np.isposinf(c.upper)
-        rows = np.repeat(c.kind == ROW, np.diff(c.ptr))
+        rows = ~c.contact_rows
         what = "free rows" if np.all(free[rows]) else "bounded rows"
         reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
     if c.has_ellipse:

@@ -48,7 +48,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, read_only
+from lavender._arrays import FloatArray, IntArray, as_array, read_only
 from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError
@@ -171,10 +171,7 @@ def scaling(model: Any, data: Any) -> FloatArray:
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
     mj = _mujoco(model, data)
-    lam = np.asarray(impulse, float)
-    m = int(data.nefc)
-    if lam.shape != (m,):
-        raise InputError(f"impulse has shape {lam.shape}; ({m},) is needed, one for each row of efc_J")
+    lam = as_array("impulse", impulse, (int(data.nefc),), unit="N s")
     push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
     change = np.zeros_like(push)
     mj.mj_solveM(model, data, change, np.ascontiguousarray(push))

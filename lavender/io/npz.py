@@ -7,7 +7,6 @@ describes each entry.
 
 from __future__ import annotations
 
-import ast
 import json
 import math
 import os
@@ -17,11 +16,13 @@ import zlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from tokenize import TokenError
 from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, as_array
 from lavender._later import issparse
 from lavender._later import sparse as sp
 from lavender.cones import CONTACT, ROW, Cones
@@ -50,6 +51,7 @@ BROKEN = (
     zipfile.BadZipFile,
     zlib.error,
     struct.error,
+    TokenError,
     EOFError,
     OSError,
     RuntimeError,
@@ -163,28 +165,17 @@ class Archive(Mapping[str, np.ndarray]):
 
 def _npy_header(stream: IO[bytes], size: int) -> _Header:
     """Of an array of numbers or text; `size` is what the archive declares for header and data together."""
-    start = stream.read(8)
-    if start[:6] != b"\x93NUMPY" or len(start) < 8 or start[6] not in (1, 2, 3):
-        raise ValueError("it is not an array (.npy)")
-    wide = start[6] > 1
-    length = struct.unpack("<I" if wide else "<H", stream.read(4 if wide else 2))[0]
-    if length > MAX_HEADER:
-        raise ValueError(f"its header has {length} bytes, more than {MAX_HEADER}")
-    header = ast.literal_eval(stream.read(length).decode("latin1" if start[6] < 3 else "utf-8"))
-    if not isinstance(header, dict) or set(header) != {"descr", "fortran_order", "shape"}:
-        raise ValueError("its header is not that of an array")
-    descr, shape = header["descr"], header["shape"]
-    if not isinstance(descr, str):
-        raise ValueError("it is a record array; plain numbers are needed")
-    dtype = np.dtype(descr)
+    if npy.read_magic(stream) != (1, 0):  # later versions are for long names of fields
+        raise ValueError("it is a record array, or none at all; plain numbers (.npy, version 1.0) are needed")
+    shape, fortran, dtype = npy.read_array_header_1_0(stream, max_header_size=MAX_HEADER)
     if dtype.kind not in "buifUS":
-        raise ValueError(f"it has dtype {descr!r}; objects are never read from a file, numbers are needed")
-    if not isinstance(shape, tuple) or not all(type(n) is int and n >= 0 for n in shape):
-        raise ValueError(f"its shape {shape!r} is not one")
+        raise ValueError(
+            f"it has dtype {dtype}; objects are never read from a file, plain numbers are needed"
+        )
     data = math.prod(shape) * dtype.itemsize
-    if data + 8 + (4 if wide else 2) + length != size:
+    if min(shape, default=0) < 0 or data + stream.tell() != size:
         raise ValueError(f"its shape {shape} needs {data} bytes, but the archive declares {size}")
-    return _Header(stream, dtype, shape, header["fortran_order"] is True)
+    return _Header(stream, dtype, shape, fortran)
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
@@ -381,13 +372,15 @@ def _read_box(archive: Archive) -> Stored:
 
 
 def _box_cones(archive: Archive, m: int) -> Cones:
-    lower, upper = (_numbers(archive, name, (m,)) for name in ("lo", "hi"))
+    lower, upper = (as_array(f"entry {name!r}", archive[name], (m,), finite=False) for name in ("lo", "hi"))
     if "cone_start" not in archive or archive["cone_start"].size == 0:
         return Cones.bounded(lower, upper)
-    shape = (archive["cone_start"].size,)
-    start = _numbers(archive, "cone_start", shape).astype(np.int64)
-    size = _numbers(archive, "cone_dim", shape).astype(np.int64)
-    mu = _numbers(archive, "cone_mu", shape)
+    whole = {name: archive[name] for name in ("cone_start", "cone_dim")}
+    count = whole["cone_start"].size
+    start, size = (
+        as_array(f"entry {name!r}", x, (count,), dtype=np.int32).astype(np.int64) for name, x in whole.items()
+    )
+    mu = as_array("entry 'cone_mu'", archive["cone_mu"], (count,))
     order = np.argsort(start)
     start, size, mu = start[order], size[order], mu[order]
     end = start + size
@@ -429,15 +422,6 @@ def _read_generated(archive: Archive) -> Stored:
     else:
         raise InputError(f"entry 'kind' is {kind!r}; 'lcp', 'free' or 'cone' is needed")
     return Stored(problem, "generated")
-
-
-def _numbers(archive: Archive, name: str, shape: tuple[int, ...]) -> np.ndarray:
-    value = archive[name]
-    if value.dtype.kind not in "buif" or value.shape != shape:
-        raise InputError(
-            f"entry {name!r} has dtype {value.dtype}, shape {value.shape}; numbers, shape {shape}, are needed"
-        )
-    return value
 
 
 def _vector(archive: Archive, name: str, problem: Problem) -> FloatArray | None:

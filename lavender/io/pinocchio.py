@@ -84,12 +84,8 @@ def from_pinocchio(
         import pinocchio as pin
     except ImportError:
         raise InputError("pinocchio cannot be imported: pip install pin; a model comes from it") from None
-    if not isinstance(model, pin.Model) or not isinstance(data, pin.Data):
-        raise InputError(
-            f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
-        )
     dt, correction = _check_given(constraint_models, constraint_datas, dt, correction)
-    _check_model(model, data)
+    _check_model(pin, model, data)
     nv = int(model.nv)
     q = np.array(as_array("q", q, (int(model.nq),)))
     v = np.array(as_array("v", v, (nv,), unit="m/s, rad/s"))
@@ -177,8 +173,12 @@ def told(engine: str, advice: str) -> Iterator[None]:
         raise InputError(f"{engine} cannot take these: {words:.300}. {advice}") from None
 
 
-def _check_model(model: Any, data: Any) -> None:
-    """Every joint's place before Pinocchio follows it: its library checks nothing."""
+def _check_model(pin: Any, model: Any, data: Any) -> None:
+    """A model and its data, and every joint's place before Pinocchio follows it: its library checks nothing."""
+    if not isinstance(model, pin.Model) or not isinstance(data, pin.Data):
+        raise InputError(
+            f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
+        )
     n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
     short = [name for name in lists if len(getattr(model, name)) != n]

@@ -98,9 +98,8 @@ def record(
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = drive_of(model, control, seed)
     folder = folder_for_steps(folder, replace)
-    files: list[str] = []
+    kept: list[dict[str, Any]] = []
     left_out: list[str] = []
-    lines: list[str] = []
     without = 0
     width = len(str(steps))
     for step in range(steps):
@@ -122,10 +121,9 @@ def record(
             continue
         problem, own, told = found
         npz.write(problem, file, impulse=own)
-        files.append(file.name)
-        lines.append(json.dumps({"file": file.name, "step": step + 1, **told}))
-    write_text(folder / ENGINE, "".join(f"{line}\n" for line in lines))
-    return Recording(folder, tuple(files), without, tuple(left_out))
+        kept.append({"file": file.name, "step": step + 1, **told})
+    write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in kept))
+    return Recording(folder, tuple(line["file"] for line in kept), without, tuple(left_out))
 
 
 def _solved(

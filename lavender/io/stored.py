@@ -46,7 +46,7 @@ def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Pat
 
     `replace` takes the problem files out that it holds.
     """
-    folder = Path(path)
+    folder = as_path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
@@ -67,6 +67,7 @@ def destination(path: str | os.PathLike[str]) -> Path:
 
     InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
     """
+    path = as_path(path)
     try:
         target = Path(os.path.realpath(path))
         found = os.stat(path)
@@ -137,6 +138,7 @@ def as_path(path: str | os.PathLike[str]) -> Path:
 
 def first_bytes(path: str | os.PathLike[str], count: int = 8, what: str = "") -> bytes:
     """The first bytes of a regular file, all of them with `count` -1; reading a pipe would wait."""
+    path = as_path(path)
     named = f"{what} {str(path)!r}" if what else path
     try:
         found = os.stat(path)

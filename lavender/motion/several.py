@@ -16,7 +16,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray, whole_number
 from lavender._later import sparse as sp
-from lavender.cones import ROW, project
+from lavender.cones import project
 from lavender.errors import CapabilityError, InputError, LavenderError
 from lavender.motion.bound import difference
 from lavender.motion.error import SAME, MotionError, in_own_rows, measure, told
@@ -350,10 +350,8 @@ def _start(problem: Problem, own: Reference, rng: np.random.Generator, i: int) -
     c = problem.cones
     x = own.impulse * rng.lognormal(sigma=0.7, size=problem.m)
     size = float(np.median(np.abs(own.impulse[own.impulse != 0.0]))) if own.impulse.any() else 1.0
-    normal = c.ptr[:-1][c.kind != ROW]
+    normal, tangents = c.normal_rows, c.friction_rows
     x[normal] = np.maximum(x[normal], size * rng.random(len(normal)))
-    tangents = np.repeat(c.kind != ROW, np.diff(c.ptr))
-    tangents[normal] = False
     x[tangents] = size * rng.normal(size=int(tangents.sum()))
     return "a random start", project(c, x)
 
@@ -378,10 +376,7 @@ def _merge(problem: Problem, found: list[tuple[Reference, str]]) -> list[Motion]
 def _motion(problem: Problem, reference: Reference, labels: tuple[str, ...]) -> Motion:
     x = reference.impulse
     w = residual(problem, x).slack
-    c = problem.cones
-    normal = c.ptr[:-1][c.kind != ROW]
-    friction = np.repeat(c.kind != ROW, np.diff(c.ptr))
-    friction[normal] = False
+    normal, friction = problem.cones.normal_rows, problem.cones.friction_rows
     pressed = normal[x[normal] > 0.0]
     return Motion(
         impulse=x,

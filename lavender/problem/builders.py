@@ -80,7 +80,7 @@ class Builders(Operators):
         if np.ndim(mu) == 0:
             each = 3 + turns
             mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
-        mu = as_array("mu", np.asarray(mu), (None,))
+        mu = as_array("mu", mu, (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(
                 f"b has {len(b)} rows for {len(mu)} values of mu; the same number of rows for each "
@@ -245,16 +245,8 @@ class Builders(Operators):
         if tangents is None:
             tangents = np.where(mu > 0.0, 2, 0)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
-        low, high = (
-            as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
-            for name, x in (("lower", lower), ("upper", upper))
-        )
-        cones = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
-        if rows.n_joints:
-            none = np.zeros(rows.n_joints)
-            kind = none.astype(np.int32)
-            own = Cones(ptr=rows.joint_ptr, kind=kind, lower=low, upper=high, mu=none, patch_radius=none)
-            cones = own + cones
+        contacts = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
+        cones = _joints(rows, lower, upper) + contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
         jv = np.zeros(m + 1)
@@ -397,6 +389,16 @@ class Builders(Operators):
         given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
         return replace(self, generalized=general, b=given, guess=warm, copy=False)
+
+
+def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
+    """The joints' blocks with bounds of their rows (mj,) [N s]."""
+    low, high = (
+        as_array(name, x, (len(rows.jac),), finite=False, unit="N s")
+        for name, x in (("lower", lower), ("upper", upper))
+    )
+    none = np.zeros(rows.n_joints)
+    return Cones(rows.joint_ptr, none.astype(np.int32), low, high, mu=none, patch_radius=none)
 
 
 def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:

@@ -18,6 +18,8 @@ from lavender._arrays import (
     equal,
     read_only,
     table_of,
+    whole_number,
+    words_for,
 )
 from lavender._derived import Derived
 from lavender._later import issparse
@@ -132,11 +134,8 @@ class ProblemData:
                     f"key has shape {key.shape} and dtype {key.dtype}; ({k},) unsigned 64-bit is needed"
                 )
             put(self, "key", read_only(key.astype(np.uint64)))
-        if self.names is not None:
-            names = self.names if isinstance(self.names, Names) else tuple(map(str, self.names))
-            if isinstance(self.names, str) or len(names) != k:
-                raise InputError(f"{len(names)} names for {k} blocks; one for each block is needed")
-            put(self, "names", names)
+        if self.names is not None and not (isinstance(self.names, Names) and len(self.names) == k):
+            put(self, "names", words_for("blocks", self.names, k))
         put(self, "name", str(self.name))
         put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
 
@@ -225,8 +224,7 @@ class ProblemData:
         InputError
             No such row.
         """
-        if not 0 <= row < self.m:
-            raise InputError(f"row {row} of a problem of {self.m} rows")
+        row = whole_number("row", row, high=self.m - 1)
         i = self.block_of(row)
         offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
         spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]

@@ -210,15 +210,14 @@ class Problem(Builders):
             N of each contact, in block order.
         """
         c = self.cones
-        contact = np.flatnonzero(c.kind != ROW)
-        n = as_array("normal_impulse", normal_impulse, (len(contact),), unit="N s")
+        load = np.zeros(c.n_blocks)
+        load[c.kind != ROW] = n = as_array(
+            "normal_impulse", normal_impulse, (len(c.normal_rows),), unit="N s"
+        )
         check_not_negative("normal_impulse", n)
-        lower, upper, reach = c.lower.copy(), c.upper.copy(), c.reach
-        for i, load in zip(contact, n, strict=True):
-            j, end = c.ptr[i], c.ptr[i + 1]
-            bound = reach[j + 1 : end] * load
-            lower[j + 1 : end], upper[j + 1 : end] = -bound, bound
-            upper[j] = np.inf
+        with np.errstate(over="ignore"):
+            bound = as_array("mu N", c.reach * np.repeat(load, np.diff(c.ptr)), (self.m,), unit="N s")
+        lower, upper = np.where(c.friction_rows, [-bound, bound], [c.lower, c.upper])
         names = None if self.names is None else [self.row_name(i) for i in range(self.m)]
         more: dict[str, Any] = {"matrix": self.csr} if self.generalized is None else {
             "generalized": self.generalized, "compliance": self.compliance

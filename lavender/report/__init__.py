@@ -7,9 +7,6 @@ lavender.report.write(records, "report")  # records.csv, records.json, figures, 
 
 from lavender.report.tables import (
     advice,
-    advice_by_level,
-    advice_by_sequence,
-    advice_by_time,
     claims,
     failures,
     families,
@@ -23,9 +20,6 @@ from lavender.report.write import write
 
 __all__ = [
     "advice",
-    "advice_by_level",
-    "advice_by_sequence",
-    "advice_by_time",
     "claims",
     "failures",
     "families",

@@ -10,7 +10,7 @@ from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
 from lavender.report.findings import Report
-from lavender.report.moved import advice_by_speed, idle, moved, speed_levels, speed_name
+from lavender.report.moved import idle, speed_name
 from lavender.report.table import WORDS, Cell, Table
 from lavender.report.tables import Advice, Line
 from lavender.report.text import NONE, count, residual, seconds, share, times, who
@@ -96,13 +96,14 @@ def sweeps_table(lines: Sequence[Line]) -> Table:
     return Table(["structure", *heads], rows, folds=True)
 
 
-def speed_table(records: Records) -> Table:
+def speed_table(report: Report) -> Table:
     """Each structure: who gets to each motion error [m/s]."""
-    by_family: dict[str, list[Cell]] = {}
-    for advice in advice_by_speed(records):
-        by_family.setdefault(advice.family, []).append(advised(advice, False))
-    heads = [f"to {speed_name(x)}" for x in speed_levels(records)]
-    rows: Rows = [[name, *row] for name, row in by_family.items()]
+    heads = [f"to {speed_name(x)}" for x in report.speeds]
+    rows: Rows = [
+        [line.name, *(advised(a, False) for a in line.by_level.values())]
+        for line in tables.advice(report.by_speed)
+        if not line.sequence
+    ]
     return Table(["structure", *heads], rows, folds=True)
 
 
@@ -150,11 +151,11 @@ def reach_table(reaches: Sequence[tables.Reach], levels: Sequence[float]) -> Tab
     return Table(heads, rows, marks)
 
 
-def moved_table(records: Records) -> Table:
+def moved_table(report: Report) -> Table:
     """Each case and solver: time to each motion error, the smallest, relative, and its bound."""
-    levels = speed_levels(records)
+    levels = report.speeds
     rows: Rows = []
-    for m in moved(records):
+    for m in tables.reaches(report.by_speed, levels):
         known = [
             f"{residual(x)}{unit}" if math.isfinite(x) else NONE
             for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))

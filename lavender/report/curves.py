@@ -19,7 +19,6 @@ __all__ = [
     "Figure",
     "Figures",
     "budget_figure",
-    "family_figure",
     "figures",
     "overall_figure",
     "pass_figure",
@@ -150,35 +149,6 @@ def overall_figure(records: Records) -> Figure:
     )  # fmt: skip
 
 
-def family_figure(records: Records, family: str, cases: list[str]) -> Figure:
-    """Work-precision over a family: the mean time that ranks solvers, to each decade that all cases reach.
-
-    The same shifted geometric mean as in the table of recommendations, so that the two name the same solver.
-    """
-    groups = {k[1]: {} for k in tables.pairs(records) if k[0] in cases and k[2] == "cold"}  # type: dict[str, dict[str, list[Record]]]
-    for (case, solver, start), runs in tables.pairs(records).items():
-        if case in cases and start == "cold":
-            groups[solver][case] = [r for r in runs if r.usable]
-    curves = []
-    for solver in sorted(groups):
-        x, y = [], []
-        for level in (10.0**-k for k in range(15)):
-            times = [
-                min((r.time_min for r in groups[solver].get(c, ()) if r.relative <= level), default=math.inf)
-                for c in cases
-            ]
-            if math.isinf(max(times)):
-                break
-            x.append(tables.geometric_mean(times, tables.SHIFT))
-            y.append(level)
-        if x:
-            curves.append(Curve(solver, solver, tuple(x), tuple(y)))
-    return Figure(
-        "family " + family, f"{family} ({count(len(cases), 'case')})", "mean time [s], where all cases get there",
-        "relative residual [-]", tuple(curves), levels=tables.levels_of(records), floor=_floor(records, cases),
-    )  # fmt: skip
-
-
 def budget_figure(records: Records, case: str) -> Figure:
     """Residual against exact iteration budgets, cold and warm."""
     curves = []
@@ -244,7 +214,6 @@ class Figures:
     """Every figure of a report, in the places where its page shows them; those without a curve are left out."""
 
     over: Group = field(default_factory=dict)  # "all": the one over all cases
-    families: Group = field(default_factory=dict)
     profiles: Group = field(default_factory=dict)  # by law, one for each level
     sequences: Group = field(default_factory=dict)
     cases: Group = field(default_factory=dict)  # error against time, residual against iterations
@@ -297,12 +266,9 @@ def _figures(records: Records) -> Figures:
     for profile in tables.profiles(records):
         if profile.cases > 1:
             profiles.setdefault(profile.law, []).append(profile_figure(profile))
-    shared = {family: cases for family, cases in tables.families(records).items() if len(cases) > 1}
-    families = {family: _drawn(family_figure(records, family, cases)) for family, cases in shared.items()}
     over = _drawn(overall_figure(records))
     return Figures(
         over={"all": over} if over else {},
-        families={family: some for family, some in families.items() if some},
         profiles={law: _drawn(*some) for law, some in profiles.items()},
         sequences={name: _pass_figures(name, passes) for name, passes in tables.by_sequence(records).items()},
         cases={c: _drawn(work_precision(part, c), budget_figure(part, c)) for c, part in parts.items()},

@@ -9,7 +9,7 @@ from functools import cached_property
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
-from lavender.report.moved import speed_levels, working
+from lavender.report.moved import by_speed, speed_levels, working
 from lavender.report.verdict import Verdict, verdict
 
 __all__ = ["Report"]
@@ -68,6 +68,11 @@ class Report:
     def speeds(self) -> tuple[float, ...]:
         """Motion errors to reach [m/s]; empty without motion errors."""
         return speed_levels(self.records)
+
+    @cached_property
+    def by_speed(self) -> Records:
+        """The same records by motion error in place of the residual; none without motion errors."""
+        return by_speed(self.records)
 
     @cached_property
     def times(self) -> tuple[float, ...]:

@@ -6,7 +6,6 @@ from lavender.bench.store import Records
 from lavender.report import contents, tables
 from lavender.report.engine import ENGINES
 from lavender.report.findings import Report
-from lavender.report.moved import robustness_by_speed
 from lavender.report.table import markdown, plain
 
 __all__ = ["summary"]
@@ -25,7 +24,7 @@ def summary(report: Report) -> str:
         lines += [plain(found.text), "", "```python", *found.code, "```", ""]
     if report.is_campaign:
         lines += markdown(contents.robustness_table(tables.robustness(records), report.levels))
-        if by_speed := robustness_by_speed(records):
+        if by_speed := tables.robustness(report.by_speed):
             lines += ["", MOTION, "", *markdown(contents.robustness_table(by_speed, report.speeds, " m/s"))]
         return "\n".join([*lines, *_failed(records)]) + "\n"
     for table in (contents.advice_table(report), contents.sweeps_table(report.lines)):
@@ -33,8 +32,8 @@ def summary(report: Report) -> str:
     if report.engines:
         lines += [ENGINES, "", *markdown(contents.engine_table(report.engines)), ""]
     if report.speeds:  # who gets to each motion error, by structure and by case
-        lines += [MOTION, "", *markdown(contents.speed_table(records)), ""]
-        lines += [*markdown(contents.moved_table(records)), ""]
+        lines += [MOTION, "", *markdown(contents.speed_table(report)), ""]
+        lines += [*markdown(contents.moved_table(report)), ""]
     lines += markdown(contents.reach_table(tables.reaches(records), report.levels).without("form"))
     return "\n".join([*lines, *_failed(records)]) + "\n"
 

@@ -7,17 +7,11 @@ from dataclasses import dataclass, replace
 
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
-from lavender.report.tables.advice import Advice, advice_by_level
-from lavender.report.tables.campaigns import Robustness, robustness
-from lavender.report.tables.cases import Reach, reaches
 
 __all__ = [
     "Idle",
-    "advice_by_speed",
     "by_speed",
     "idle",
-    "moved",
-    "robustness_by_speed",
     "speed_levels",
     "speed_name",
     "working",
@@ -53,8 +47,13 @@ def speed_levels(records: Records) -> tuple[float, ...]:
 
 
 def by_speed(records: Records) -> Records:
-    """The records as if m/s of motion error were their residual; runs without one reached nothing."""
+    """The records as if m/s of motion error were their residual; runs without one reached nothing.
+
+    None of them where no motion error is known.
+    """
     levels = speed_levels(records)
+    if not levels:
+        return Records()
     found = records.having(
         replace(r, relative=math.inf if r.motion_speed is None else r.motion_speed, floor=0.0)
         for r in records
@@ -63,22 +62,6 @@ def by_speed(records: Records) -> Records:
     for run in records.runs.values():
         found.add(replace(run, plan={**run.plan, "levels": levels}))
     return found
-
-
-def advice_by_speed(records: Records) -> list[Advice]:
-    """For each structure and speed level: who brings most cases there, and who is fastest."""
-    return advice_by_level(by_speed(records)) if speed_levels(records) else []
-
-
-def robustness_by_speed(records: Records) -> list[Robustness]:
-    """Campaigns: shares of cases brought to each speed level, motion errors [m/s] by budget; none without them."""
-    return robustness(by_speed(records)) if speed_levels(records) else []
-
-
-def moved(records: Records) -> list[Reach]:
-    """How far and how fast each solver came on each case by motion error [m/s]; none without motion errors."""
-    levels = speed_levels(records)
-    return reaches(by_speed(records), levels) if levels else []
 
 
 def working(records: Records) -> Records:

@@ -12,7 +12,6 @@ from lavender.bench.store import Records
 from lavender.report import contents, tables
 from lavender.report.curves import Figures
 from lavender.report.findings import Report
-from lavender.report.moved import robustness_by_speed
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
@@ -72,14 +71,14 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
         "engines": contents.engine_table(report.engines),
-        "moved": None if campaign else contents.moved_table(records),
-        "speed_advice": None if campaign else contents.speed_table(records),
+        "moved": None if campaign else contents.moved_table(report),
+        "speed_advice": None if campaign else contents.speed_table(report),
         "noise": NOISE,
         "residual_noise": RESIDUAL_NOISE,
         "level": levels[len(levels) // 2],
         "runs": list(records.runs.values()),
         "levels": levels,
-        "advice": contents.advice_table(report, _links(report.lines, figures)),
+        "advice": contents.advice_table(report, _links(report.lines)),
         "swept": contents.sweeps_table(report.lines),
         "lines": line_table(records),
         "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
@@ -100,7 +99,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "campaign": campaign,
         "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
         "robustness_by_speed": contents.robustness_table(
-            robustness_by_speed(records) if campaign else [], report.speeds, " m/s"
+            tables.robustness(report.by_speed) if campaign else [], report.speeds, " m/s"
         ),
         "sequences": {
             name: contents.pass_table(passes).without("sequence", "steps")
@@ -116,8 +115,8 @@ def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, A
     """The figures, and by section the names of its own; of motion errors beside those of residuals."""
     names = sorted({r.solver for r in records} | {c.solver for f in figures for c in f.curves})
     number = {name: i for i, name in enumerate(names)}
-    # Under the heading of a case or a family its name says nothing new.
-    own = [f.name for group in (figures.cases, figures.families) for some in group.values() for f in some]
+    # Under the heading of a case its name says nothing new.
+    own = [f.name for some in figures.cases.values() for f in some]
     titles = {name: "" for plain in own for name in (plain, f"motion {plain}")}
     return {
         "drawings": {  # each escapes what it holds
@@ -158,14 +157,10 @@ def _cases(records: Records, levels: Sequence[float]) -> dict[str, Any]:
     return {"cases": cases, "case_list": contents.case_table(records, fastest, level, stored)}
 
 
-def _links(lines: Sequence[tables.Line], figures: Figures) -> dict[str, str]:
+def _links(lines: Sequence[tables.Line]) -> dict[str, str]:
     """Where on the page more is said of a structure or sequence."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
-    return {
-        name: f"{part}-{file_name(name)}"
-        for name, part in parts.items()
-        if part == "sequence" or name in figures.families
-    }
+    return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}
 
 
 def _changes(old: Records | None, records: Records) -> dict[str, Any]:

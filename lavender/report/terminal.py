@@ -9,7 +9,7 @@ from lavender.bench.record import printable
 from lavender.bench.store import Records
 from lavender.report import contents, tables
 from lavender.report.findings import Report
-from lavender.report.moved import idle, robustness_by_speed
+from lavender.report.moved import idle
 from lavender.report.table import print_table
 from lavender.report.text import count, residual, suspicions
 
@@ -34,7 +34,7 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
         )
         by_residual = contents.robustness_table(tables.robustness(records), report.levels)
         print_table(console, by_residual, grouped=True)
-        if by_speed := robustness_by_speed(records):
+        if by_speed := tables.robustness(report.by_speed):
             console.print(BY_MOTION, highlight=False)
             by_motion = contents.robustness_table(by_speed, report.speeds, " m/s")
             print_table(console, by_motion, grouped=True)
@@ -53,7 +53,7 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
             console.print("\n[bold]By sweeps[/]", highlight=False)
             print_table(console, swept)
         if report.speeds:
-            _print_motion(records, console, whole)
+            _print_motion(report, console, whole)
     for case in still[:SHORT]:
         console.print(
             f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
@@ -84,11 +84,11 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
             console.print(f"  and {len(wrong) - SHORT} more", highlight=False)
 
 
-def _print_motion(records: Records, console: Console, whole: bool) -> None:
+def _print_motion(report: Report, console: Console, whole: bool) -> None:
     """Who gets to each motion error, by structure; each case where that is asked for or few."""
     console.print(BY_MOTION, highlight=False)
-    print_table(console, contents.speed_table(records))
-    moved = contents.moved_table(records)
+    print_table(console, contents.speed_table(report))
+    moved = contents.moved_table(report)
     if whole or len(moved.rows) <= SHORT:
         console.print()
         print_table(console, moved, grouped=True)

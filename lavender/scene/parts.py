@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, as_array
 from lavender.errors import InputError
 from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
@@ -122,17 +123,11 @@ def quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
     return np.concatenate([[cosine], sine * (x / norm(x))])
 
 
-def numbers(what: str, value: object, n: int) -> FloatArray:
+def numbers(what: str, value: Any, n: int) -> FloatArray:
     """`value` as a new finite array (n,)."""
-    try:
-        x = np.array(value, float)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} is {value!r}; {n} numbers are needed") from None
-    if x.shape != (n,):
-        raise InputError(f"{what} has shape {x.shape}; ({n},) is needed")
-    if not np.isfinite(x).all():
-        raise InputError(f"{what} must be finite; it is {x.tolist()}")
-    return x
+    if np.ndim(value) == 0:
+        raise InputError(f"{what} is {value!r}; {n} numbers are needed")
+    return as_array(what, value, (n,)).copy()
 
 
 def unit(what: str, value: object) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, number, whole_number
+from lavender._arrays import FloatArray, as_array, flag, number, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
@@ -90,7 +90,7 @@ class Parameters:
         for name, allowed in RANGES.items():
             put(self, name, number(name, getattr(self, name), **allowed))
         gravity: Any = self.gravity
-        if isinstance(gravity, (int, float)):
+        if np.ndim(gravity) == 0:
             gravity = (0.0, 0.0, -number("gravity", gravity))
         put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
         for name in ("solver_options", "stepper_options"):
@@ -106,9 +106,7 @@ class Parameters:
             longest = MAX_SUBSTEP if own else self.dt
         put(self, "max_substep", number("max_substep", longest, above=0.0))
         put(self, "substeps", self._count_of_substeps())
-        if not isinstance(self.warm_start, (bool, np.bool_)):
-            raise InputError(f"warm_start is {self.warm_start!r}; True or False is needed")
-        put(self, "warm_start", bool(self.warm_start))
+        put(self, "warm_start", flag("warm_start", self.warm_start))
         order: Any = self.order
         if order is None:
             put(self, "order", stepper.order if own else "given")
@@ -357,7 +355,9 @@ class Scene:
             raise InputError(f"a scene has at most {MAX_BODIES} bodies")
         if not isinstance(label, str):
             raise InputError(f"name is {name!r}; a string is needed")
-        static = bool(static) or isinstance(shape, Plane)
+        if shape is not None and not isinstance(shape, (Plane, Sphere, Box)):
+            raise InputError(f"shape of {label} is {shape!r}; a Plane, Sphere or Box is needed")
+        static = flag(f"static of {label}", static) or isinstance(shape, Plane)
         mass = 0.0 if static else number(f"mass of {label} [kg]", mass)
         if mass < 0.0 or (mass == 0.0 and not static):
             raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
@@ -483,7 +483,7 @@ class Scene:
             damping=number(f"damping of {label}", damping, low=0.0),
             motor_speed=_given(f"motor_speed of {label} [rad/s]", motor_speed),
             motor_torque=_given(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
-            collide=bool(collide),
+            collide=flag(f"collide of {label}", collide),
         )
         self.joints.append(joint)
         return len(self.joints) - 1
@@ -589,14 +589,11 @@ def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
 
 
 def _tensor(label: str, given: Any) -> FloatArray:
-    try:
-        x = np.array(given, float)
-    except (TypeError, ValueError):
-        raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed") from None
-    if x.shape == (3,):
+    if np.shape(given) not in ((3,), (3, 3)):
+        raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed")
+    x = as_array(f"inertia of {label} [kg m^2]", given, np.shape(given))
+    if x.ndim == 1:
         x = np.diag(x)
-    if x.shape != (3, 3) or not np.isfinite(x).all():
-        raise InputError(f"inertia of {label} is {x.tolist()}; 3 finite moments or a (3, 3) tensor is needed")
     scale = np.abs(x).max()
     with np.errstate(over="ignore"):  # NumPy 1.26 warns of 5e-324 / 5e-324
         uneven = scale > 0.0 and np.abs(x / scale - x.T / scale).max() > 1e-12

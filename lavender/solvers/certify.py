@@ -17,7 +17,6 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
-from lavender.cones import ROW
 from lavender.deadline import Deadline
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
@@ -82,10 +81,8 @@ def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
 
     # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.
     cones = problem.cones
-    contact = np.repeat(cones.kind != ROW, np.diff(cones.ptr))
+    contact, tangent = cones.contact_rows, cones.friction_rows
     free = np.isneginf(cones.lower) & np.isposinf(cones.upper) & ~contact
-    tangent = contact.copy()
-    tangent[cones.ptr[:-1][cones.kind != ROW]] = False
     scale = 1.0 / np.sqrt(problem.d)
     normal = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))
     limit = cones.reach * scale[normal] / scale

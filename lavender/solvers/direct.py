@@ -42,7 +42,7 @@ from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUC
 
 GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
 PATIENCE = 6  # passes without halving the best residual
-BATCH = 32  # rounds between two looks at the clock and the judge
+BATCH = 32  # rounds between two checks of the clock and the residual
 
 
 @dataclass

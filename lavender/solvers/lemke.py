@@ -82,7 +82,7 @@ class Lemke:
     def _follow(
         self, state: PivotState, paths: lemke.Lemke, max_iter: int, tol: float, deadline: Deadline, chunk: int
     ) -> Claim:
-        """At most `max_iter` pivots, `chunk` of them between two looks at the clock."""
+        """At most `max_iter` pivots, `chunk` of them between two checks of the clock."""
         rows, message = state.rows, ""
         certificate: FloatArray | None = None
         while True:

@@ -24,7 +24,7 @@ from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.weights import READ, of_law, rates, sweep_cost
 from lavender_ext.small.call import Bounded, Friction, Small
-from lavender_ext.small.many import Gate, solve_first
+from lavender_ext.small.many import Limits, solve_first
 
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together.
@@ -45,11 +45,13 @@ def velocities_cost(problem: Problem, largest: int) -> float:
     return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
 
 
-def gate(most: float, most_coulomb: float) -> Gate:
+def limits(most: float, most_coulomb: float) -> Limits:
     """What may be counted to cost so much at most [ns] is let in."""
     v = rates()["velocities"]
     count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
-    return Gate(np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM]))
+    return Limits(
+        np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM])
+    )
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
@@ -105,7 +107,7 @@ class SmallCall:
     """What `SolverSpec.small` holds: small problems as that solver solves them."""
 
     name: str
-    gate: Gate | None  # what it may cost over generalised velocities; None: not at all
+    limits: Limits | None  # what it may cost over generalised velocities; None: not at all
     pivots: bool  # bounded rows
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
@@ -123,9 +125,9 @@ class SmallCall:
             if kept.vain == (self.name, tol, at):
                 return None
         if problem.generalized is not None:
-            if self.gate is None:
+            if self.limits is None:
                 return None
-            found = solve_first(kept.view, impulse, tol, self.gate)
+            found = solve_first(kept.view, impulse, tol, self.limits)
         else:
             small = kept.small
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
@@ -228,6 +230,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", gate(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
+AUTO = SmallCall("auto", limits(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", gate(MOST, MOST), False)
+NEWTON = SmallCall("newton", limits(MOST, MOST), False)

@@ -265,7 +265,7 @@ cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
 
 
 cdef enum:
-    FEWEST = 24                 # blocks: below, a sweep costs less than to look for pairs
+    FEWEST = 24                 # blocks: below, a sweep costs less than to find pairs
     FIRST = 16                  # sweeps of a run that packs, with all before: packing costs two to four
 
 

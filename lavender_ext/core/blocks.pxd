@@ -17,5 +17,5 @@ cdef class Blocks:
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                     const double[::1] upper, const double[::1] mu, const double[::1] radius,
                     const double[::1] rolling)
-    cdef bint look(self) noexcept
+    cdef bint check(self) noexcept
     cdef void spell(self) noexcept

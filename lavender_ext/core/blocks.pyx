@@ -23,7 +23,7 @@ cdef class Blocks:
     """Pointers to the arrays of a problem's blocks, which are kept; ValueError where they are no blocks."""
 
     def __init__(self, ptr, kind, lower, upper, mu, patch_radius, rolling):
-        if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.look():
+        if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.check():
             raise ValueError("arrays that do not fit each other, or hold what no block can have")
         self.arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
 
@@ -47,7 +47,7 @@ cdef class Blocks:
             self.at.rolling = &rolling[0]
         return m > 0 or k == 0
 
-    cdef bint look(self) noexcept:
+    cdef bint check(self) noexcept:
         # What the blocks are; False where one is none.
         cdef blocks_t* p = &self.at
         cdef int32_t i, j, size, kind
@@ -188,7 +188,7 @@ def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
         return None
     made = room_of(given.at.n_blocks, given.at.n_rows)
     put(made, 0, 0, &given.at)
-    if not made.look():
+    if not made.check():
         return None
     made.spell()
     return made
@@ -197,7 +197,7 @@ def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
 def adopted(ptr, kind, lower, upper, mu, patch_radius, rolling):
     """Blocks over these arrays themselves, read-only from now on; None where anything is amiss."""
     cdef Blocks made = Blocks.__new__(Blocks)
-    if not made.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not made.look():
+    if not made.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not made.check():
         return None
     made.spell()
     for x in (ptr, kind, lower, upper, mu, patch_radius, rolling):
@@ -237,7 +237,7 @@ cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper)
         (<double*>made.at.mu)[i] = (<double*>made.at.patch_radius)[i] = (<double*>made.at.rolling)[i] = 0.0
         (<double*>made.at.lower)[i] = -INF if lower == NULL else lower[i]
         (<double*>made.at.upper)[i] = INF if upper == NULL else upper[i]
-    return made if made.look() else None
+    return made if made.check() else None
 
 
 def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=0):
@@ -282,4 +282,4 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
         for j in range(i * size, (i + 1) * size):
             (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF
             (<double*>made.at.upper)[j] = INF
-    return made if made.look() else None
+    return made if made.check() else None

@@ -1,7 +1,7 @@
 """A method as three functions on plain structs: room, start, step. Nothing here needs Python, allocates, or looks at a clock.
 
     view_t v          a problem: its blocks with d and nu, and one of A, bodies, J and M
-    asked_t o         which method, to what tolerance, with how much work
+    options_t o       which method, to what tolerance, with how much work
     room_t r          the caller's arrays
     lav_room(&v, &o, &r)            -> r.n_index, r.n_real as a first guess; 0: the method does not take this problem
     lav_start(&v, &o, &r, lambda)   -> MORE | ROOM (r.n_index, r.n_real say how much; give it, start again) | an end
@@ -15,7 +15,7 @@ arrays of v.
 |---|---|---|---|
 | NEWTON | bounded rows, cones, Coulomb's law; dense | the same, of up to 1,500 bodies | the same, islands |
 
-After CERTIFICATE `asked_t.proven` = 1 ends it; without, the next step goes on.
+After CERTIFICATE `options_t.proven` = 1 ends it; without, the next step goes on.
 """
 from libc.stdint cimport int32_t, int64_t
 
@@ -30,7 +30,7 @@ cdef enum:                      # outcomes; the first six are those of newton/pl
     UNFIT = 7
 
 
-cdef struct asked_t:
+cdef struct options_t:
     int32_t method
     int32_t budget              # factorisations
     int32_t proven              # the direction of a CERTIFICATE is a proof
@@ -52,7 +52,7 @@ cdef struct said_t:
     const double* direction     # (m) N s of a CERTIFICATE, or NULL
 
 
-cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexcept nogil
-cdef public int32_t lav_start(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil
-cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r, int32_t work, double* lam,
+cdef public int32_t lav_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil
+cdef public int32_t lav_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil
+cdef public int32_t lav_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
                              said_t* said) noexcept nogil

@@ -8,7 +8,7 @@ from lavender_ext.core.arrays cimport address
 from lavender_ext.core.block cimport has_friction
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, asked_t, room_t, said_t
+from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, options_t, room_t, said_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish as furnish_flow, marks_of, need_t, numbers_of, settle
@@ -35,7 +35,7 @@ cdef inline int64_t begun_room(const view_t* v) noexcept nogil:
     return sizeof(state_t) // sizeof(double) + 1 + judge_room(&v.p, v.r, v.g)
 
 
-cdef inline double* begin(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+cdef inline double* begin(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
     """The problem, what is asked, and errors of doing nothing as the judge has them; what is behind (`begun_room`)."""
     cdef double begun[3]
     cdef newton_t* n = &(<state_t*>r.real).n
@@ -66,7 +66,7 @@ cdef inline void rows_need(const view_t* v, room_t* r) noexcept nogil:
     r.n_real = begun_room(v) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, has_friction(&v.p)) + 8
 
 
-cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef inline int32_t start_rows(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = &(<state_t*>r.real).n
     cdef int64_t m = v.p.n_rows
     cdef double* x = begin(v, o, r)
@@ -83,7 +83,7 @@ cdef inline int32_t start_rows(const view_t* v, const asked_t* o, room_t* r, con
 # -- over bodies -----------------------------------------------------------------------------------------------
 
 
-cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef inline int32_t start_bodies(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
     cdef newton_t* n = &(<state_t*>r.real).n
     cdef double* x = begin(v, o, r)
     cdef pattern_t a
@@ -100,7 +100,7 @@ cdef inline int32_t start_bodies(const view_t* v, const asked_t* o, room_t* r, c
 # -- over J and M ----------------------------------------------------------------------------------------------
 
 
-cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+cdef inline int32_t start_general(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
     cdef state_t* s = <state_t*>r.real
     cdef double* x = begin(v, o, r)
     cdef need_t need
@@ -119,7 +119,7 @@ cdef inline int32_t start_general(const view_t* v, const asked_t* o, room_t* r) 
     return MORE
 
 
-cdef inline int32_t step_general(const asked_t* o, state_t* s, int32_t work, double* lam) noexcept nogil:
+cdef inline int32_t step_general(const options_t* o, state_t* s, int32_t work, double* lam) noexcept nogil:
     """All islands, the one that waits first."""
     cdef int32_t end, left = s.n.budget
     if o.stop or left <= 0:
@@ -135,7 +135,7 @@ cdef inline int32_t step_general(const asked_t* o, state_t* s, int32_t work, dou
 # -- the three -------------------------------------------------------------------------------------------------
 
 
-cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexcept nogil:
+cdef public int32_t lav_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
     """r.n_index and r.n_real as far as they are known beforehand; 0 where the method does not take the problem."""
     cdef int64_t most = 0
     r.n_index = r.n_real = 0
@@ -157,7 +157,7 @@ cdef public int32_t lav_room(const view_t* v, const asked_t* o, room_t* r) noexc
     return most > 0
 
 
-cdef public int32_t lav_start(const view_t* v, const asked_t* o, room_t* r, const double* lam) noexcept nogil:
+cdef public int32_t lav_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
     """From lam (m): MORE, or ROOM with how much is needed."""
     cdef room_t need
     if not lav_room(v, o, &need):
@@ -171,7 +171,7 @@ cdef public int32_t lav_start(const view_t* v, const asked_t* o, room_t* r, cons
     return start_rows(v, o, r, lam)
 
 
-cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r, int32_t work, double* lam,
+cdef public int32_t lav_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
                              said_t* said) noexcept nogil:
     """`work` factorisations or a few more; lam (m) is the best so far."""
     cdef state_t* s = <state_t*>r.real
@@ -195,7 +195,7 @@ cdef public int32_t lav_step(const view_t* v, const asked_t* o, const room_t* r,
 cdef class Driver:
     """A problem's `view_t` and the arrays of a method on it, for Python."""
     cdef view_t v
-    cdef asked_t o
+    cdef options_t o
     cdef room_t r
     cdef object keep
 
@@ -210,7 +210,7 @@ cdef class Driver:
             self.v.r = &data.rows
         else:
             self.v.a = &data.csr
-        self.o = asked_t(NEWTON, budget, 0, 0, has_wide(), tol)
+        self.o = options_t(NEWTON, budget, 0, 0, has_wide(), tol)
         self.keep = [data]
 
     def start(self, const double[::1] impulse):

@@ -12,7 +12,7 @@ from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport NEWTON, ROOM, asked_t, lav_room, lav_start, lav_step, room_t, said_t
+from lavender_ext.driver.driver cimport NEWTON, ROOM, options_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
@@ -64,7 +64,7 @@ cdef struct turns_t:            # of one part
     double* error               # (m)
     double* scratch             # (12 n_bodies)
     sweep_data_t c
-    asked_t asked
+    options_t options
     room_t room
     said_t said
     int32_t how
@@ -129,14 +129,14 @@ cdef inline bint begin_newton(turns_t* t) noexcept nogil:
     """Newton's method from `answer`; is there room for it?"""
     cdef room_t* r = t.r
     t.how = 0
-    if not lav_room(&t.s.v, &t.asked, &t.room):
+    if not lav_room(&t.s.v, &t.options, &t.room):
         return False
     t.said.factorisations = 0
     while True:
         if not has_room(r, t.room.n_index, t.room.n_real):
             return False
         t.room.index, t.room.real = r.index, r.real
-        t.how = lav_start(&t.s.v, &t.asked, &t.room, t.s.answer)
+        t.how = lav_start(&t.s.v, &t.options, &t.room, t.s.answer)
         if t.how != ROOM:
             return t.how == MORE
 
@@ -145,7 +145,7 @@ cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
     """So many factorisations, or its end; the relative residual of `answer`."""
     cdef int32_t last = t.said.factorisations + steps
     while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
-        t.how = lav_step(&t.s.v, &t.asked, &t.room, last - t.said.factorisations, t.s.answer, &t.said)
+        t.how = lav_step(&t.s.v, &t.options, &t.room, last - t.said.factorisations, t.s.answer, &t.said)
     return found_at(t, t.s.answer)
 
 
@@ -190,7 +190,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
         now = t.e0 / own if t.e0 / own < t.v0 / nothing.velocity else t.v0 / nothing.velocity
-        t.asked = asked_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
+        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
         now = factor_in_turns(&t)
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]

@@ -31,7 +31,7 @@ cdef enum:
     AT_A_TIME = 256             # problems between two looks for Ctrl-C
 
 
-cdef struct gate_t:             # as `velocities_cost` of lavender/solvers/small.py, ns
+cdef struct limits_t:           # as `velocities_cost` of lavender/solvers/small.py, ns
     double step                 # each iteration, as if all islands had theirs at once,
     double entry                # each multiply-add of a sweep, and
     double work                 # of a factor
@@ -65,17 +65,17 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
 
 
-cdef inline bint is_cheap(const job_t* j, const gate_t* gate, double largest) noexcept nogil:
-    cdef double flops = j.g.n * (largest * largest) / 6.0, count = gate.bounded, most = gate.most
+cdef inline bint is_cheap(const job_t* j, const limits_t* limits, double largest) noexcept nogil:
+    cdef double flops = j.g.n * (largest * largest) / 6.0, count = limits.bounded, most = limits.most
     cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
     if has_friction(&j.p):
-        count = gate.cone
+        count = limits.cone
         if j.p.law == COULOMB:
-            count, most, flops = gate.coulomb, gate.most_coulomb, 2.0 * flops
-    return gate.entry * gate.read * sweep + count * (gate.step + gate.entry * sweep + gate.work * flops) <= most
+            count, most, flops = limits.coulomb, limits.most_coulomb, 2.0 * flops
+    return limits.entry * limits.read * sweep + count * (limits.step + limits.entry * sweep + limits.work * flops) <= most
 
 
-cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
+cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n)
@@ -86,7 +86,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double to
     if j.begin[0] < 0.0:
         begin(j, room.real)
     settle(&f, &j.p, &j.g, per, room.index, &need)
-    if need.crowded or need.values > gate.values or not is_cheap(j, gate, need.wide):
+    if need.crowded or need.values > limits.values or not is_cheap(j, limits, need.wide):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -108,11 +108,11 @@ cdef inline void solve_job(job_t* j, room_t* room, const gate_t* gate, double to
     j.solved = j.relative <= tol
 
 
-cdef inline void solve_alone(job_t* j, room_t* room, const gate_t* gate, double tol) noexcept nogil:
+cdef inline void solve_alone(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     """One of many: what was worked out of its data goes with it."""
     cdef bint known = j.made.marks != NULL
     if j.p.n_rows > 0:
-        solve_job(j, room, gate, tol)
+        solve_job(j, room, limits, tol)
     if not known:
         free(j.made.marks)
         free(j.made.numbers)
@@ -150,19 +150,19 @@ cdef void remember(job_t* j, Data p):
         p.start_relative = j.begin[2]
 
 
-cdef class Gate:
-    """Of the numbers of a `gate_t` (10,)."""
-    cdef gate_t at
+cdef class Limits:
+    """Of the numbers of a `limits_t` (10,)."""
+    cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
-        self.at = (<const gate_t*>&numbers[0])[0]
+        self.at = (<const limits_t*>&numbers[0])[0]
 
 
-def solve_first(Data p, start, double tol, Gate gate):
+def solve_first(Data p, start, double tol, Limits limits):
     """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
 
     What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, has empty rows or costs
-    more than the gate (`gate_t`) lets in. d, Y and the error of doing nothing stay with the data.
+    more than the limits (`limits_t`) let in. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL)
@@ -173,7 +173,7 @@ def solve_first(Data p, start, double tol, Gate gate):
     lam, both = impulse, results
     take(&j, p, start, &lam[0], &both[0])
     with nogil:
-        solve_job(&j, &room, &gate.at, tol)
+        solve_job(&j, &room, &limits.at, tol)
         free(room.index)
         free(room.real)
     if not known and j.made.numbers != NULL:
@@ -191,14 +191,14 @@ cdef class Batch:
         In generalised coordinates, each of a problem of at least one row.
     starts : list of (m,) N s or None
         None: from doing nothing.
-    gate : Gate
+    limits : Limits
     """
 
     cdef job_t* jobs
     cdef list data
     cdef object impulses, both
 
-    def __init__(self, list data, list starts, double tol, Gate gate):
+    def __init__(self, list data, list starts, double tol, Limits limits):
         cdef Py_ssize_t i, end, done = 0, at = 0, n = len(data)
         cdef room_t room = room_t(0, 0, NULL, NULL)
         cdef Data p
@@ -221,7 +221,7 @@ cdef class Batch:
                 end = done + AT_A_TIME if done + AT_A_TIME < n else n
                 with nogil:
                     while done < end:
-                        solve_alone(&self.jobs[done], &room, &gate.at, tol)
+                        solve_alone(&self.jobs[done], &room, &limits.at, tol)
                         done += 1
                 PyErr_CheckSignals()
         finally:

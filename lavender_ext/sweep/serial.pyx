@@ -95,7 +95,7 @@ cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) n
     cdef const blocks_t* p = c.blocks
     cdef int32_t s, i
     for s in range(n):
-        if c.order == NULL:                             # every block is one row, as it stands: without the look-ups
+        if c.order == NULL:                             # every block is one row, as it stands: without the lookups
             for i in range(p.n_rows):
                 lam[i] = relax_row(lam[i], csr_dot(c.csr, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
             continue

@@ -12,14 +12,12 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks.peers import engines, race
+from benchmarks.peers import adapters, engines, race
 from benchmarks.peers import tables as comparison
+from benchmarks.peers.adapters import Contestant, Result, ours
 from benchmarks.peers.command import command
-from benchmarks.peers.contest import Result, ours
 from benchmarks.peers.problems import problems
 from lavender import suite
-from lavender.bench.peers import adapters
-from lavender.bench.peers.adapters import Contestant
 
 SMALL = {  # laws and kinds of bounds that adapters must translate
     "lcp": "box_stack(n=2)",

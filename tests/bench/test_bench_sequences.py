@@ -125,7 +125,8 @@ def test_a_level_of_a_sequence_is_solved_to_that_level():
     plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
     records = bench.run(bench.sequence(moving_stack(3), "load"), ["pgs", "direct"], plan)
     assert {r.tol for r in records if r.solver == "pgs"} == set(plan.levels)
-    for advice in lv.report.tables.advice_by_sequence(records)[0]:
+    (line,) = lv.report.advice(records)
+    for advice in line.by_level.values():
         assert all(
             float(c.how.removeprefix("to ").partition(",")[0]) <= advice.target for c in advice.ranking
         )

@@ -505,7 +505,7 @@ sys.meta_path.insert(0, Finder())
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
 @pytest.mark.parametrize("way", [("-m", "lavender"), ("-m", "lavender.cli")])
 @pytest.mark.parametrize(
-    "module", ["numpy", "lavender.problem", "lavender.cli.options", "lavender.cli.solve"]
+    "module", ["numpy", "lavender.problem", "lavender.cli.options", "lavender.cli.solvers"]
 )
 def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_path):
     """The signal comes where the import of a module begins, whatever the machine's speed."""

@@ -184,9 +184,13 @@ def test_a_body_is_painted_where_it_is():
 
 def test_pictures_refuse_what_they_cannot_do(tmp_path):
     film = lv.Simulation("spinner").film(2)
-    for bad in ({"path": "x.txt"}, {"path": "x.png", "frames": 0}, {"path": "x.gif", "rate": 0}):
+    wrong = ({"frames": 0}, {"rate": 0}, {"size": "wide"}, {"turn": float("nan")}, {"frames": True})
+    for bad in ({"path": "x.txt"}, *({"path": "x.png", **more} for more in wrong)):
         with pytest.raises(lv.InputError):
             save_picture(film, tmp_path / bad.pop("path"), **bad)
+    for touch in (film.save, lv.engine.Film.load, lambda number: save_picture(film, number)):
+        with pytest.raises(lv.InputError, match="path is 7"):  # no open file of the process
+            touch(7)
     with pytest.raises(lv.InputError, match="cannot write"):
         save_picture(film, tmp_path / "none" / "x.png")
 

@@ -22,8 +22,8 @@ def says(status, **more):
 
 # Worked out anew at each call, and the caller's own.
 ANEW = {
-    "n_tangents", "n_together", "apart_rows", "spin_rows", "rolling_rows", "reach", "coefficients", "stretch",
-    "parents",
+    "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "apart_rows", "spin_rows",
+    "rolling_rows", "reach", "coefficients", "stretch", "parents",
 }  # fmt: skip
 
 

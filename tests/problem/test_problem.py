@@ -133,7 +133,7 @@ def test_rows_have_names():
     assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
     assert named.row_name(first) == "box 1 on box 2, normal"
     assert random_lcp(1).row_name(3) == "row 3"
-    with pytest.raises(lv.InputError, match="row 99"):
+    with pytest.raises(lv.InputError, match="row is 99"):
         random_lcp(1).row_name(99)
 
 
@@ -150,6 +150,7 @@ def test_pinned_bodies_are_legal():
 # -- bad input ---------------------------------------------------------------------------------------------
 
 NAN, INF = np.nan, np.inf
+GAP = np.ma.array([1.0, 2.0], mask=[False, True])
 BAD_PROBLEMS = {
     "NaN in A": (
         lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]),
@@ -196,6 +197,27 @@ BAD_PROBLEMS = {
     ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
+    "masked b": (lambda: lv.Problem.lcp(I2, GAP), r"b \[m/s\] has no value at \[1\], 1 masked in all"),
+    "masked A": (lambda: lv.Problem.lcp(np.ma.array(I2, mask=I2 > 0), [1, 1]), r"no value at \[0, 0\], 2"),
+    "masked mu": (lambda: lv.Problem.contact(np.eye(6), np.ones(6), GAP), "mu has no value"),
+    "masked findex": (lambda: lv.Problem.findex_order(np.ma.array([-1, 0], mask=[0, 1])), "no value"),
+    "masked start": (lambda: lv.solve(lv.Problem.lcp(I2, [1, 1]), "pgs", impulse=GAP), "impulse .* no value"),
+    "masked impulse": (lambda: lv.residual(lv.Problem.lcp(I2, [1, 1]), GAP), "impulse .* no value"),
+    "complex impulse": (lambda: lv.residual(lv.Problem.lcp(I2, [1, 1]), [1, 2j]), "complex"),
+    "impulse of text": (lambda: lv.residual(lv.Problem.lcp(I2, [1, 1]), ["1", "2"]), "real numbers"),
+    "a judge without a problem": (lambda: lv.residual(None, [1.0]), "a lavender.Problem is needed"),
+    "dates": (lambda: lv.Problem.lcp(I2, np.array([1, 2], "m8[s]")), "real numbers"),
+    "mu of text": (lambda: lv.Cones.contacts("0.5"), "real numbers"),
+    "complex mu": (lambda: lv.Cones.contacts([0.5j]), "real numbers"),
+    "one bound": (lambda: lv.Cones.bounded(0.0, 1.0), r"lower \[N s\] has shape \(\); \(any,\) is needed"),
+    "free rows": (lambda: lv.Cones.free(2.5), "m is 2.5; a whole number"),
+    "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
+    "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
+    "half a row": (lambda: lv.Problem.lcp(I2, [1, 1]).row_name(0.5), "row is 0.5"),
+    "friction beyond float64": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e308),
+        r"mu N \[N s\] must be finite",
+    ),
 }
 
 
@@ -245,9 +267,9 @@ def test_bad_rows_say_what_came_and_what_was_needed(case):
 def test_options_of_the_wrong_type_are_input_errors():
     with pytest.raises(lv.InputError, match=r"'jacobi' cannot take the options .*omega"):
         lv.solve(random_lcp(0), "jacobi", omega="0.5")
-    with pytest.raises(lv.InputError, match="not an array of numbers"):
+    with pytest.raises(lv.InputError, match="real numbers"):
         lv.residual(random_lcp(0), ["a"] * 12)
-    with pytest.raises(lv.InputError, match="one for each block"):
+    with pytest.raises(lv.InputError, match="a sequence of 2 words"):
         lv.Problem.lcp(I2, [1.0, 1.0], names="ab")
 
 

@@ -1,4 +1,4 @@
-"""Rows at the door: the quick looks refuse and accept what the long way does."""
+"""Rows at the door: the quick checks refuse and accept what the long way does."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lavender as lv
-from lavender_ext.core import gate
+from lavender_ext.core import checks
 
 
 def fields(seed, bodies=3, contacts=4, joints=2):
@@ -84,9 +84,9 @@ def test_quick_looks_end_as_the_long_way(what, seed):
     given = spoilt(seed, SPOILT[what])
     quick = outcome(given)
     with pytest.MonkeyPatch.context() as patch:
-        for look in ("are_frames", "are_definite"):
-            patch.setattr(gate, look, lambda *_: False)
-        patch.setattr(gate, "are_pairs", _pairs_by_numpy)
+        for name in ("are_frames", "are_definite"):
+            patch.setattr(checks, name, lambda *_: False)
+        patch.setattr(checks, "are_pairs", _pairs_by_numpy)
         slow = outcome(given)
     assert quick == slow
     legal = ("nothing", "a joint of nobody", "a normal too long by 1e-11", "a normal too long by 1e-7")

@@ -93,8 +93,8 @@ def test_command_lines_of_a_page_are_understood(page):
             if words[:1] != ["lavender"]:
                 continue
             where = f"{page.name}, block at line {line}: {command}"
-            assert words[1] in cli.commands, where
-            sub = cli.commands[words[1]]
+            sub = cli.get_command(None, words[1])
+            assert sub is not None, where
             try:
                 sub.make_context(words[1], words[2:])
             except click.ClickException as error:

@@ -68,7 +68,7 @@ def test_everything_asked_for_is_in_the_folder(real, tmp_path):
     saved = sorted(p.name for p in (tmp_path / "figures").iterdir())
     assert saved == sorted(f"{name}.{suffix}" for name in shown for suffix in ("svg", "png"))
     kinds = [name.split("_")[0] for name in shown]
-    assert [kinds.count(kind) for kind in ("work-precision", "budget", "family", "profile")] == [3, 3, 1, 2]
+    assert [kinds.count(kind) for kind in ("work-precision", "budget", "profile")] == [3, 3, 2]
     assert all(p.stat().st_size > 1000 for p in (tmp_path / "figures").iterdir())
     text = (tmp_path / "summary.md").read_text()
     for solver in ("pgs", "direct", "jacobi", "gauss_seidel"):

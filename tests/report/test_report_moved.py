@@ -14,8 +14,9 @@ from click.testing import CliRunner
 import lavender as lv
 from lavender import bench, report
 from lavender.cli import cli, main
-from lavender.report import moved, tables
+from lavender.report import contents, moved, tables
 from lavender.report.curves import figures
+from lavender.report.findings import Report
 from lavender.report.verdict import verdict
 from lavender.report.write import write
 
@@ -34,7 +35,7 @@ def records():
 
 
 def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
-    for row in moved.moved(records):
+    for row in tables.reaches(moved.by_speed(records)):
         runs = [r for r in records if (r.case, r.solver, r.start) == (row.case, row.solver, row.start)]
         for level, time in row.times.items():
             assert time == min((r.time_min for r in runs if r.motion_speed <= level), default=math.inf)
@@ -46,7 +47,8 @@ def test_times_to_a_speed_are_those_of_runs_that_reached_it(records):
 def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records):
     working = moved.working(records)
     said = verdict(working)
-    best = next(a for a in moved.advice_by_speed(working) if a.target == 1e-4).best
+    line, *_ = tables.advice(moved.by_speed(working))
+    best = line.by_level[1e-4].best
     assert said.sentences[0].startswith(f"Use {best.solver}: ")
     assert "until no body is wrong by more than 1e-4 m/s on stack(n=16)" in said.sentences[0]
     # the line to copy does what the sentence says
@@ -70,9 +72,10 @@ def records_without(records, name):
 
 
 def test_recommendations_by_speed_name_who_gets_there(records):
-    found = moved.advice_by_speed(moved.working(records))
+    by_speed = moved.by_speed(moved.working(records))
+    found = [a for line in tables.advice(by_speed) for a in line.by_level.values()]
     assert {a.target for a in found} == {1e-2, 1e-4}
-    rows = {r.solver: r for r in moved.moved(records) if r.case == "stack(n=16)"}
+    rows = {r.solver: r for r in tables.reaches(by_speed) if r.case == "stack(n=16)"}
     for a in found:
         fastest = min(rows, key=lambda s: rows[s].times[a.target])
         assert fastest in (a.best.solver, *a.ties)  # within noise an order is fixed
@@ -80,8 +83,8 @@ def test_recommendations_by_speed_name_who_gets_there(records):
 
 def test_without_motion_errors_there_is_nothing_to_show():
     plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
-    assert moved.moved(plain) == []
-    assert moved.advice_by_speed(plain) == []
+    assert len(moved.by_speed(plain)) == 0
+    assert contents.moved_table(Report(plain)).rows == contents.speed_table(Report(plain)).rows == []
     assert moved.speed_levels(plain) == ()
 
 
@@ -94,9 +97,7 @@ def test_what_has_nothing_to_do_is_in_no_ranking(records):
     (case,) = moved.idle(records)
     assert (case.case, case.rows) == ("flying apart", 3)
     assert case.velocity == max(r.velocity for r in records if r.case == "flying apart")
-    assert [a.ranking[0].cases for a in tables.advice_by_level(busy)] == [1] * len(
-        tables.advice_by_level(busy)
-    )
+    assert {a.ranking[0].cases for line in tables.advice(busy) for a in line.by_level.values()} == {1}
     assert moved.working(busy) is busy
 
 
@@ -173,7 +174,7 @@ def test_the_summary_has_every_line_of_the_motion_table(records, tmp_path):
     write(records, tmp_path, figures=False)
     text = (tmp_path / "summary.md").read_text(encoding="utf-8")
     assert "| structure | to 1e-2 m/s | to 1e-4 m/s |" in text
-    for row in moved.moved(moved.working(records)):
+    for row in tables.reaches(moved.by_speed(moved.working(records))):
         name = row.solver if row.start == "cold" else f"{row.solver} ({row.start})"
         times = " | ".join(report.text.seconds(row.times[x]) for x in (1e-2, 1e-4))
         assert f"| {row.case} | {name} | {times} | {report.text.residual(row.best)} m/s |" in text
@@ -196,7 +197,7 @@ def test_a_campaign_counts_cases_by_motion_error_too(tmp_path):
     lv.io.save(idle_problem(), idle)
     plan = bench.CampaignPlan(levels=(1e-3,), budgets=(1, 64), orders=(), motion=True)
     found = bench.campaign(["stack(n=4)", "stack(n=32)", str(idle)], ["pgs"], plan, workers=1)
-    rows = moved.robustness_by_speed(moved.working(found))
+    rows = tables.robustness(moved.by_speed(moved.working(found)))
     best = {r.case: math.inf for r in moved.working(found)}
     for r in moved.working(found):
         best[r.case] = min(best[r.case], r.motion_speed)

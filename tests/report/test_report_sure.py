@@ -92,7 +92,8 @@ def test_in_a_time_misses_count_and_the_sentence_says_how_many():
             budget = {"mode": "budget", "tol": 0.0, "max_iter": 8, "work": {"sweeps": 8}, "claims": False}
             made.append(record(case, solver, 1e-4, left, **budget))
     found = records_of(*made)
-    (advice,) = report.advice_by_time(found, [1e-3])
+    (line,) = report.advice(found, [1e-3])
+    advice, swept = line.by_time[1e-3], line.by_sweeps[8.0]
     assert [(c.solver, c.solved, c.score) for c in advice.ranking][:2] == [
         ("wide", 10, 0.1),
         ("deep", 7, 1.0),
@@ -101,7 +102,6 @@ def test_in_a_time_misses_count_and_the_sentence_says_how_many():
     assert any("take wide, 8 sweeps: it serves 10 of 10" in s for s in said)
     alone = verdict(records_of(*(r for r in made if r.solver != "wide")), [1e-3]).sentences
     assert any("take deep, 8 sweeps: it serves 7 of 10" in s for s in alone)
-    (swept,) = report.tables.advice_by_sweeps(found)
     assert (swept.target, swept.best.solver) == (8.0, "wide")
     assert any(s.startswith("With 8 sweeps, take wide") for s in verdict(found, sweeps=[8]).sentences)
 

@@ -222,7 +222,7 @@ def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(se
 @pytest.mark.parametrize("seed", [1224, 1351])  # of 48 and 105 rows, where newton is stuck
 def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
     problem = wild(seed=seed).problem
-    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.gate) is None
+    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.limits) is None
     fresh = replace(problem, copy=False)
     assert registry.get("auto").small.solve(fresh, None, 1e-6) is None
     assert fresh.derived.vain is not None
@@ -230,13 +230,13 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
 
 
 @pytest.mark.parametrize("seed", range(16))
-def test_the_compiled_gate_lets_in_what_is_counted_to_cost_little(seed):
-    """`velocities_cost` and the gate of the compiled loops say the same of each law."""
+def test_the_compiled_limits_let_in_what_is_counted_to_cost_little(seed):
+    """`velocities_cost` and the limits of the compiled loops say the same of each law."""
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
     n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60))
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
-    found = solve_first(problem.metric, None, np.inf, AUTO.gate)
+    found = solve_first(problem.metric, None, np.inf, AUTO.limits)
     cost = velocities_cost(problem, general.prepare(problem).largest)
     assert (found is not None) == (cost <= AT_ONCE[problem.law])
 
@@ -396,7 +396,7 @@ def test_one_call_has_steps_for_every_island_of_velocities():
         compliance=np.tile(part.compliance, many),
         friction=part.friction,
     )
-    found = solve_first(problem.metric, None, 1e-6, AUTO.gate)
+    found = solve_first(problem.metric, None, 1e-6, AUTO.limits)
     assert found and found[1][0] > many
 
 

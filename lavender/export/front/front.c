@@ -54,9 +54,9 @@ struct lav_solver {
   double *pair_room;
   int32_t pairs_asked;
   struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
-  struct driver_driver_asked_t asked;
+  struct driver_driver_options_t newton_options;
   struct driver_driver_room_t drive;
-  int32_t driven;              /* Newton's method has begun, as `asked` says */
+  int32_t driven;              /* Newton's method has begun, as `newton_options` says */
   blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
   struct pivot_direct_direct_t direct;
   struct pivot_lemke_lemke_t lemke;
@@ -117,7 +117,7 @@ static uint64_t hash_bytes(const void *from, uint64_t bytes, uint64_t seed) {
 
 uint64_t lav_hash(const double *x, int32_t n, uint64_t seed) { return hash_bytes(x, x && n > 0 ? 8 * (uint64_t)n : 0, seed); }
 
-/* -- what is asked for, looked at ------------------------------------------------------------------------------------- */
+/* -- what is asked for, checked --------------------------------------------------------------------------------------- */
 
 static int32_t are_finite(const double *x, int64_t n) {
   double sum = 0.0; /* stays 0, or becomes NaN */

@@ -110,24 +110,24 @@ static const double CLOSEST = 1e-2;
 
 /* On the impulse as it stands; rows of a formed A where it does not go over bodies. */
 static int32_t start_newton(lav_solver *s, double tol, int32_t budget) {
-  s->asked.tol = tol;
-  s->asked.budget = budget;
-  return k_start(&s->view, &s->asked, &s->drive, s->impulse);
+  s->newton_options.tol = tol;
+  s->newton_options.budget = budget;
+  return k_start(&s->view, &s->newton_options, &s->drive, s->impulse);
 }
 
 static int32_t prepare_newton(lav_solver *s) {
   uint64_t from = s->used;
   int32_t how = driver_driver_ROOM;
-  s->asked.method = driver_driver_NEWTON;
-  s->asked.wide = LAVENDER_HAS_WIDE();
+  s->newton_options.method = driver_driver_NEWTON;
+  s->newton_options.wide = LAVENDER_HAS_WIDE();
   s->view = s->read;
   s->driven = 0;
   if (s->p.n_rows == 0) return LAV_OK;
-  if (!k_room(&s->view, &s->asked, &s->drive)) {
+  if (!k_room(&s->view, &s->newton_options, &s->drive)) {
     GIVE_BACK(form_matrix(s));
     s->view.r = NULL;
     s->view.a = &s->a;
-    if (!k_room(&s->view, &s->asked, &s->drive)) return LAV_ERROR_UNSUPPORTED;
+    if (!k_room(&s->view, &s->newton_options, &s->drive)) return LAV_ERROR_UNSUPPORTED;
     from = s->used;
   }
   while (how == driver_driver_ROOM) {
@@ -135,7 +135,7 @@ static int32_t prepare_newton(lav_solver *s) {
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
     if (s->is_short) return LAV_ERROR_ROOM;
-    how = s->view.a ? newton_plan_MORE : start_newton(s, s->asked.tol, s->asked.budget); /* as the last run: it tells the room */
+    how = s->view.a ? newton_plan_MORE : start_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
   }
   s->driven = s->view.a == NULL;
   return LAV_OK;
@@ -146,11 +146,11 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
   double closer = 1.0;
   int32_t how = newton_plan_MORE, before = 0;
   lav_verdict now;
-  if (!s->driven || budget->tol != s->asked.tol || budget->iterations != s->asked.budget)
+  if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
     how = start_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
-    how = k_step(&s->view, &s->asked, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
+    how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
     out->iterations = before + said.factorisations;
     if (how == newton_plan_SPENT) break;
     if (how == newton_plan_REACHED) {
@@ -166,8 +166,8 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
-  s->asked.tol = budget->tol;
-  s->asked.budget = budget->iterations;
+  s->newton_options.tol = budget->tol;
+  s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;
 }
 

@@ -2,7 +2,7 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- direct and lemke: pivots on bounded rows ------------------------------------------------------------------------- */
 
-enum { GUESS_SWEEPS = 2, BATCH = 32, STAYING = 6 }; /* rounds or pivots between two looks at the clock; passes that gain nothing */
+enum { GUESS_SWEEPS = 2, BATCH = 32, STAYING = 6 }; /* rounds or pivots between two checks of the clock; passes that gain nothing */
 static const double TINY_PIVOT = 1e-13;
 
 static int32_t prepare_pivots(lav_solver *s) {
@@ -34,7 +34,7 @@ static int32_t prepare_pivots(lav_solver *s) {
   return LAV_OK;
 }
 
-/* Rounds until the next look at the clock, within the budget. */
+/* Rounds until the next check of the clock, within the budget. */
 static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
   const int32_t left = budget->iterations - s->direct.s.n_rounds;
   return left < BATCH ? left : BATCH;

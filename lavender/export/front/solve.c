@@ -249,7 +249,7 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
   const int64_t memory = method == LAV_NNCG ? 0 : o->memory, prepared = 9 * m + 26 * k; /* of exact blocks */
   const int64_t pairs = bodies && k >= PACK_FROM ? sweep_packed_room_for(q->n_joints, mj, k - q->n_joints, mc, q->n_bodies) : 0;
   struct core_view_view_t view;
-  struct driver_driver_asked_t asked;
+  struct driver_driver_options_t newton;
   struct driver_driver_room_t room;
   int64_t numbers = 0, band = q->form == LAV_MATRIX && m > 0 && q->n_entries / m > 64 ? q->n_entries / m : 64;
   csr_t none = {NULL, NULL, NULL};
@@ -263,10 +263,10 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
       if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
       if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * n + 2048;
       memset(&view, 0, sizeof view);
-      memset(&asked, 0, sizeof asked);
+      memset(&newton, 0, sizeof newton);
       view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
-      asked.method = driver_driver_NEWTON;
-      k_room(&view, &asked, &room);
+      newton.method = driver_driver_NEWTON;
+      k_room(&view, &newton, &room);
       return room.n_index / 2 + room.n_real + 16;
     default: break;
   }
@@ -340,10 +340,10 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   take_kept(s, largest);
   s->begin = s->used;
 #ifndef LAV_SWEEPS_ONLY
-  s->asked.tol = 1e-6;
-  s->asked.budget = 1000;
+  s->newton_options.tol = 1e-6;
+  s->newton_options.budget = 1000;
   if (options->n_turns > 0) COPY(s->given_turns, options->turns, 2 * options->n_turns);
-  s->options.turns = s->given_turns; /* `lav_set` looks at them when the caller's may be gone */
+  s->options.turns = s->given_turns; /* `lav_set` reads them when the caller's may be gone */
 #endif
   s->magic = MAGIC;
   *out = s;

@@ -20,10 +20,6 @@ __all__ = [
     "Choice",
     "Line",
     "advice",
-    "advice_by_level",
-    "advice_by_sequence",
-    "advice_by_sweeps",
-    "advice_by_time",
     "counts_sweeps",
     "quantile",
     "steps_of",
@@ -127,7 +123,14 @@ class Line:
 
 
 def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
-    """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget."""
+    """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget.
+
+    To a level: first who brings most cases there, then who is fastest (shifted geometric mean). In a time, and with a
+    budget of those whose iterations are sweeps: who serves most cases, then the residual at the 90th percentile. A case
+    is served where at most half of the start's residual is left; who has nothing to show in the time scores 1 on it:
+    doing nothing. A solver whose claim was wrong on a case comes after all that were not. `times` [s]; `time_budgets`
+    if none are given.
+    """
     times = tuple(times) or time_budgets(records)
     ways, swept = _ways(records), _swept(records)
     return [
@@ -142,52 +145,6 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
         for is_sequence, groups in ((False, families(records)), (True, steps_of(records)))
         for name, cases in groups.items()
     ]
-
-
-def advice_by_level(records: Records) -> list[Advice]:
-    """For each structure and level: first who solves most cases, then who is fastest (shifted geometric mean).
-
-    A solver whose claim was wrong on a case of the family at any level comes after all that were not.
-    """
-    ways = _ways(records)
-    return [
-        to_level(records, family, cases, level, ways)
-        for family, cases in families(records).items()
-        for level in levels_of(records)
-    ]
-
-
-def advice_by_time(records: Records, times: Sequence[float] = ()) -> list[Advice]:
-    """For each structure and time budget: who serves most cases in that time, then the residual at the 90th percentile.
-
-    A case is served where at most half of the start's residual is left. A solver with nothing to show in the time
-    scores 1 on that case: doing nothing. `times` [s]; `time_budgets` if none are given.
-    """
-    times, ways = tuple(times) or time_budgets(records), _ways(records)
-    return [
-        within(records, family, cases, limit, ways)
-        for family, cases in families(records).items()
-        for limit in times
-    ]
-
-
-def advice_by_sequence(records: Records, times: Sequence[float] = ()) -> tuple[list[Advice], list[Advice]]:
-    """For each sequence, by level and by time of a step: which solver and budget, carried or cold."""
-    times, ways, sequences = tuple(times) or time_budgets(records), _ways(records), steps_of(records)
-    return (
-        [to_level(records, s, c, x, ways) for s, c in sequences.items() for x in levels_of(records)],
-        [within(records, s, c, t, ways) for s, c in sequences.items() for t in times],
-    )
-
-
-def advice_by_sweeps(records: Records) -> list[Advice]:
-    """For each structure and sequence and each budget: who serves most cases with so many sweeps, ranked as in a time.
-
-    Solvers whose iterations are sweeps: the others' cost nobody can compare by number.
-    """
-    groups = [*families(records).items(), *steps_of(records).items()]
-    swept = _swept(records)
-    return [_with_sweeps(records, name, cases, n, swept[n]) for name, cases in groups for n in swept]
 
 
 def _with_sweeps(records: Records, name: str, cases: Sequence[str], n: int, ways: Ways) -> Advice:
@@ -257,7 +214,7 @@ def steps_of(records: Records) -> dict[str, list[str]]:
 def to_level(
     records: Records, family: str, cases: Sequence[str], level: float, ways: Ways | None = None
 ) -> Advice:
-    """Who brings these cases, or steps, to a level; see `advice_by_level`. `ways` spares a pass over the records.
+    """Who brings these cases, or steps, to a level; see `advice`. `ways` spares a pass over the records.
 
     Steps of several sequences count together, by the lines that were asked for the level or have a budget.
     """
@@ -278,7 +235,7 @@ def to_level(
 def within(
     records: Records, family: str, cases: Sequence[str], limit: float, ways: Ways | None = None
 ) -> Advice:
-    """Who comes closest on these cases, or steps, within a time [s]; see `advice_by_time`.
+    """Who comes closest on these cases, or steps, within a time [s]; see `advice`.
 
     A run that takes the time within noise may be in it or not the next time: who would be the best with it is
     as good as the best.

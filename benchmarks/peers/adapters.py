@@ -1,4 +1,4 @@
-"""Solvers of others on a problem by their own interface: time to a given error, judged like ours.
+"""Solvers of others on a problem by their own interface, and ours: time to a given error, by one judge.
 
 A contestant runs a problem at tighter and tighter settings of its own; each run gives a time and an impulse, and the
 time to an error is the least time of a run that has it, by the judge, whatever was asked. It gets a problem in its
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
+import math
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -33,9 +34,13 @@ from lavender.external.running import Limits
 from lavender.external.stopwatch import own_time
 from lavender.problem import Problem
 from lavender.residuals import reference
+from lavender.solve import prepare
 
-__all__ = ["LADDER", "Call", "Contestant", "Runs", "check_siconos", "contestants"]
+__all__ = ["SCIPY", "SCRATCH", "TARGETS", "Contestant", "Result", "check_siconos", "contestants", "ours"]
 
+TARGETS = (1e-3, 1e-6, 1e-9)  # errors that all are asked for
+SCRATCH = ", from scratch"  # what names of ours end with that pay for forming A too
+SCIPY = "scipy "  # what names of SciPy's factorisations begin with
 #: Settings of other solvers, loose to tight: their own measures, in units where unknowns are near 1.
 LADDER = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12, 1e-14)
 START = 60.0  # s, wall: imports of a backend on a loaded machine
@@ -57,6 +62,23 @@ class Contestant:
     peer: bool
     runs: Runs = field(repr=False)
     refuses: Callable[[Problem], str | None] = field(default=lambda _: None, repr=False)
+
+
+@dataclass
+class Result:
+    """What one contestant reached on one problem."""
+
+    problem: str
+    rows: int
+    law: str
+    solver: str
+    peer: bool
+    runs: list[tuple[float, float]] = field(default_factory=list)  # s, relative residual, of every setting
+    note: str = ""
+
+    def time(self, target: float) -> float:
+        """Least time [s] of a run with at most this relative residual; inf without one."""
+        return min((t for t, r in self.runs if r <= target), default=math.inf)
 
 
 # -- QP and cone backends --------------------------------------------------------------------------
@@ -250,7 +272,7 @@ def _scipy(name: str) -> Contestant:
             return "for linear systems"
         return "a wide band" if name == "banded" and max(problem.bandwidth) > 100 else None
 
-    return Contestant(f"scipy {name}", True, runs, refuses)
+    return Contestant(f"{SCIPY}{name}", True, runs, refuses)
 
 
 # -- Siconos, in an interpreter of its own ---------------------------------------------------------
@@ -372,3 +394,37 @@ def contestants(siconos: str = "") -> list[Contestant]:
         made += [_siconos(siconos, name, True) for name in SICONOS_FRICTION]
         made += [_siconos(siconos, name, False) for name in SICONOS_LCP]
     return made
+
+
+# -- ours -----------------------------------------------------------------------------------------
+
+
+def ours() -> list[Contestant]:
+    """Every solver of ours, on a problem whose A is known and from scratch."""
+    names = [name for name, spec in registry.specs().items() if not spec.external and spec.missing() is None]
+    return [_ours(name, scratch) for name in names for scratch in (False, True)]
+
+
+def _ours(name: str, scratch: bool) -> Contestant:
+    """`prepare` and `solve` of a problem of which A and d are known, or of one of which nothing is yet."""
+
+    def runs(problem: Problem, limit: float) -> Iterator[Call]:
+        def once(tol: float) -> tuple[float, FloatArray]:
+            given = replace(problem, copy=False) if scratch else problem
+            start = process_time()
+            prepared = prepare(given, name)
+            seconds = process_time() - start
+            reference(given)  # the judge's
+            first = given.start()
+            start = process_time()
+            impulse = prepared.solve(impulse=first, tol=tol, max_iter=2**31 - 1, time_limit=limit).impulse
+            return seconds + process_time() - start, impulse
+
+        if not scratch:
+            reference(problem)
+            if problem.csr_data.d.size and "rows" in registry.get(name).operators:
+                _ = problem.data
+        for tol in TARGETS:
+            yield functools.partial(once, tol)
+
+    return Contestant(name + SCRATCH * scratch, False, runs, registry.get(name).refuses)

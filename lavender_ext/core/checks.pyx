@@ -1,6 +1,6 @@
-"""The gate of arrays for what most callers give: float64 that lies together, of the shape asked for.
+"""Checks of arrays for what most callers give: float64 that lies together, of the shape asked for.
 
-Nothing is said here of what is wrong: where a function says no, the long way looks again, decides, and finds the words.
+Nothing is said here of what is wrong: where a function says no, the long way checks again, decides, and finds the words.
 """
 from cpython.buffer cimport PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer
 from libc.math cimport fabs
@@ -23,7 +23,10 @@ def plain(value, tuple shape, bint finite, bint copy):
     cdef bint fits
     if type(value) is not ndarray or not value.flags.c_contiguous:
         return None
-    PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    try:
+        PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    except ValueError:                                  # dates have no buffer
+        return None
     fits = view.format[0] == 100 and view.format[1] == 0 and view.ndim == len(shape)    # "d"
     if fits:
         for i in range(view.ndim):

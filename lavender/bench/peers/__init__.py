@@ -1,1 +1,0 @@
-"""Solvers of others on the same problems, by their own interface."""
