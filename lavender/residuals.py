@@ -7,7 +7,8 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
     velocity  V = max sqrt(nu d) |e|                 [m/s]
     relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of doing nothing, lambda = Pi(0)
     floor     2^-53 (|A| |lambda| + |b|) put through the same two norms: what rounding lambda to
-              float64 costs; no solver can promise less than about twice that
+              float64 costs; no solver can promise less than about twice that, and where it is
+              1e-3 and more, relative is no less than it
     success   relative <= tol
 
 Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
