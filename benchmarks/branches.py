@@ -16,7 +16,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender import motion
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
@@ -194,13 +194,12 @@ def table(found: Sequence[Crossing]) -> str:
     "--every", type=click.IntRange(1), default=3, show_default=True, help="Search one step of these."
 )
 @click.option("--sweeps", type=click.IntRange(4, 64), default=16, show_default=True, help="Of the engine.")
-@click.option("--out", type=click.Path(path_type=Path), help="JSON of the steps.")
+@out_option("JSON of the steps.")
 def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
     """Whether a warm-started engine stays on one branch where a step has several motions.
 
     Six scenes whose bodies are pushed in directions of their own.
     """
-    folder_of(out)
     found: list[Crossing] = []
     for name, parameters, speed in RUNS:
         own = follow(name, speed, steps=steps, every=every, sweeps=sweeps, **parameters)

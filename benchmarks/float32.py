@@ -22,7 +22,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
@@ -200,10 +200,9 @@ def table(stops: Sequence[Stop]) -> str:
 @click.option("--steps", default=100, show_default=True, help="Problems of each model.")
 @click.option("--every", default=5, show_default=True, help="Steps of the simulation between two.")
 @click.option("--seed", default=0, show_default=True)
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), help="Every answer, as JSON.")
+@out_option("Every answer, as JSON.")
 def command(models: tuple[Path, ...], steps: int, every: int, seed: int, out: Path | None) -> None:
     """Early stops planted in a float32 Newton over steps of MuJoCo models, and what the judge says of them."""
-    folder_of(out)
     rng, stops = np.random.default_rng(seed), []
     for model in models:
         for problem in robot_steps(model, steps, every, seed):

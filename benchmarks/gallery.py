@@ -19,7 +19,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender._arrays import FloatArray
 from lavender.engine import Simulation
 from lavender.errors import InputError
@@ -154,7 +154,7 @@ def table(found: Iterable[Stay]) -> str:
     show_default=True,
     help="Solvers of the substeps, commas between them.",
 )
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Also write the numbers as JSON.")
+@out_option("Also write the numbers as JSON.")
 def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: Path | None) -> None:
     """Run scenes of the gallery for ten minutes, at 60 and at 120 steps a second: energies, drifts, times.
 
@@ -162,7 +162,6 @@ def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: Path | N
     """
     if not seconds > 0.0:
         raise InputError(f"seconds is {seconds:g}; more than 0 is needed")
-    folder_of(out)
     found: list[Stay] = []
     for name in scenes or tuple(SCENES):
         for solver in solvers.split(","):

@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender import motion
 from lavender.bench import resolve, structure_of
 from lavender.cones import ROW
@@ -337,9 +337,7 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
 @click.option(
     "--figure", "picture", type=click.Path(path_type=Path), help="Residual against motion error, drawn."
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="JSON of the searches, and of the iterates as `samples`."
-)
+@out_option("JSON of the searches, and of the iterates as `samples`.")
 def command(
     files: tuple[str, ...],
     runs: int,
@@ -351,7 +349,6 @@ def command(
 
     On FILES, or on the default set of the suite.
     """
-    folder_of(out)
     seen: list[Sample] = []
     found: list[Branches] = []
     left = 0

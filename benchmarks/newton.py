@@ -29,7 +29,7 @@ import numpy as np
 import lavender as lv
 from benchmarks import drawn
 from benchmarks.islands import forms
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender import suite
 from lavender.problem import Problem
 from lavender.residuals import nothing_to_do
@@ -245,7 +245,7 @@ def table(records: list[dict[str, Any]]) -> str:
 @click.option("--tol", default=1e-6, show_default=True)
 @click.option("--limit", default=2.0, show_default=True, help="Of one solve [s].")
 @click.option("--only", multiple=True, type=click.Choice(list(PARTS)), help="Parts; default: all.")
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="JSON of the lines.")
+@out_option("JSON of the lines.")
 def command(
     sets: str,
     seeds: str,
@@ -257,7 +257,6 @@ def command(
     out: Path | None,
 ) -> None:
     """What every form, start, phase and factorisation of newton is worth: each taken out alone."""
-    folder_of(out)
     args = Asked(sets.replace(",", " ").split(), seeds, rows, files, tol, limit)
     parts, records = {name: PARTS[name] for name in only or PARTS}, []
     for name, problem in problems(args):

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import click
 
 from lavender.bench import machine
 from lavender.errors import InputError
 from lavender.io.stored import write_text
 
-__all__ = ["folder_of", "markdown", "write_json"]
+__all__ = ["folder_of", "markdown", "out_option", "write_json"]
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -28,6 +30,13 @@ def folder_of(out: Path | None) -> Path | None:
     if out is not None and not out.parent.is_dir():
         raise InputError(f"--out {out}: there is no such folder")
     return out
+
+
+def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """`--out FILE`, which a command gets as a path whose folder exists, or None."""
+    return click.option(
+        name, type=click.Path(path_type=Path), callback=lambda ctx, option, path: folder_of(path), help=text
+    )
 
 
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:

@@ -22,7 +22,7 @@ import click
 import numpy as np
 import scipy.sparse as sp
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender import solve
 from lavender._arrays import FloatArray
 from lavender.cones import ROW
@@ -235,10 +235,9 @@ def _dart(gravity: tuple[float, float, float], steps: int) -> Iterator[tuple[str
 @click.command()
 @click.argument("names", nargs=-1)
 @click.option("--engines", is_flag=True, help="Drag a slab down a slope in every engine here instead.")
-@click.option("--out", type=click.Path(path_type=Path), help="Write every figure as JSON.")
+@out_option("Write every figure as JSON.")
 def command(names: tuple[str, ...], engines: bool, out: Path | None) -> None:
     """Friction in a disk, a box and the edges of a pyramid."""
-    folder_of(out)
     if engines:
         g = 9.81 * (np.sin(np.arctan(STEEP * MU)) - MU * np.cos(np.arctan(STEEP * MU)))
         click.echo(

@@ -24,7 +24,7 @@ g > 0 it leaves the unit circle where g is larger than about kappa.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 
@@ -40,7 +40,7 @@ from lavender.errors import InputError
 from lavender.io.stored import write_figure
 from lavender.scene import Scene
 
-__all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "numbers", "slowest"]
+__all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "slowest"]
 
 TOWERS = ((2, 4), (4, 4), (6, 4))  # boxes, sweeps
 ORDERS = ("given", "symmetric", "alternating")
@@ -233,37 +233,24 @@ def figure(path: str | PathLike[str]) -> None:
     write_figure(canvas, path)
 
 
-@dataclass(frozen=True)
-class Tower:
-    """One tower in one order."""
-
-    boxes: int
-    sweeps: int
-    order: str
-    kappa: float
-    hertz: float  # Hz, of the slowest mode in substeps of 1/60 s
-    fine: float  # Hz, of 1/240 s
-    still: float  # largest |z| of a substep of 1/60 s with gain 0
-    whole: float  # with gain 1
-
-
-def numbers(towers: Sequence[tuple[int, int]] = TOWERS) -> list[Tower]:
-    """Every tower (boxes, sweeps) in every order."""
-    found = []
-    for n, sweeps in towers:
+def numbers() -> Iterator[tuple[str, ...]]:
+    """Towers in every order: kappa and frequency of the slowest mode, largest |z| of a substep with gain 0 and 1."""
+    for n, sweeps in TOWERS:
         for order in ORDERS:
             still = modes(n, sweeps, 1 / 60, order=order)
-            fine = modes(n, sweeps, 1 / 240, order=order)
             whole = modes(n, sweeps, 1 / 60, order=order, gain=1.0)
-            most = [float(np.abs(m.z[0]) ** (1 / m.substeps)) for m in (still, whole)]
-            kappa, hertz = slowest(still)
-            found.append(
-                Tower(
-                    boxes=n, sweeps=sweeps, order=order, kappa=kappa, hertz=hertz, fine=slowest(fine)[1],
-                    still=most[0], whole=most[1],
-                )
-            )  # fmt: skip
-    return found
+            (kappa, hertz), (_, fine) = slowest(still), slowest(modes(n, sweeps, 1 / 240, order=order))
+            most, fed = (float(np.abs(m.z[0]) ** (1 / m.substeps)) for m in (still, whole))
+            yield (
+                str(n),
+                str(sweeps),
+                order,
+                f"{kappa:.2e}",
+                f"{hertz:.2f}",
+                f"{fine:.2f}",
+                f"{most:.6f}",
+                f"{fed:.4f}",
+            )
 
 
 @click.command("stability")
@@ -271,14 +258,7 @@ def numbers(towers: Sequence[tuple[int, int]] = TOWERS) -> list[Tower]:
 def command(picture: str | None) -> None:
     """Why towers fall on few sweeps: eigenvalues of one substep about rest."""
     head = ("boxes", "sweeps", "order", "kappa", "Hz, 1/60 s", "Hz, 1/240 s", "|z|, g = 0", "|z|, g = 1")
-    cells = [
-        (
-            t.boxes, t.sweeps, t.order, f"{t.kappa:.2e}", f"{t.hertz:.2f}", f"{t.fine:.2f}", f"{t.still:.6f}",
-            f"{t.whole:.4f}",
-        )
-        for t in numbers()
-    ]  # fmt: skip
-    click.echo(markdown(head, cells))
+    click.echo(markdown(head, numbers()))
     for n, sweeps in TOWERS[1:]:
         gain, (kappa, _) = critical_gain(n, sweeps, 1 / 60, digits=1), slowest(modes(n, sweeps, 1 / 60))
         click.echo(

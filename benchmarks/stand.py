@@ -26,7 +26,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender._arrays import FloatArray
 from lavender.bench.machine import versions
 from lavender.cli.options import Names, Numbers
@@ -316,7 +316,7 @@ def _at_least(low: int, **lists: Sequence[int]) -> None:
 @click.option(
     "--seconds", type=click.FloatRange(min=3.0), default=60.0, show_default=True, help="Simulated at most."
 )
-@click.option("--out", type=click.Path(path_type=Path), help="JSON of the lines.")
+@out_option("JSON of the lines.")
 def command(
     engines: tuple[str, ...] | None,
     boxes: tuple[int, ...],
@@ -340,7 +340,6 @@ def command(
             raise UnknownName("order", order, SCENE_ORDERS)
     _at_least(1, boxes=boxes, sweeps=sweeps, rates=rates)
     _at_least(0, substeps=substeps)
-    folder_of(out)
     found = []
     for line in lines(names, boxes, sweeps, rates, substeps, seconds=seconds, orders=orders or (None,)):
         found.append(line)

@@ -22,7 +22,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
 from lavender.io.stored import write_figure
@@ -34,7 +34,7 @@ from lavender.report.style import looks
 from lavender.scene import Scene
 from lavender.scene.steppers import STEPPERS, get_stepper
 
-__all__ = ["BUDGETS", "SCENES", "Point", "command", "measure", "plot", "reference", "table"]
+__all__ = ["BUDGETS", "SCENES", "Point", "command", "draw", "measure", "reference", "table"]
 
 SECONDS = 2.0
 DT = 1.0 / 60.0
@@ -185,7 +185,7 @@ def table(points: Sequence[Point], budgets: Sequence[float] = (300.0, 1200.0, 50
     return markdown(heads, cells)
 
 
-def plot(points: Sequence[Point], path: Path) -> None:
+def draw(points: Sequence[Point], path: Path) -> None:
     """Distance against CPU time, a diagram for each scene: the lower hull of each stepper over all its budgets.
 
     Raises
@@ -227,12 +227,10 @@ def _figure(scene: str, points: Sequence[Point]) -> Figure:
 
 @click.command("steppers")
 @click.option("--steppers", default=",".join(STEPPERS), show_default=True, help="Names with commas.")
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Every run, JSON.")
-@click.option("--plot", "figure", type=click.Path(path_type=Path), default=None, help="Figure (.svg, .png).")
-def command(steppers: str, out: Path | None, figure: Path | None) -> None:
+@out_option("Every run, JSON.")
+@out_option("Figure (.svg, .png).", "--plot")
+def command(steppers: str, out: Path | None, plot: Path | None) -> None:
     """Steppers' distance from a reference on six scenes, against CPU time."""
-    folder_of(out)
-    folder_of(figure)
 
     def show(point: Point) -> None:
         words = point.note or f"{1e3 * point.distance:.3g} mm, {1e3 * point.cpu:.3g} ms a second"
@@ -241,6 +239,6 @@ def command(steppers: str, out: Path | None, figure: Path | None) -> None:
     found = measure(steppers=steppers.replace(",", " ").split(), show=show)
     if out is not None:
         write_json(out, found)
-    if figure is not None:
-        plot(found, figure)
+    if plot is not None:
+        draw(found, plot)
     click.echo(table(found))

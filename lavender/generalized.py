@@ -31,7 +31,7 @@ from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr
-from lavender_ext.factor.dissection import dissection
+from lavender_ext.factor.graph import least_degree
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Generalized"]
@@ -40,7 +40,6 @@ ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodi
 ASYMMETRY32 = 2.0**-16  # the same of an M in float32, of which the lower triangle is taken
 MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search
 FACTORS = 20  # of a matrix like M that the solves of a problem take: what an order that fills in costs
-LEAF = 8  # velocities or trees that are not taken apart any more
 MET = 100  # trees that meet a tree, in the mean, beyond which no order keeps J^T J sparse
 Compressed = tuple[IntArray, IntArray, FloatArray]
 
@@ -373,23 +372,22 @@ def _order(mass: Compressed, n: int) -> IntArray:
     """Velocity at each place, eliminated from the last."""
     indptr, indices, _ = mass
     lower = sp.csr_array((np.ones(len(indices), np.int32), indices, indptr), shape=(n, n))
-    return _dissected(sp.csr_array(lower + lower.T))
+    return _eliminated(sp.csr_array(lower + lower.T))
 
 
-def _dissected(graph: sp.csr_array) -> IntArray:
-    """Vertex at each place by nested dissection, separators first, since elimination begins at the last."""
+def _eliminated(graph: sp.csr_array) -> IntArray:
+    """Vertex at each place, the first eliminated last, since elimination begins there."""
     graph.setdiag(0)
     graph.eliminate_zeros()
     graph.sort_indices()
-    order: IntArray = dissection(graph.indptr.astype(np.int32), graph.indices.astype(np.int32), LEAF)[::-1]
+    order: IntArray = least_degree(graph.indptr.astype(np.int32), graph.indices.astype(np.int32))[::-1]
     return order
 
 
 def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     """Velocity at each place where many trees may stand in any order, as vertices of a flex do; None: as they are.
 
-    M does not fill in whatever the order of its trees, but N = M + J^T V J of Newton couples those that share a row:
-    nested dissection of that graph, separators first, since elimination begins at the last.
+    M does not fill in whatever the order of its trees, but N = M + J^T V J of Newton couples those that share a row.
     """
     n = len(parent)
     roots = np.flatnonzero(parent < 0)
@@ -406,7 +404,7 @@ def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     if np.sum(np.diff(on.indptr).astype(float) ** 2) > MET * len(roots):
         return None
     met = sp.csr_array(on.T @ on)
-    first = _dissected(met)
+    first = _eliminated(met)
     place = np.empty(len(roots), np.int64)
     place[first] = np.arange(len(roots))
     order = np.argsort(place[tree], kind="stable").astype(np.int32)

@@ -46,6 +46,9 @@ def finish(
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
         status = DIVERGED
+    elif status is CONVERGED and tol < relative == judged.floor:
+        status = DIVERGED
+        message = f"{message}; beside such impulses float64 loses b".removeprefix("; ")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
     elif problem.operator not in spec.operators and (
@@ -53,11 +56,6 @@ def finish(
     ):
         status = STALLED
         message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
-    elif status is CONVERGED and spec.own and tol < relative == judged.floor:
-        status = STALLED
-        message = f"{message}; the impulse ran away: rounding it hides all that its test saw".removeprefix(
-            "; "
-        )
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
         status = FLOOR
     certificate = claim.certificate

@@ -7,9 +7,11 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
     velocity  V = max sqrt(nu d) |e|                 [m/s]
     relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of doing nothing, lambda = Pi(0)
     floor     2^-53 (|A| |lambda| + |b|) put through the same two norms: what rounding lambda to
-              float64 costs; no solver can promise less than about twice that, and where it is
-              1e-3 and more, relative is no less than it
+              float64 costs; no solver can promise less than about twice that
     success   relative <= tol
+
+Where rounding A lambda alone costs more than doing nothing and as much as all of b, float64 cannot tell A lambda - b
+from A lambda: the floor is then the relative residual, unless that is more. An impulse that ran away is no solution.
 
 Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
 norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.

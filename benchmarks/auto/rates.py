@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.auto.curves import Curve
-from lavender.problem import Problem
+from lavender.problem import LAWS, Problem
 from lavender.registry import SMALL_ROWS
 from lavender.solvers.costs import READ, Costs
 from lavender.solvers.structure import Structure
+from lavender.solvers.weights import law_of
 
 __all__ = ["DRAWN", "LEAST", "count_rates", "fit", "gathered", "least_squares", "middle"]
 
@@ -28,11 +29,14 @@ LEVEL = 1e-6  # that counts are for
 POINTS = 5  # of a curve, that are fitted at most
 NINE_IN_TEN = 0.9
 UPPER = 0.75  # quantile of counts of who promises nothing, and so is not left before what is expected of it
-KINDS = {
-    "rows": ("linear", "lcp"),
-    "cone": ("cone",),
-    "coulomb": ("coulomb",),
-}  # of laws, as rates tell them apart
+# Laws, as rates tell them apart: what a multiply-add of a sweep costs, and counts of iterations.
+SWEPT = {"rows": ("linear", "lcp", "coulomb", "rolling"), "cone": ("cone",)}
+KINDS = {"rows": ("linear", "lcp"), "cone": ("cone",), "coulomb": ("coulomb",)}
+COUNTED = {
+    "newton": KINDS | {"rolling": ("rolling",)},
+    "velocities": KINDS,
+    "nncg": {"rows": LAWS, "rolling": ("rolling",)},
+}
 Terms = list[float]
 Recorded = tuple[Structure, dict[str, Curve]]
 
@@ -61,12 +65,12 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
 
     def given(s: Structure, value: float) -> Terms:
         """The value at the place of the problem's law."""
-        return [value * (s.problem.law in of_laws) for of_laws in KINDS.values()]
+        return [value * (law_of(s.problem) in of_laws) for of_laws in SWEPT.values()]
 
     rates: dict[str, Any] = {}
     sweeps, back = of("anderson"), of("nncg")
     start, each_row, *work = least_squares(sweeps, lambda s, n: [1.0, n * s.m, *given(s, n * s.sweep)])
-    rates["anderson"] = {"start": start, "row": each_row, "work": dict(zip(KINDS, work, strict=True))}
+    rates["anderson"] = {"start": start, "row": each_row, "work": dict(zip(SWEPT, work, strict=True))}
     rates["nncg"] = {}
     finite = [(s, c) for s, c in of("direct") if s.is_definite]
     start, each_row, one, formed = least_squares(finite, lambda s, n: [1.0, n * s.m, n * s.direct, s.formed])
@@ -92,10 +96,18 @@ def fit(cases: Iterable[Recorded]) -> dict[str, Any]:
         "admm": split,
     }
     for name, part in chosen.items():
-        kinds = {kind: [x for x in part if x[0].problem.law in laws] for kind, laws in KINDS.items()}
-        whole = middle(part, quantile=UPPER if name in ("nncg", "admm") else 0.5)
-        by_kind = {kind: _round(middle(those, whole)) for kind, those in kinds.items()}
-        rates[name] = rates[name] | {"count": by_kind if name in ("newton", "velocities") else _round(whole)}
+        quantile = UPPER if name in ("nncg", "admm") else 0.5
+        by_law = {law: [x for x in part if law_of(x[0].problem) == law] for law in (*LAWS, "rolling")}
+        whole = middle([x for law in LAWS for x in by_law[law]], quantile=quantile)
+        by_kind = {
+            kind: _round(
+                middle(
+                    [x for law in laws for x in by_law[law]], whole, 0.5 if kind == "rolling" else quantile
+                )
+            )
+            for kind, laws in COUNTED.get(name, {}).items()
+        }
+        rates[name] |= {"count": by_kind or _round(whole)}
     rates["sure"] = _round(surely({"direct": finite, "newton": newton + steps}, rates))
     return rates
 

@@ -128,7 +128,7 @@ def _one(
             run="", case=case, sha="", solver=solver, mode="tol", tol=level,
             max_iter=UNLIMITED if spec.resumable else 0, time_limit=most,
         )  # fmt: skip
-        record = measure(problem, task)
+        record, _ = measure(problem, task)
         solved = record.relative <= level or (
             record.status in ("FLOOR", "INFEASIBLE") and not record.contradicted
         )

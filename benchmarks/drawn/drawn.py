@@ -16,9 +16,20 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
+import benchmarks.drawn.foreign as other
+import benchmarks.drawn.foreign_new as newer
 from benchmarks.drawn.foreign import PART, UP, Matrix
 from benchmarks.drawn.foreign import drawn as draw
-from benchmarks.drawn.wild import LARGEST_DENSE, Structure, World, between, on_floor
+from benchmarks.drawn.wild import (
+    LARGEST_DENSE,
+    MASSES,
+    Structure,
+    World,
+    between,
+    masses_of,
+    on_floor,
+    problem_of,
+)
 from lavender.cones import Cones
 from lavender.errors import UnknownName
 from lavender.problem import Problem
@@ -325,3 +336,32 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     rng = np.random.default_rng([seed, 0x647261])
     names = [n for n in STRUCTURES if part == "all" or (n in JUDGED) == (part == "judged")]
     return draw(rng, seed, rows, names, WORLDS, MATRICES)
+
+
+@family(drawn_rolling={})
+def rolling(seed: int = 0, rows: int = 3000) -> Draft:
+    """Bodies of a structure to tune on, of any lot but `wild`'s, whose contacts resist rolling, and perhaps spin."""
+    at_least(8, rows=rows)
+    rng = np.random.default_rng([seed, 0x726F6C])
+    worlds = {
+        name: world
+        for lot, tuned in ((WORLDS, TUNED), (other.WORLDS, other.TUNED), (newer.WORLDS, newer.TUNED))
+        for name, world in lot.items()
+        if name in tuned
+    }
+    name, masses = str(rng.choice(list(worlds))), str(rng.choice(MASSES))
+    world = worlds[name](rng, max(2, round(8.0 * (rows / 8.0) ** rng.random() / 5.0)))
+    bodies = Bodies(world.position, masses_of(rng, masses, len(world.position)), world.inertia)
+    sideways(bodies, float(rng.choice([0.0, 0.2, 1.0])), seed=seed)
+    made = problem_of(rng, world, bodies, "coulomb").rows
+    assert made is not None
+    spin = {"patch_radius": 0.02} if rng.random() < 0.5 else {}
+    problem = Problem.from_rows(
+        made,
+        mu=rng.uniform(0.2, 0.9),
+        tangents=2,
+        rolling=10.0 ** rng.uniform(-3.0, -1.0),
+        friction=str(rng.choice(["coulomb", "cone"])),
+        **spin,
+    )
+    return Draft(problem, f"{name}, masses {masses}, {problem.law} that resists rolling: drawn, not chosen")

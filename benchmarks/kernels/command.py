@@ -10,7 +10,7 @@ import click
 
 from benchmarks.kernels.cases import CASES, Row, run
 from benchmarks.kernels.instructions import COUNTED, instructions
-from benchmarks.output import folder_of, markdown, write_json
+from benchmarks.output import markdown, out_option, write_json
 from lavender.bench import machine
 
 __all__ = ["command", "table"]
@@ -43,13 +43,12 @@ def table(rows: Sequence[Row]) -> str:
 @click.option(
     "--instructions", "count", is_flag=True, help="Count instructions by valgrind's callgrind, minutes."
 )
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every row here too, JSON.")
+@out_option("Write every row here too, JSON.")
 def command(cases: tuple[str, ...], seconds: float, count: bool, out: Path | None) -> None:
     """Kernels and small calls beside bare loops of the same mathematics, measured in turns.
 
     CASES are names; without them all of them.
     """
-    folder_of(out)
     click.echo(f"{machine.cpu_name()}\n")
     found: list[Row] = []
     list(run([name for name in cases if name not in CASES]))  # a wrong name ends it here

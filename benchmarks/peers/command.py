@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 
-from benchmarks.output import folder_of, write_json
+from benchmarks.output import out_option, write_json
 from benchmarks.peers import engines as peer_engines
 from benchmarks.peers import race
 from benchmarks.peers.adapters import Result, contestants, ours
@@ -52,7 +52,7 @@ PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", 
     metavar="PYTHON",
     help="Interpreter that has Siconos (Debian: python3-siconos).",
 )
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every run here too, JSON.")
+@out_option("Write every run here too, JSON.")
 def command(
     files: tuple[str, ...],
     engines: bool,
@@ -68,7 +68,6 @@ def command(
 
     FILES are problems for the solvers; without them a fixed list of small and large ones.
     """
-    folder_of(out)
 
     def note(text: str) -> None:
         click.echo(text, err=True)

@@ -82,7 +82,7 @@ def _distributions() -> Mapping[str, list[str]]:
     return metadata.packages_distributions()  # by module; reads the lists of all that is installed
 
 
-def describe(plan: Mapping[str, Any], packages: Iterable[str] = (), threads: int = 1) -> Run:
+def describe(plan: Mapping[str, Any], packages: Iterable[str] = ()) -> Run:
     """The run that starts now. Its identity holds CPU, versions and plan, not the time."""
     facts = {
         "lavender": __version__,
@@ -90,7 +90,7 @@ def describe(plan: Mapping[str, Any], packages: Iterable[str] = (), threads: int
         "platform": platform.platform(),
         "cpu": cpu_name(),
         "cores": os.cpu_count() or 1,
-        "threads": threads,
+        "threads": 1,
         "versions": versions(packages),
     }
     # What decides how a single measurement comes out; which cases and solvers are asked for does not.

@@ -44,29 +44,35 @@ MANY = 64  # problems in one call of solve_many
 
 
 @dataclass(frozen=True)
-class Step:
-    """One problem, both sides; times in s, residuals relative."""
+class WarmStep:
+    """One problem, both sides; of consecutive steps each from what it knew. Times in s, residuals relative."""
 
     model: str
     step: int
     rows: int
+    engine: float
+    ours: float  # one call
+    engine_residual: float
+    residual: float
+
+
+@dataclass(frozen=True)
+class Step(WarmStep):
+    """One problem, both sides from nothing."""
+
     nv: int
     law: str
     tolerance: float  # of MuJoCo, the loosest accepted; 0 where none was
-    engine: float
-    ours: float  # one call
-    many: float  # each in solve_many
-    kernel: float  # of one call, its solver alone
-    engine_residual: float
-    residual: float
+    many: float  # s, each in solve_many
+    kernel: float  # s, of one call, its solver alone
+    prepare: float  # s, of one call
+    judge: float  # s
     strict: float  # residual of ours when asked for STRICT
     coulomb: float | None  # the same under Coulomb's law; None where a contact has more than two tangents
-    prepare: float = 0.0  # s, of one call
-    judge: float = 0.0  # s
-    momentum: float = 0.0  # -, |M (v+ - v)| / |M v| of ours against a solution v
-    engine_momentum: float = 0.0
-    energy: float = 0.0  # -, of the kinetic energy
-    engine_energy: float = 0.0
+    momentum: float  # -, |M (v+ - v)| / |M v| of ours against a solution v
+    engine_momentum: float
+    energy: float  # -, of the kinetic energy
+    engine_energy: float
 
 
 def fresh(problem: Problem) -> Problem:
@@ -92,16 +98,12 @@ def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_WARMSTART)
     found = 0.0, np.inf
     try:
-        for tolerance in TOLERANCES:
-            model.opt.tolerance = tolerance
+        for tolerance in (*TOLERANCES, 0.0):
+            model.opt.tolerance = tolerance or default
             mj.mj_fwdConstraint(model, data)
             found = tolerance, residual(problem, adapter.impulse(model, data)).relative
             if found[1] <= TARGET:
                 break
-        else:
-            model.opt.tolerance = default
-            mj.mj_fwdConstraint(model, data)
-            found = 0.0, residual(problem, adapter.impulse(model, data)).relative
         seconds = least(lambda: mj.mj_fwdConstraint(model, data), 4 * REPEATS)
     finally:
         model.opt.solver, model.opt.tolerance, model.opt.disableflags = kept
@@ -159,27 +161,24 @@ def next_step(problem: Problem, impulse: Any, reference_impulse: Any) -> tuple[f
     )
 
 
-def _steps(mj: Any, model: Any, steps: int, seed: int) -> Iterator[tuple[int, Any]]:
-    """Number of each step under random controls, and the data after it."""
-    data, drive = mj.MjData(model), drive_of(model, "random", seed)
+def _problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
+    """Number, data and problem of each `every`-th step under random controls; None for a problem without a row."""
+    data, drive = mj.MjData(model), drive_of(model, "random", 0)
     for step in range(steps):
         data.ctrl[:] = drive(data, step)
         mj.mj_step(model, data)
-        yield step, data
+        if (step + 1) % every == 0:
+            mj.mj_forward(model, data)
+            some = int(data.nefc) > 0
+            yield step, data, adapter.from_mujoco(model, data, name=f"{path.stem} {step}") if some else None
 
 
-def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[Step]:
+def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
     """Steps of one model under random controls; those without constraints or nothing to do are left out."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     out: list[Step] = []
-    for step, data in _steps(mj, model, 20 * steps * every, seed):
-        if (step + 1) % every:
-            continue
-        mj.mj_forward(model, data)
-        if int(data.nefc) == 0:
-            continue
-        problem = adapter.from_mujoco(model, data, name=f"{path.stem} {step}")
-        if reference(problem)[1] < 1e-9:
+    for step, data, problem in _problems(mj, path, model, 20 * steps * every, every):
+        if problem is None or reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
         engine_impulse = adapter.impulse(model, data)
@@ -225,31 +224,16 @@ def measure(mj: Any, path: Path, steps: int, every: int, seed: int = 0) -> list[
     return out
 
 
-@dataclass(frozen=True)
-class WarmStep:
-    """One of consecutive steps, both sides from what they knew; times in s."""
-
-    model: str
-    step: int
-    rows: int
-    engine: float
-    ours: float  # one call
-    engine_residual: float
-    residual: float
-
-
-def measure_warm(mj: Any, path: Path, steps: int, seed: int = 0) -> list[WarmStep]:
+def measure_warm(mj: Any, path: Path, steps: int) -> list[WarmStep]:
     """Consecutive steps of one model under random controls, each solved warm by both sides."""
     model = mj.MjModel.from_xml_path(os.fspath(path))
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     out: list[WarmStep] = []
     before: tuple[Problem, Any] | None = None
-    for step, data in _steps(mj, model, steps, seed):
-        mj.mj_forward(model, data)
-        if int(data.nefc) == 0:
+    for step, data, problem in _problems(mj, path, model, steps, 1):
+        if problem is None:
             before = None
             continue
-        problem = adapter.from_mujoco(model, data, name=f"{path.stem} {step}")
         engine = least(partial(mj.mj_fwdConstraint, model, data))
         start = problem.start() if before is None else carry(*before, problem)
         ours = np.inf

@@ -24,7 +24,7 @@ __all__ = ["ENGINES", "Contestant", "contestants"]
 ENGINES = (
     "Inside the engine: its own answers, judged like ours; its time holds no copy of the problem and no judge"
 )
-_NUMBERS = ("rows", "seconds", "relative", "iterations")
+_NUMBERS = ("rows", "seconds", "relative")
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,6 @@ class Contestant:
     solver: str  # of the engine
     steps: int
     rows: float  # median
-    iterations: float  # median
     seconds: float  # median, inside the engine
     relative: float  # median
     worst: float
@@ -65,7 +64,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 continue
         if not found:
             continue
-        rows, seconds, relative, iterations, early, solvers = zip(*found, strict=True)
+        rows, seconds, relative, early, solvers = zip(*found, strict=True)
         name, ours, worst = _fastest(Path(word).name, records)
         out.append(
             Contestant(
@@ -73,7 +72,6 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 solver=f"{max(set(solvers), key=solvers.count).capitalize()} (inside the engine)",
                 steps=len(found),
                 rows=float(np.median(rows)),
-                iterations=float(np.median(iterations)),
                 seconds=float(np.median(seconds)),
                 relative=float(np.median(relative)),
                 worst=float(np.max(relative)),

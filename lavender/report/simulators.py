@@ -12,7 +12,7 @@ from lavender.report.table import Table, markdown
 
 __all__ = ["table", "warm_table"]
 
-S = TypeVar("S", Step, WarmStep)
+S = TypeVar("S", bound=WarmStep)
 PARTS = ("ours", "many", "kernel", "prepare", "judge")  # of one call, over MuJoCo's time
 CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
 

@@ -11,16 +11,16 @@ __all__ = ["NONE", "count", "residual", "seconds", "share", "suspicions", "times
 NONE = "–"  # where there is no number
 
 
-def seconds(t: float, missing: str = NONE) -> str:
+def seconds(t: float) -> str:
     """Three digits and a unit: 12.3 µs, 4.56 ms, 7.89 s."""
     if not math.isfinite(t):
-        return missing
+        return NONE
     for scale, unit in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
         if t >= 0.9995 * scale or unit == "µs":
             x = t / scale
             digits = max(0, 2 - math.floor(math.log10(x))) if x >= 1.0 else 2
             return f"{x:.{digits}f} {unit}"
-    return missing
+    return NONE
 
 
 def residual(x: float) -> str:

@@ -31,13 +31,13 @@ from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.islands import block_bodies
-from lavender.solvers.newton_systems.pattern import block_pattern
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.newton_systems.systems import DENSE_FILL, factor_cost
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
 from lavender_ext.factor import symbolic
+from lavender_ext.factor.graph import body_pattern
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import scaled_entries
 
@@ -127,7 +127,7 @@ class AdmmState:
             return _FULL * m**3 / 3.0
         if self.kind == _BODIES:
             assert problem.rows is not None
-            nptr, nind = block_pattern(problem.rows.n_bodies, block_bodies(problem))[:2]
+            nptr, nind = body_pattern(block_bodies(problem), problem.rows.n_bodies)[:2]
             return _PANELS_WORK * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
         return _PANELS_WORK * self.panels.work if m else 0.0
 

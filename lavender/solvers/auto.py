@@ -141,7 +141,7 @@ def others(log: SolveLog, plan: Plan | None, begun: list[Candidate]) -> None:
     costs = Costs(log.problem, log.tol, structure=structure, plan=plan)
     names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
     race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)
-    if log.best > log.tol and log.certificate is None and log.left > 0:
+    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
 
 

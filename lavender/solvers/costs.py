@@ -18,7 +18,7 @@ from typing import Any
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.solvers.structure import Structure
-from lavender.solvers.weights import READ, of_law, rates
+from lavender.solvers.weights import READ, law_of, of_law, rates
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
 
@@ -191,6 +191,7 @@ class Costs:
         self.structure = Structure(problem) if structure is None else structure
         self.rates = rates() if given is None else given
         self.planned = {} if plan is None else dict(plan.candidates)
+        self.law = law_of(problem)
         self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
 
     @property
@@ -200,7 +201,7 @@ class Costs:
 
     def floor(self, name: str) -> float:
         """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
-        r, law, m = self.rates, self.problem.law, self.structure.m
+        r, law, m = self.rates, self.law, self.structure.m
         if name == "newton" and self.problem.generalized is not None:
             v, half = (
                 r["velocities"],
@@ -230,13 +231,13 @@ class Costs:
 
     def of(self, name: str) -> Cost:
         """As counted."""
-        s, r, law = self.structure, self.rates, self.problem.law
+        s, r, law = self.structure, self.rates, self.law
         if name in self.planned:
             return self.planned[name]
         if name in ("anderson", "nncg"):
             a = r["anderson"]
             each = a["row"] * s.m + of_law(a["work"], law) * s.sweep
-            count = self.decades * r[name]["count"]
+            count = self.decades * of_law(r[name]["count"], law)
             return Cost(a["start"], each * (1.0 if name == "anderson" else BOTH_WAYS), count)
         if name == "direct":
             return self._finite("direct", s.direct)
@@ -261,9 +262,7 @@ class Costs:
     def _finite(self, name: str, factor: float) -> Cost:
         r, s = self.rates[name], self.structure
         setup = r["start"] + self.rates["formed"] * s.formed
-        count = (
-            1.0 if name == "direct" and self.problem.law == "linear" else of_law(r["count"], self.problem.law)
-        )
+        count = 1.0 if name == "direct" and self.law == "linear" else of_law(r["count"], self.law)
         return Cost(setup, r["row"] * s.m + r["work"] * factor, count)
 
 

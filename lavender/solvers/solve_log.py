@@ -113,6 +113,11 @@ class SolveLog:
         """The last turns gained next to nothing."""
         return len(self.turns) > STILL and self.best > GAIN * self.turns[-STILL].before
 
+    @property
+    def vain(self) -> bool:
+        """The last turn gained next to nothing."""
+        return bool(self.turns) and self.best > GAIN * self.turns[-1].before
+
     def done(self) -> bool:
         """Solved, proven to have no solution, or at an end."""
         return (

@@ -39,9 +39,17 @@ def rates() -> dict[str, Any]:
     return found
 
 
+def law_of(problem: Problem) -> str:
+    """The law as rates tell it: Coulomb's where contacts resist rolling is one of its own."""
+    return "rolling" if problem.law == "coulomb" and problem.cones.has_rolling else problem.law
+
+
 def of_law(rate: Any, law: str) -> float:
     """A rate that depends on the law: bounded rows, whether they have bounds or not, and each law of friction."""
-    return float(rate[law if law in rate else "rows"] if isinstance(rate, Mapping) else rate)
+    if not isinstance(rate, Mapping):
+        return float(rate)
+    like = "coulomb" if law == "rolling" else law
+    return float(next(rate[kind] for kind in (law, like, "rows") if kind in rate))
 
 
 def sweep_cost(problem: Problem, work: float | None = None) -> float:

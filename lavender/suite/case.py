@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ParamSpec
@@ -169,7 +169,7 @@ def spell(value: Any) -> str:
     return min((s for s in spellings if float(s) == value), key=len)
 
 
-def parse(text: str, known: Iterable[str] = ()) -> tuple[str, dict[str, Any]]:
+def parse(text: str) -> tuple[str, dict[str, Any]]:
     """Name and parameters of "pyramid(k=10, mass_ratio=1e6)"; words need no quotes.
 
     Raises

@@ -30,7 +30,7 @@ cdef struct sparse_t:
 cdef struct factor_t:
     int32_t n                   # block columns
     int32_t s                   # rows of a block, 1 to 6
-    const int32_t* nptr         # (n + 1) blocks of row k of N, columns <= k ascending, the diagonal last
+    const int32_t* nptr         # (n + 1) blocks of row k of N, columns <= k, the diagonal last
     const int32_t* nind
     const int32_t* rptr         # (n + 1) pattern of row k of L, columns < k ascending
     const int32_t* rind

@@ -1,94 +1,95 @@
 """An elimination order of bodies, and the pattern of the matrix over them in that order.
 
-The order is the minimum degree of the graph in which bodies with a block in common are neighbours (Tinney, Walker 1967):
-eliminate a body of least degree, join its neighbours, repeat. Neighbours are bits, so joining is one pass over n / 64
-words.
+Bodies with a block in common are neighbours. Their order is that of least degree (minimum_degree.pxd), columns of one
+pattern put beside each other.
 """
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy
+
+from lavender_ext.factor.minimum_degree cimport degree_order
+from lavender_ext.factor.symbolic cimport postordered
 
 
-cdef inline int32_t count_bits(uint64_t x) noexcept nogil:
-    x = x - ((x >> 1) & <uint64_t>0x5555555555555555)
-    x = (x & <uint64_t>0x3333333333333333) + ((x >> 2) & <uint64_t>0x3333333333333333)
-    x = (x + (x >> 4)) & <uint64_t>0x0F0F0F0F0F0F0F0F
-    return <int32_t>((x * <uint64_t>0x0101010101010101) >> 56)
+cdef inline int64_t order_room(int64_t n, int64_t neighbours) noexcept nogil:
+    """Whole numbers of scratch that `order_graph` takes, from a multiple of 8 bytes on."""
+    return 13 * n + 2 + neighbours + neighbours // 4
 
 
-cdef inline int32_t lowest_bit(uint64_t x) noexcept nogil:
-    return count_bits((x & (~x + 1)) - 1)
+cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near, int32_t* scratch, int32_t* order,
+                             int32_t* rank, int32_t* nptr, int32_t* nind, int32_t* parent) noexcept nogil:
+    """An order of elimination (n) of a graph's vertices, the place (n) of each, and the lower pattern in it.
+
+    near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i; scratch (`order_room`); nind (half of near and n).
+    """
+    cdef int64_t* left = <int64_t*>scratch
+    cdef int32_t* whole = scratch + 2 * n               # 8 n + 1
+    cdef int32_t* head = whole + 8 * n + 1              # n + 1
+    cdef int32_t* size = head + n + 1
+    cdef int32_t* lists = size + n                      # the rest
+    cdef int32_t i
+    for i in range(n):
+        size[i] = 1
+    memcpy(whole, ptr, (n + 1) * sizeof(int32_t))
+    memcpy(lists, near, ptr[n] * sizeof(int32_t))
+    degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, whole, left, head, order)
+    postordered(n, ptr, near, order, rank, nptr, nind, parent, whole)
 
 
-cdef inline void body_order(int32_t k, const int32_t* body, int32_t n, int32_t words, uint64_t* near, uint64_t* given,
-                            int32_t* degree, int32_t* rank) noexcept nogil:
-    """rank (n): place of each body in the elimination; near, given (n, words) hold neighbours, scratch and kept."""
-    cdef int32_t i, j, p, w, q, step, best
-    cdef uint64_t bits
-    cdef int64_t row, other
-    for row in range(<int64_t>n * words):
-        near[row] = 0
+cdef inline int64_t pattern_room(int64_t n, int64_t k) noexcept nogil:
+    """Whole numbers of scratch that `eliminate_bodies` takes for n bodies and k blocks, from a multiple of 8 bytes on."""
+    return order_room(n, 2 * k) + 3 * n + 1 + 2 * k
+
+
+cdef inline void find_neighbours(int32_t k, const int32_t* body, int32_t n, int32_t* mark, int32_t* ptr,
+                                 int32_t* near) noexcept nogil:
+    """near[ptr[i]:ptr[i + 1]] are the neighbours of body i, each once; near (2 k), mark (n) is scratch."""
+    cdef int32_t i, a, b, q, to = 0, first = 0
+    for i in range(n + 1):
+        ptr[i] = 0
     for i in range(k):
-        p = body[2 * i]
-        q = body[2 * i + 1]
-        if p >= 0 and q >= 0:
-            near[<int64_t>p * words + (q >> 6)] |= <uint64_t>1 << (q & 63)
-            near[<int64_t>q * words + (p >> 6)] |= <uint64_t>1 << (p & 63)
+        a = body[2 * i]
+        b = body[2 * i + 1]
+        if a >= 0 and b >= 0 and a != b:
+            ptr[a + 1] += 1
+            ptr[b + 1] += 1
     for i in range(n):
-        rank[i] = -1
-        degree[i] = 0
-        for w in range(words):
-            bits = near[<int64_t>i * words + w]
-            given[<int64_t>i * words + w] = bits
-            degree[i] += count_bits(bits)
-    for step in range(n):
-        p = -1
-        best = n + 1
-        for i in range(n):
-            if rank[i] < 0 and degree[i] < best:
-                best = degree[i]
-                p = i
-        rank[p] = step
-        row = <int64_t>p * words
-        for w in range(words):
-            bits = near[row + w]
-            while bits != 0:
-                i = 64 * w + lowest_bit(bits)
-                bits = bits & (bits - 1)
-                other = <int64_t>i * words
-                degree[i] = 0
-                for j in range(words):
-                    near[other + j] |= near[row + j]
-                near[other + (i >> 6)] &= ~(<uint64_t>1 << (i & 63))
-                near[other + (p >> 6)] &= ~(<uint64_t>1 << (p & 63))
-                for j in range(words):
-                    degree[i] += count_bits(near[other + j])
+        ptr[i + 1] += ptr[i]
+        mark[i] = ptr[i]
+    for i in range(k):
+        a = body[2 * i]
+        b = body[2 * i + 1]
+        if a >= 0 and b >= 0 and a != b:
+            near[mark[a]] = b
+            near[mark[b]] = a
+            mark[a] += 1
+            mark[b] += 1
+    for i in range(n):
+        mark[i] = -1
+    for i in range(n):
+        b = ptr[i + 1]
+        for q in range(first, b):
+            if mark[near[q]] != i:
+                mark[near[q]] = i
+                near[to] = near[q]
+                to += 1
+        first = b
+        ptr[i + 1] = to
 
 
-cdef inline void lower_pattern(int32_t k, const int32_t* body, int32_t n, int32_t words, const uint64_t* given,
-                               const int32_t* rank, int32_t* at, int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot,
-                               int32_t* turned) noexcept nogil:
-    """Lower block rows in elimination order, and of each block its two places (larger first) and three slots."""
-    cdef int32_t i, j, r, w, q, top, a, b
-    cdef uint64_t bits
-    for i in range(n):
-        at[rank[i]] = i
-    q = 0
-    for r in range(n):
-        nptr[r] = q
-        for w in range(words):
-            bits = given[<int64_t>at[r] * words + w]
-            while bits != 0:
-                j = rank[64 * w + lowest_bit(bits)]
-                bits = bits & (bits - 1)
-                if j < r:
-                    top = q
-                    while top > nptr[r] and nind[top - 1] > j:
-                        nind[top] = nind[top - 1]
-                        top -= 1
-                    nind[top] = j
-                    q += 1
-        nind[q] = r
-        q += 1
-    nptr[n] = q
+cdef inline void eliminate_bodies(int32_t k, const int32_t* body, int32_t n, int32_t* scratch, int32_t* parent,
+                                  int32_t* nptr, int32_t* nind, int32_t* node, int32_t* slot, int32_t* turned) noexcept nogil:
+    """Lower block rows in elimination order, and of each block its two places (larger first) and three slots.
+
+    body (k, 2), -1 static; scratch (`pattern_room`); parent (n), nptr (n + 1), nind (n + k), node (k, 2), slot (k, 3),
+    turned (k).
+    """
+    cdef int32_t* order = scratch + order_room(n, 2 * k)
+    cdef int32_t* rank = order + n
+    cdef int32_t* ptr = rank + n                        # n + 1
+    cdef int32_t* near = ptr + n + 1                    # 2 k
+    cdef int32_t i, r, a, b, q
+    find_neighbours(k, body, n, rank, ptr, near)
+    order_graph(n, ptr, near, scratch, order, rank, nptr, nind, parent)
     for i in range(k):
         a = rank[body[2 * i]] if body[2 * i] >= 0 else -1
         b = rank[body[2 * i + 1]] if body[2 * i + 1] >= 0 else -1

@@ -4,13 +4,13 @@ Two blocks are connected where they share a moving body, a tree of M, or where A
 with path halving; labels are numbered in the order of the first block of each component. The order of the bodies is in
 graph.pxd.
 """
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t
 
 import numpy as np
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.graph cimport body_order, lower_pattern
+from lavender_ext.factor.graph cimport eliminate_bodies, order_graph, order_room, pattern_room
 
 
 cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
@@ -151,13 +151,10 @@ cdef public int32_t lav_body_pairs(int32_t k, const int32_t* body, int32_t n_bod
 
 
 def body_pattern(const int32_t[:, ::1] body, int n):
-    """(nptr, nind, node, slot, turned) of the normal matrix over n bodies, blocks between bodies (k, 2).
-
-    Memory n^2 / 4 bytes: for a few thousand bodies at most.
-    """
-    cdef int32_t k = <int32_t>body.shape[0], words = (n + 63) // 64
-    cdef uint64_t[::1] near = np.empty(n * words + 1, np.uint64), given = np.empty(n * words + 1, np.uint64)
-    cdef int32_t[::1] degree = np.empty(n + 1, np.int32), rank = np.empty(n + 1, np.int32)
+    """(nptr, nind, node, slot, turned) of the normal matrix over n bodies, blocks between bodies (k, 2)."""
+    cdef int32_t k = <int32_t>body.shape[0]
+    cdef double[::1] scratch = np.empty(pattern_room(n, k) // 2 + 1)
+    cdef int32_t[::1] parent = np.empty(n + 1, np.int32)
     nptr_array, nind_array = np.zeros(n + 1, np.int32), np.empty(n + k + 1, np.int32)
     node_array, slot_array = np.empty((k, 2), np.int32), np.empty((k, 3), np.int32)
     turned_array = np.empty(k, np.int32)
@@ -165,10 +162,23 @@ def body_pattern(const int32_t[:, ::1] body, int n):
     cdef int32_t[:, ::1] node = node_array, slot = slot_array
     if k and n:
         with nogil:
-            body_order(k, &body[0, 0], n, words, &near[0], &given[0], &degree[0], &rank[0])
-            lower_pattern(k, &body[0, 0], n, words, &given[0], &rank[0], &degree[0], &nptr[0], &nind[0], &node[0, 0],
-                          &slot[0, 0], &turned[0])
+            eliminate_bodies(k, &body[0, 0], n, <int32_t*>&scratch[0], &parent[0], &nptr[0], &nind[0], &node[0, 0],
+                             &slot[0, 0], &turned[0])
     return nptr_array, nind_array[:nptr_array[n]].copy(), node_array, slot_array, turned_array
+
+
+def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
+    """(n,) vertices in their order of elimination; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
+    cdef double[::1] scratch = np.empty(order_room(n, all_) // 2 + 1)
+    order_array = np.empty(n, np.int32)
+    cdef int32_t[::1] order = order_array, index = np.empty(4 * n + all_ // 2 + 4, np.int32)
+    cdef const int32_t* entries = &near[0] if all_ else NULL
+    if n:
+        with nogil:
+            order_graph(n, &ptr[0], entries, <int32_t*>&scratch[0], &order[0], &index[0], &index[n], &index[3 * n + 1],
+                        &index[2 * n + 1])
+    return order_array
 
 
 def body_components(const int32_t[:, ::1] body, int n_bodies):

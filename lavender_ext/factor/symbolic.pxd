@@ -1,4 +1,4 @@
-"""The elimination tree of a lower block pattern, its postorder, and the pattern of its factor."""
+"""An order of elimination and the lower pattern in it, its tree and postorder, and the pattern of its factor."""
 from libc.stdint cimport int32_t
 
 
@@ -78,3 +78,55 @@ cdef inline void postorder_of(int32_t n, const int32_t* parent, int32_t* child, 
                 rank[i] = k
                 k += 1
                 top -= 1
+
+
+cdef inline void lower_of(int32_t n, const int32_t* ptr, const int32_t* near, const int32_t* rank, const int32_t* order,
+                          int32_t* nptr, int32_t* nind) noexcept nogil:
+    """Lower pattern of a graph in an order, the diagonal last in each row."""
+    cdef int32_t k, i, q, to = 0
+    for k in range(n):
+        nptr[k] = to
+        i = order[k]
+        for q in range(ptr[i], ptr[i + 1]):
+            if rank[near[q]] < k:
+                nind[to] = rank[near[q]]
+                to += 1
+        nind[to] = k
+        to += 1
+    nptr[n] = to
+
+
+cdef inline void tree_of(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
+                         int32_t* above) noexcept nogil:
+    # Elimination tree of a lower pattern, ancestors remembered (Liu 1986); above (n) is scratch.
+    cdef int32_t k, q, j, after
+    for k in range(n):
+        parent[k] = -1
+        above[k] = -1
+        for q in range(nptr[k], nptr[k + 1]):
+            j = nind[q]
+            while j >= 0 and j < k:
+                after = above[j]
+                above[j] = k
+                if after < 0:
+                    parent[j] = k
+                j = after
+
+
+cdef inline void postordered(int32_t n, const int32_t* ptr, const int32_t* near, int32_t* order, int32_t* rank, int32_t* nptr,
+                             int32_t* nind, int32_t* parent, int32_t* scratch) noexcept nogil:
+    """An order of a graph with columns of one pattern beside each other, which keeps the fill, and the lower pattern in it.
+
+    scratch (4 n); `parent` is the tree of the order as it came.
+    """
+    cdef int32_t i
+    for i in range(n):
+        rank[order[i]] = i
+    lower_of(n, ptr, near, rank, order, nptr, nind)
+    tree_of(n, nptr, nind, parent, scratch)
+    postorder_of(n, parent, scratch, scratch + n, scratch + 2 * n, scratch + 3 * n)
+    for i in range(n):
+        rank[i] = scratch[3 * n + rank[i]]
+    for i in range(n):
+        order[rank[i]] = i
+    lower_of(n, ptr, near, rank, order, nptr, nind)

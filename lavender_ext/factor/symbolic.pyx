@@ -1,14 +1,14 @@
 """What a pattern alone tells of a factor: elimination trees, patterns of block factors, panels, their rows and places.
 
 Of a sparse matrix rows of one pattern are taken as one vertex, in an order of least degree; of a matrix of blocks each
-block column is one, as they stand. A chain of bodies has its pattern in its own order.
+block column is one, as they stand.
 """
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.factor.minimum_degree cimport degree_order
-from lavender_ext.factor.symbolic cimport block_pattern, block_tree, column_pattern, postorder_of
+from lavender_ext.factor.symbolic cimport block_pattern, block_tree, column_pattern, postordered
 
 
 cdef enum:
@@ -56,39 +56,6 @@ cdef public int32_t lav_node_graph(int32_t count, const int32_t* indptr, const i
     return total
 
 
-cdef public void lav_lower(int32_t n, const int32_t* ptr, const int32_t* near, const int32_t* rank, const int32_t* order,
-                           int32_t* nptr, int32_t* nind) noexcept nogil:
-    """Lower pattern of a graph in an order, the diagonal last in each row."""
-    cdef int32_t k, i, q, to = 0
-    for k in range(n):
-        nptr[k] = to
-        i = order[k]
-        for q in range(ptr[i], ptr[i + 1]):
-            if rank[near[q]] < k:
-                nind[to] = rank[near[q]]
-                to += 1
-        nind[to] = k
-        to += 1
-    nptr[n] = to
-
-
-cdef inline void tree_of(int32_t n, const int32_t* nptr, const int32_t* nind, int32_t* parent,
-                         int32_t* above) noexcept nogil:
-    # Elimination tree of a lower pattern, ancestors remembered (Liu 1986); above (n) is scratch.
-    cdef int32_t k, q, j, after
-    for k in range(n):
-        parent[k] = -1
-        above[k] = -1
-        for q in range(nptr[k], nptr[k + 1]):
-            j = nind[q]
-            while j >= 0 and j < k:
-                after = above[j]
-                above[j] = k
-                if after < 0:
-                    parent[j] = k
-                j = after
-
-
 cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int32_t* indices, int32_t room,
                                      int32_t* scratch, int64_t* left, int32_t* begin, int32_t* order, int32_t* size,
                                      int32_t* nptr, int32_t* nind, int32_t* parent, int32_t* lptr) noexcept nogil:
@@ -115,16 +82,7 @@ cdef public int32_t lav_sparse_order(int32_t n, const int32_t* indptr, const int
     degree_order(count, size, room, near, whole, left, head, order)
     # The quotient graph has used up its lists: once more.
     total = lav_node_graph(count, indptr, indices, node, begin, gptr, near)
-    for i in range(count):
-        rank[order[i]] = i
-    lav_lower(count, gptr, near, rank, order, nptr, nind)
-    tree_of(count, nptr, nind, parent, whole)
-    postorder_of(count, parent, whole, whole + n, whole + 2 * n, whole + 3 * n)
-    for i in range(count):
-        rank[i] = whole[3 * n + rank[i]]
-    for i in range(count):
-        order[rank[i]] = i
-    lav_lower(count, gptr, near, rank, order, nptr, nind)
+    postordered(count, gptr, near, order, rank, nptr, nind, parent, whole)
     for i in range(count):
         size[i] = begin[order[i] + 1] - begin[order[i]]
     block_tree(count, nptr, nind, parent, whole, whole + n, lptr + 1)
@@ -245,56 +203,6 @@ def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):
     cdef int32_t[::1] lind = lind_array, rind = rind_array
     block_pattern(n, &nptr[0], &nind[0], &parent[0], &mark[0], &lptr[0], &rptr[0], &row_count[0], &lind[0], &rind[0])
     return lptr_array, lind_array, rptr_array, rind_array
-
-
-def chain_pattern(const int32_t[:, ::1] body, int n):
-    """As `graph.body_pattern`, bodies in their own order, where each meets its neighbours alone; or None."""
-    cdef int32_t k = <int32_t>body.shape[0], i, a, b
-    for i in range(k):
-        a = body[i, 0]
-        b = body[i, 1]
-        if a >= 0 and b >= 0 and (a - b > 1 or b - a > 1):
-            return None
-    nptr_array, nind_array = np.empty(n + 1, np.int32), np.empty(2 * n + 1, np.int32)
-    node_array, slot_array, turned_array = np.empty((k, 2), np.int32), np.zeros((k, 3), np.int32), np.empty(k, np.int32)
-    cdef int32_t[::1] meets = np.zeros(n + 1, np.int32), nptr = nptr_array, nind = nind_array, turned = turned_array
-    cdef int32_t[:, ::1] node = node_array, slot = slot_array
-    for i in range(k):
-        a = body[i, 0]
-        b = body[i, 1]
-        turned[i] = a < b
-        node[i, 0] = b if a < b else a
-        node[i, 1] = a if a < b else b
-        if node[i, 1] >= 0:
-            meets[node[i, 0]] = 1
-    nptr[0] = 0
-    for i in range(n):
-        nptr[i + 1] = nptr[i] + 1 + meets[i]
-        if meets[i]:
-            nind[nptr[i]] = i - 1
-        nind[nptr[i + 1] - 1] = i
-    for i in range(k):
-        a = node[i, 0]
-        b = node[i, 1]
-        if a >= 0:
-            slot[i, 0] = nptr[a + 1] - 1
-        if b >= 0:
-            slot[i, 1] = nptr[b + 1] - 1
-            slot[i, 2] = nptr[a]
-    return nptr_array, nind_array[:nptr_array[n]].copy(), node_array, slot_array, turned_array
-
-
-def postorder(const int32_t[::1] nptr, const int32_t[::1] nind):
-    """(n,) places that keep the fill and put columns of one pattern beside each other."""
-    cdef int32_t n = <int32_t>nptr.shape[0] - 1
-    cdef int32_t[::1] parent = np.empty(n + 1, np.int32), a = np.empty(n + 1, np.int32), b = np.empty(n + 1, np.int32)
-    cdef int32_t[::1] c = np.empty(n + 1, np.int32)
-    out = np.empty(n, np.int32)
-    cdef int32_t[::1] rank = out
-    if n:
-        block_tree(n, &nptr[0], &nind[0], &parent[0], &a[0], &b[0], &c[0])
-        postorder_of(n, &parent[0], &a[0], &b[0], &c[0], &rank[0])
-    return out
 
 
 def analysed(indptr, indices):

@@ -4,12 +4,12 @@ First what the pattern needs (`index_room`, `lay_pattern`, `make_pattern`), then
 `furnish_bodies`). Six columns stand for a body.
 """
 from libc.math cimport sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.factor.graph cimport body_order, lower_pattern
+from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.panel cimport fill_panel, inertia_root
@@ -19,7 +19,7 @@ from lavender_ext.newton.system cimport BODIES
 
 
 cdef enum:
-    MOST_BODIES = 1500          # whose neighbours bits hold
+    MOST_BODIES = 1500          # whose factor has room as if it were full
 
 
 cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -27,15 +27,12 @@ cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogi
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
         return 0
-    # neighbours twice, eight vectors of bodies and their pivots, the pattern of N and of L, elements
-    return 4 * n * ((n + 63) // 64) + 16 * (n + 1) + (n + k + 1) + n * (n - 1) + 2 + 9 * (k + 1) + own_index(k)
+    # scratch of an order, six vectors of bodies and their pivots, the pattern of N and of L, elements
+    return pattern_room(n, k) + 12 * (n + 1) + (n + k + 1) + n * (n - 1) + 2 + 9 * (k + 1) + own_index(k)
 
 
 cdef struct pattern_t:
-    uint64_t* near
-    uint64_t* given
-    int32_t* degree
-    int32_t* rank
+    int32_t* scratch            # `pattern_room`
     int32_t* parent
     int32_t* mark
     int32_t* nptr
@@ -55,12 +52,9 @@ cdef struct pattern_t:
 
 cdef inline void lay_pattern(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Places in index (`index_room`), which begins at a multiple of 8 bytes."""
-    cdef int64_t n = r.n_bodies, words = (n + 63) // 64, k = p.n_rows
-    a.near = <uint64_t*>index
-    a.given = a.near + n * words
-    a.degree = index + 4 * n * words
-    a.rank = a.degree + n + 1
-    a.parent = a.rank + n + 1
+    cdef int64_t n = r.n_bodies, k = p.n_rows
+    a.scratch = index
+    a.parent = index + pattern_room(n, k)
     a.mark = a.parent + n + 1
     a.nptr = a.mark + n + 1
     a.lptr = a.nptr + n + 1
@@ -88,15 +82,14 @@ cdef inline void make_pattern(const scaled_t* s, pattern_t* a, const rows_t* r) 
         body = r.joint_body + 2 * s.block[i] if c < 0 else r.contact_body + 2 * c
         a.body[2 * i] = body[0]
         a.body[2 * i + 1] = body[1]
-    body_order(k, a.body, n, (n + 63) // 64, a.near, a.given, a.degree, a.rank)
-    lower_pattern(k, a.body, n, (n + 63) // 64, a.given, a.rank, a.degree, a.nptr, a.nind, a.node, a.slot, a.turned)
+    eliminate_bodies(k, a.body, n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.turned)
     block_tree(n, a.nptr, a.nind, a.parent, a.mark, a.rptr + 1, a.lptr + 1)
     a.lptr[0] = 0
     a.rptr[0] = 0
     for i in range(n):
         a.lptr[i + 1] += a.lptr[i]
         a.rptr[i + 1] += a.rptr[i]
-    block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.degree, a.lind, a.rind)
+    block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
 
 
 cdef inline int64_t body_room(const newton_t* s, const pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:

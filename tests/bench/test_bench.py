@@ -169,9 +169,7 @@ def test_the_same_command_goes_on_where_it_was_killed(tmp_path, monkeypatch):
     path.write_bytes(b"".join(lines[:7]) + lines[7][: len(lines[7]) // 2])
     kept = len(bench.read(path))
     made = []
-    monkeypatch.setattr(
-        runner, "measure_impulse", lambda *args: made.append(args[1]) or timing.measure_impulse(*args)
-    )
+    monkeypatch.setattr(runner, "measure", lambda *args: made.append(args[1]) or timing.measure(*args))
     again = bench.run(problems, ["pgs", "direct"], QUICK, path)
     assert [r.key for r in again] == [r.key for r in whole]
     assert len(made) == len(whole) - kept

@@ -60,7 +60,7 @@ def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
     assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
     assert all("after 1 of 5 steps" in s.reason for s in records.skips)
-    monkeypatch.setattr(runner, "measure_impulse", None)  # nothing is solved again
+    monkeypatch.setattr(runner, "measure", None)  # nothing is solved again
     assert bench.run(items, ["pgs"], plan, path).records == records.records
     (line,) = lv.report.advice(records, [1.0])
     assert line.by_time[1.0].best.solved == 1

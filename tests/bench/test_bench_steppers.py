@@ -73,7 +73,7 @@ def test_chaos_is_no_reference(monkeypatch):
 
 def test_the_figure_of_motion(tmp_path):
     points = steppers.measure(["ramp"], ["impulses", "avbd"], [(1, 4), (4, 4)])
-    steppers.plot(points, tmp_path / "motion.svg")
+    steppers.draw(points, tmp_path / "motion.svg")
     text = (tmp_path / "motion.svg").read_text()
     assert "ramp" in text
     assert text.count("<path") > 10

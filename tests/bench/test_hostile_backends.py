@@ -150,19 +150,19 @@ PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="process
 def test_a_backend_that_forks_and_hangs_ends_with_its_child(hostile, watchdog):
     p = stack()
     with Worker(grace=0.5) as worker:
-        assert worker.measure(p, task(p, "x_fork", time_limit=1.5)).status == "KILLED"
+        assert worker.measure(p, task(p, "x_fork", time_limit=1.5))[0].status == "KILLED"
         pids = list(map(int, hostile.read_text().split()))
         assert len(pids) == 2
         assert wait_until(lambda: not any(map(runs, pids)))
-        assert worker.measure(p, task(p, "pgs")).status == "CONVERGED"  # and another worker goes on
+        assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
 
 
 @PROC
 def test_a_child_that_left_the_group_and_keeps_the_pipe_keeps_nobody_waiting(hostile, watchdog):
     p = stack()
     with Worker(grace=0.5) as worker:
-        assert worker.measure(p, task(p, "x_escape", time_limit=1.5)).status == "KILLED"
-        assert worker.measure(p, task(p, "pgs")).status == "CONVERGED"
+        assert worker.measure(p, task(p, "x_escape", time_limit=1.5))[0].status == "KILLED"
+        assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"
     os.kill(int(hostile.read_text()), signal.SIGKILL)
 
 
@@ -245,7 +245,7 @@ def test_a_whole_run_survives_its_backends(hostile, watchdog, monkeypatch):
 def test_memory_is_limited_without_asking(hostile, watchdog):
     p = stack()
     with Worker() as worker:  # 320 GB, untouched: nothing but a limit refuses it
-        record = worker.measure(p, task(p, "x_eat"))
+        record, _ = worker.measure(p, task(p, "x_eat"))
     assert record.status in ("ERROR", "NUMERICAL_ERROR")
     assert "MemoryError" in record.message
     assert worker.memory == machine.memory_share() == max(2**31, machine.memory() // 2)
@@ -257,16 +257,16 @@ def test_memory_is_limited_without_asking(hostile, watchdog):
 def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchdog, how):
     p = stack()
     with Worker(grace=1.0) as worker:
-        record = worker.measure(p, task(p, f"x_{how}"))
+        record, _ = worker.measure(p, task(p, f"x_{how}"))
         assert record.status in ("CRASHED (no answer)", "KILLED")
-        assert worker.measure(p, task(p, "pgs")).status == "CONVERGED"
+        assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"
     assert not hostile.exists()
 
 
 def test_the_verdict_is_of_a_problem_that_the_backend_never_held(hostile, watchdog):
     p = stack()
     with Worker() as worker:
-        record = worker.measure(p, task(p, "x_lie"))
+        record, _ = worker.measure(p, task(p, "x_lie"))
     assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
     assert "says CONVERGED" in record.contradicted
 
@@ -277,8 +277,8 @@ def test_what_a_worker_says_is_what_this_process_says():
     with Worker() as worker:
         for solver, more in (("pgs", {}), ("direct", {}), ("pgs", {"start": "carried"})):
             asked = task(p, solver, **more)
-            far, there = worker.measure_impulse(p, asked, start)
-            near, here = timing.measure_impulse(p, asked, start)
+            far, there = worker.measure(p, asked, start)
+            near, here = timing.measure(p, asked, start)
             np.testing.assert_array_equal(here, there)
             times = {n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace"))}
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)

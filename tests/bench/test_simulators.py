@@ -62,8 +62,9 @@ def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
 def test_ratios_are_geometric_means_by_the_number_of_rows():
     def step(rows, engine, ours, tolerance=1e-8):
         return simulators.Step(
-            "m", 0, rows, 3, "lcp", tolerance, engine, ours, ours / 2, ours / 4, 0.0, 0.0, 0.0, None,
-            prepare=ours / 8, judge=ours / 8,
+            "m", 0, rows, engine, ours, 0.0, 0.0, nv=3, law="lcp", tolerance=tolerance, many=ours / 2, kernel=ours / 4,
+            prepare=ours / 8, judge=ours / 8, strict=0.0, coulomb=None, momentum=0.0, engine_momentum=0.0, energy=0.0,
+            engine_energy=0.0,
         )  # fmt: skip
 
     text = tables.table([step(4, 1e-6, 2e-6), step(5, 1e-6, 8e-6), step(400, 1e-3, 5e-4, 0.0)])

@@ -14,10 +14,11 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import suite
 from lavender.cones import CONTACT_SPIN, ROW
-from lavender.solvers.newton_systems import pattern, sparse, systems
+from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.factor import symbolic
+from lavender_ext.factor.graph import body_pattern
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.solve import Solve
 
@@ -313,16 +314,14 @@ def random_columns(rng, node, n, s):
     return k, whole
 
 
-@pytest.mark.parametrize("few", [0, 1500])
-def test_block_factor_on_a_graph_of_bodies_matches_dense(few, monkeypatch):
+def test_block_factor_on_a_graph_of_bodies_matches_dense():
     rng = np.random.default_rng(3)
     n, s = 12, 3
     body = np.array(
         [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.3] + [(0, -1), (5, -1)], np.int32
     )
-    monkeypatch.setattr(pattern, "FEW_BODIES", few)
-    nptr, nind, node, slot, turned = pattern.block_pattern(n, body)
-    assert np.array_equal(np.sort(node[turned], axis=1), node[turned][:, ::-1])
+    nptr, nind, node, slot, turned = body_pattern(body, n)
+    assert (node[:, 0] > node[:, 1]).all() and 0 < turned.sum() < len(body)
     rank = {tuple(sorted(pair)) for pair in node.tolist()}
     assert len(rank) == len(body)
     m = len(body)
@@ -347,8 +346,7 @@ def test_panels_solve_what_a_dense_matrix_solves_with_the_same_bits_at_any_width
     body = rng.integers(-1, n, (m, 2))
     body = np.ascontiguousarray(body[body[:, 0] != body[:, 1]], np.int32)
     m = len(body)
-    nptr, nind, node, _, _ = pattern.block_pattern(n, body)
-    nptr, nind, node, slot, _ = pattern.postordered(n, node, nptr, nind)
+    nptr, nind, node, slot, _ = body_pattern(body, n)
     structure = nptr, nind, *symbolic.factor_pattern(nptr, nind)
     panels = symbolic.block_panels(*structure[:4], s, few, share)
     assert len(panels[2]) // 2 - 1 < n
@@ -366,18 +364,6 @@ def test_panels_solve_what_a_dense_matrix_solves_with_the_same_bits_at_any_width
     assert len({out.tobytes() for out in outs}) == 1
 
 
-def test_postorder_keeps_the_fill():
-    rng = np.random.default_rng(3)
-    n = 60
-    body = np.ascontiguousarray(rng.integers(0, n, (150, 2)), np.int32)
-    body = body[body[:, 0] != body[:, 1]]
-    nptr, nind, node, _, _ = pattern.block_pattern(n, body)
-    before = symbolic.factor_pattern(nptr, nind)
-    nptr, nind, *_ = pattern.postordered(n, node, nptr, nind)
-    after = symbolic.factor_pattern(nptr, nind)
-    assert sorted(np.diff(before[0])) == sorted(np.diff(after[0]))
-
-
 def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
     problem = wild(seed=239).problem
     rows = problem.rows
@@ -388,21 +374,16 @@ def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
     assert good(solution, 1e-10), solution
 
 
-def test_a_chain_of_bodies_gets_the_pattern_of_any_graph(monkeypatch):
+def test_a_chain_of_bodies_does_not_fill_in():
     rng = np.random.default_rng(5)
-    n = 40
-    low = rng.integers(0, n - 1, 60)
+    n = 2000
+    low = rng.integers(0, n - 1, 4000)
     body = np.stack([low, low + 1], axis=1)
     body[::2] = body[::2, ::-1]
     body[3::9, 1] = -1
     body[5::9, 0] = -1
-    body = np.ascontiguousarray(body, np.int32)
-    monkeypatch.setattr(pattern, "FEW_BODIES", 0)
-    chain = pattern.block_pattern(n, body)
-    assert symbolic.chain_pattern(body, n) is not None
-    monkeypatch.setattr(symbolic, "chain_pattern", lambda *_: None)
-    for one, other in zip(chain, pattern.block_pattern(n, body), strict=True):
-        assert np.array_equal(one, other)
+    nptr, nind, *_ = body_pattern(np.ascontiguousarray(body, np.int32), n)
+    assert symbolic.factor_pattern(nptr, nind)[0][-1] == nptr[n] - n
 
 
 # -- answers ------------------------------------------------------------------------------------------

@@ -153,7 +153,8 @@ def campaign(
         for j, name in enumerate(names)
     ]
     out = Records()
-    with opened(store) as kept, _backend(backend) as name:
+    name, cluster = _backend(backend)
+    with cluster, opened(store) as kept:
         known = {} if kept is None else _finished(kept.records, this.run)
         out.source = str(kept.path) if kept is not None else ""
         done = {p.index: known[p.case, p.solver] for p in pairs if (p.case, p.solver) in known}
@@ -246,9 +247,8 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
             return
 
 
-@contextlib.contextmanager
-def _backend(word: str) -> Iterator[str]:
-    """The name by which joblib knows a backend, once that is ready: "dask=tcp://host:8786" connects to a scheduler.
+def _backend(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
+    """The name by which joblib knows a backend, and what holds the connection to its cluster.
 
     Raises
     ------
@@ -259,9 +259,7 @@ def _backend(word: str) -> Iterator[str]:
 
     name, _, address = word.partition("=")
     if name == "dask":
-        with _dask(address):
-            yield name
-        return
+        return name, _dask(address)
     if name == "ray":
         _ray(address)
     elif name not in BACKENDS or address:
@@ -269,11 +267,11 @@ def _backend(word: str) -> Iterator[str]:
             f"joblib has no backend {word!r}: 'loky' runs processes on this machine, 'dask' or 'dask=ADDRESS' and "
             "'ray' or 'ray=ADDRESS' a cluster"
         )
-    yield name
+    return name, contextlib.nullcontext()
 
 
-@contextlib.contextmanager
-def _dask(address: str) -> Iterator[None]:
+def _dask(address: str) -> contextlib.AbstractContextManager[Any]:
+    """A client of the scheduler, or nothing to hold where there is one already."""
     try:
         import dask
         import distributed
@@ -282,22 +280,18 @@ def _dask(address: str) -> Iterator[None]:
             "backend 'dask' needs distributed: pip install 'lavender-contact[cluster]'"
         ) from None
     address = address or dask.config.get("scheduler-address", "")
-    if not address:
-        try:
-            distributed.get_client()
-        except ValueError:
-            raise InputError(
-                "backend 'dask' needs a scheduler: give dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
-                "distributed.Client first"
-            ) from None
-        yield
-        return
     try:
-        client = distributed.Client(address, timeout=CONNECT)  # type: ignore[no-untyped-call]
+        if address:
+            return distributed.Client(address, timeout=CONNECT)  # type: ignore[no-untyped-call]
+        distributed.get_client()
     except (OSError, ValueError) as error:
-        raise InputError(f"no dask scheduler answers at {address!r} ({error}); start one there") from None
-    with client:
-        yield
+        raise InputError(
+            f"no dask scheduler answers at {address!r} ({error}); start one there"
+            if address
+            else "backend 'dask' needs a scheduler: give dask=tcp://HOST:8786, set DASK_SCHEDULER_ADDRESS, or make a "
+            "distributed.Client first"
+        ) from None
+    return contextlib.nullcontext()
 
 
 def _ray(address: str) -> None:

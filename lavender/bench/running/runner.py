@@ -16,7 +16,7 @@ from lavender.bench import machine
 from lavender.bench.cases import Item, Source, describe, resolve
 from lavender.bench.record import CaseInfo, Record, Run, Skip, asked_of
 from lavender.bench.running.plan import Plan, passes
-from lavender.bench.running.timing import Ask, Task, measure_impulse, one_thread
+from lavender.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.bench.running.worker import Worker
 from lavender.bench.store import Records, Store, opened
 from lavender.errors import LavenderError
@@ -307,9 +307,9 @@ class Runner:
     def make(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         """The record of a task, made here or in the worker, and the impulses (m,) [N s] that came out, or None."""
         if self.worker is not None and is_foreign(spec):
-            record, found = self.worker.measure_impulse(replace(problem, copy=False), task, impulse)
+            record, found = self.worker.measure(replace(problem, copy=False), task, impulse)
         else:
-            record, found = measure_impulse(problem, task, impulse)
+            record, found = measure(problem, task, impulse)
         return with_motion(record, problem, found) if self.plan.motion else record, found
 
 

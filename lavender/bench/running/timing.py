@@ -157,24 +157,24 @@ class Outcome:
     reached: tuple[float, ...] = ()  # relative residual of each repeat, in mode "time"
 
 
-def measure(problem: Problem, task: Task) -> Record:
+def measure(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
     """Make one measurement; what the solver raises becomes a record of status ERROR.
+
+    Parameters
+    ----------
+    problem : Problem
+    task : Task
+    impulse : (m,) N s, optional
+        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
+
+    Returns
+    -------
+    Record, and the impulses (m,) [N s] that came out, or None
 
     Raises
     ------
     KeyboardInterrupt
         Ctrl-C; nothing is recorded.
-    """
-    return measure_impulse(problem, task)[0]
-
-
-def measure_impulse(problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
-    """As `measure`, with the impulses (m,) [N s] that came out, or None.
-
-    Parameters
-    ----------
-    impulse : (m,) N s, optional
-        Start, for `start="carried"`. "cold" starts from Pi(0), "warm" from the problem's guess.
     """
     return judged(problem, task, attempt(problem, task, impulse))
 

@@ -48,14 +48,8 @@ class Worker:
         self._process = Process(_SERVED, self.memory or 0, environment=_ONE_THREAD)
         self._holds = ""
 
-    def measure(self, problem: Problem, task: Task) -> Record:
+    def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
         """As `lavender.bench.running.timing.measure`, in the worker."""
-        return self.measure_impulse(problem, task)[0]
-
-    def measure_impulse(
-        self, problem: Problem, task: Task, impulse: Any = None
-    ) -> tuple[Record, FloatArray | None]:
-        """As `lavender.bench.running.timing.measure_impulse`, in the worker."""
         process = self._process
         if not process.alive:
             self._holds = ""

@@ -1,6 +1,5 @@
 """Newton's method in parts; `lavender/solvers/newton.py` puts them together.
 
-pattern          order of elimination over bodies
 systems          what is factored, over the bodies or over the rows of A, and its compiled solve
 sparse           matrices of few entries, for that
 augmented        rows that nearly depend on each other, likewise

@@ -17,9 +17,9 @@ from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.augmented import Augmented
-from lavender.solvers.newton_systems.pattern import block_pattern, postordered
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import symbolic
+from lavender_ext.factor.graph import body_pattern
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Solve
 
@@ -106,13 +106,10 @@ class VelocitySystem(System):
     def _analyse(self, n: int, bodies: IntArray) -> None:
         """Order of elimination and pattern of the factor."""
         s = self.s
-        nptr, nind, node, slot, turned = block_pattern(n, bodies)
+        nptr, nind, node, slot, turned = body_pattern(bodies, n)
         structure = symbolic.factor_pattern(nptr, nind)
         self.cost = factor_cost(structure[0], s)
         if self.cost >= PANELS:
-            nptr, nind, node, slot, again = postordered(n, node, nptr, nind)
-            turned = (turned != again).astype(np.int32)
-            structure = symbolic.factor_pattern(nptr, nind)
             self.panels = symbolic.block_panels(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
         self.structure = (nptr, nind, *structure)
         self.pattern = (bodies, node, slot, turned)
