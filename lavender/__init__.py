@@ -1,7 +1,16 @@
-"""lavender: the constraint problem of one rigid-body step, solved by the solver you name, and judged.
+"""lavender solves the constraint problem of one rigid-body time step with the solver you name, and judges the result.
 
-Scenes, the engine, files, cases and reports are imported at their first use: `lavender.Scene`,
-`lavender.io`, `lavender.suite`, `lavender.bench`, `lavender.report`.
+    problem = lavender.Problem.lcp(A, b)            # A [1/kg], b [m/s]; or contact, linear, from_rows, from_jacobian
+    solution = lavender.solve(problem, tol=1e-8)    # by `auto`, or lavender.solve(problem, "pgs", ...)
+    solution.impulse, solution.residual.relative    # [N s], [-]
+
+Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
+Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
+Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the data), `motion_error`, `redundancy`
+Engine     `Scene`, `Simulation`
+Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
+
+Submodules and the engine are imported at their first use.
 """
 
 import lavender._starting  # noqa: I001 - first: Ctrl-C from here on

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 class Derived:
-    """Numbers that a problem keeps beside its data; a field is None as long as nobody has asked for it.
+    """Numbers that a problem keeps beside its data; a field is None until it is first needed.
 
     Every field is written whole and read once, so threads that share a problem see a value or None; two that find
     None work out the same numbers, to the bit.

@@ -86,33 +86,34 @@ def check_shape(name: str, shape: Any) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Cones:
-    """Bounds of every block (k of them, m rows): `bounded`, `free`, `contacts`, and sums of these.
+    """Bounds of k blocks with m rows. Made by `Cones.free`, `Cones.bounded` and `Cones.contacts`; `+` joins them.
 
     Parameters
     ----------
     ptr : (k + 1,) int
-        First row of each block, then m.
+        First row of each block, followed by m.
     kind : (k,) int
         ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING or CONTACT_ELLIPSE of each block.
     lower, upper : (m,) N s
-        Bounds of rows on ROW blocks; infinite ones are allowed, those of contacts are not read.
+        Bounds of the rows of ROW blocks, possibly infinite. Those of contacts are not read.
     mu : (k,) -
         Coefficient of friction of each contact.
     patch_radius : (k,) m
-        Of contacts with spin: their spin row is bounded by mu r lambda_n [N m s]. Of CONTACT_BOX and CONTACT_ELLIPSE
+        Contacts with spin: r; their spin row is bounded by mu r lambda_n [N m s]. CONTACT_BOX and CONTACT_ELLIPSE:
         mu_2 / mu_1 [-].
     rolling : (k,) m, optional
-        mu_r of CONTACT_ROLLING: what rolls is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier, Viano 2023.
+        mu_r of CONTACT_ROLLING: the rolling impulse is bounded by mu_r lambda_n [N m s]; default 0. Acary, Bourrier,
+        Viano 2023.
 
     Raises
     ------
     InputError
-        Shapes that do not fit, lower > upper, NaN bounds, negative mu, patch radius or mu_r, a contact with
-        more rows than normal, two tangents and spin, a round cone of more than five tangents.
+        Shapes that do not fit; lower > upper or NaN bounds; a negative mu, patch radius or mu_r; a contact with more
+        rows than its kind has; a round cone of more than five tangents.
 
     Examples
     --------
-    A hinge of five rows, a motor that gives at most 2 N s, two contacts of a normal and two tangents:
+    A hinge of five rows, a motor of at most 2 N s, and two contacts of one normal and two tangents each:
 
     >>> import lavender as lv
     >>> cones = lv.Cones.free(5) + lv.Cones.bounded([-2.0], [2.0]) + lv.Cones.contacts(0.5, count=2)

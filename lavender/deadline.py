@@ -1,4 +1,4 @@
-"""When a run must have ended: the one clock of solvers, asked between their steps."""
+"""The deadline of a solve: the only clock of solvers, read between their steps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from time import perf_counter
 
 __all__ = ["CHUNK_TIME", "Deadline", "Stopwatch"]
 
-CHUNK_TIME = (
-    0.01  # s between two looks at the clock; five times that is still below what a person notices on Ctrl-C
-)
+CHUNK_TIME = 0.01  # s between two readings of the clock; five times that is still unnoticeable after Ctrl-C
 
 
 class Stopwatch:
-    """What a step takes: the seconds since it was made."""
+    """Measures a step: seconds since this object was made."""
 
     __slots__ = ("_start",)
 
@@ -27,7 +25,7 @@ class Stopwatch:
 
 
 class Deadline:
-    """`limit` [s] from now, or never."""
+    """A moment `limit` [s] from now, or never."""
 
     __slots__ = ("_at",)
 
@@ -40,7 +38,7 @@ class Deadline:
         return self._at < math.inf
 
     def passed(self, step: float = 0.0) -> bool:
-        """Whether a step of so many seconds, begun now, would end after it."""
+        """Whether a step of so many seconds, begun now, would end after the deadline."""
         return self._at < math.inf and perf_counter() + step >= self._at
 
     def left(self, least: float = 0.0) -> float | None:

@@ -1,7 +1,7 @@
-"""Solvers of others: what they are handed is a copy, and what comes back is checked whole before anybody reads it.
+"""Wrapper for solvers of other packages: they get copies, and everything that they return is checked.
 
-A plug-in may keep the arrays that it was given, change them later, or claim what is no claim. Its problem, its impulse
-and its answer are its own: none of them is the caller's, and none is what the judge reads.
+A plug-in may keep the arrays that it was given, change them later, or return an invalid claim. So it works on copies of
+the problem and of the impulse; the caller and the judge never read its arrays.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["Foreign"]
 
 
 class Foreign:
-    """A solver of the name, as `lavender.registry` describes one, behind this door."""
+    """A solver of another package with the interface of `lavender.registry`, wrapped."""
 
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
@@ -34,7 +34,7 @@ class Foreign:
             self.until = lambda held, deadline: solver.until(held.state, deadline)
 
     def prepare(self, problem: Problem) -> Held:
-        """Factor, colour, allocate, of a problem of its own."""
+        """Factor, colour, allocate, for a copy of the problem."""
         return Held(problem, self.solver.prepare(_private(problem)))
 
     def update(self, held: Held, problem: Problem) -> Held:
@@ -44,7 +44,7 @@ class Foreign:
     def run(
         self, held: Held, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        """`max_iter` more iterations on an impulse of its own; what it ends with is copied."""
+        """`max_iter` more iterations on a copy of the impulse; the result is copied back."""
         handed = impulse.copy()
         kept = False
         try:
@@ -59,7 +59,7 @@ class Foreign:
         return self._checked(claim, wrong, len(impulse))
 
     def _checked(self, claim: Any, wrong: str, m: int) -> Claim:
-        """The claim with what belongs into each of its fields, or one that says what is wrong."""
+        """The claim with every field checked, or a NUMERICAL_ERROR that says what is wrong."""
         if type(claim) is not Claim:
             wrong = wrong or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
             return Claim(Status.NUMERICAL_ERROR, 0, {}, f"solver {self.name!r} {wrong}")
@@ -97,14 +97,14 @@ class Foreign:
 
 
 class Held:
-    """What `prepare` of a foreign solver returned, with the problem that its answers are judged on."""
+    """What `prepare` of the wrapped solver returned, with the problem by which its results are judged."""
 
     def __init__(self, problem: Problem, state: Any) -> None:
         self.problem, self.state = problem, state
 
     @property
     def best(self) -> tuple[float, FloatArray] | None:
-        """The iterate that it takes for its best, judged here; None where it has none, or none of finite numbers."""
+        """Its best iterate by its own account, judged here; None if it has none, or none of finite numbers."""
         found = getattr(self.state, "best", None)
         if not isinstance(found, tuple) or len(found) != 2 or not isinstance(found[1], np.ndarray):
             return None
@@ -115,7 +115,7 @@ class Held:
 
     @property
     def sweeps_per_decade(self) -> float:
-        """What it says of its pace; NaN where that is no number."""
+        """Its `sweeps_per_decade`; NaN if that is not a number."""
         found = getattr(self.state, "sweeps_per_decade", math.nan)
         return float(found) if isinstance(found, (int, float, np.number)) and found > 0.0 else math.nan
 
@@ -125,7 +125,7 @@ def _counts(n: Any) -> bool:
 
 
 def _private(problem: Problem) -> Problem:
-    """The same problem in arrays that nobody else reads."""
+    """A copy of the problem with arrays of its own."""
     made = replace(
         problem,
         cones=deepcopy(problem.cones),
@@ -133,5 +133,5 @@ def _private(problem: Problem) -> Problem:
         generalized=deepcopy(problem.generalized),
         copy=True,
     )
-    reference(made)  # of the judge, which nobody can set any more
+    reference(made)  # the judge's norms, fixed before the solver sees the copy
     return made

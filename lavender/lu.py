@@ -1,7 +1,8 @@
-"""SuperLU by one door, which keeps out what has no LU whatever its entries are.
+"""The only call of SuperLU; it refuses structurally singular matrices.
 
-A square matrix some of whose rows have entries in too few columns between them is singular for any values. SuperLU
-reads and writes outside its arrays on some of these before it can say so (SciPy 1.17), which may end the interpreter.
+A square matrix is structurally singular if some of its rows together have entries in too few columns; it is then
+singular for any values. SuperLU (SciPy 1.17) reads and writes outside its arrays on some of these, which may crash the
+interpreter.
 """
 
 from __future__ import annotations
@@ -14,11 +15,11 @@ __all__ = ["sparse_lu"]
 
 
 def sparse_lu(matrix: Any, **options: Any) -> Any:
-    """SuperLU's factor of a square sparse matrix (n, n), n > 0; RuntimeError where it is singular."""
+    """SuperLU's factor of a square sparse matrix (n, n), n > 0; RuntimeError if it is singular."""
     from scipy.sparse.linalg import splu  # 0.1 s to import, needed only here
 
     a = sp.csc_array(matrix)
-    # A diagonal without a gap is one entry for every row and column.
+    # A full diagonal gives every row and column an entry of its own.
     if not a.diagonal().all() and sp.csgraph.structural_rank(sp.csr_array(a)) < a.shape[0]:
         raise RuntimeError("the matrix is singular whatever its entries are")
     return splu(a, **options)

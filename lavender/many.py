@@ -1,8 +1,8 @@
 """Many problems in one call: the results of `solve` on each, with the same bits.
 
-Problems in generalised coordinates go through one compiled loop without the interpreter, those of few rows each through
-its own compiled call; what that leaves, and every other problem, is solved one by one. Solutions are put in words when
-somebody asks.
+Problems in generalised coordinates are solved in one compiled loop without the interpreter, small problems by one
+compiled call each. Problems that these do not solve, and all others, are solved one by one. The descriptive fields of
+a solution (claim, counts, names) are made when they are first read.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ def solve_many(
     max_iter: int | None = None,
     **options: Any,
 ) -> list[Solution]:
-    """Solve every problem; the same bits as `solve` on each, whatever the number of threads.
+    """Solve many problems, with the bits of `solve` on each for any number of threads.
 
     Parameters
     ----------
     problems : iterable of Problem
     solver : str
     impulses : sequence of (m,) N s, optional
-        Warm start of each problem, None where it has none; default: as `solve`.
+        Warm start of each problem, None for a problem without one; default: as `solve`.
     threads : int
         Problems solved at the same time.
     tol, max_iter, **options
@@ -55,7 +55,8 @@ def solve_many(
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, `impulses` of another length than `problems`, `impulse`, or as `solve`.
+        `threads` is not a whole number from 1, `impulses` has another length than `problems`, `impulse` was given, or
+        as `solve`.
     UnknownName, CapabilityError, SolverUnavailable
         As `solve`, for the first problem that is refused.
     KeyboardInterrupt

@@ -30,8 +30,20 @@ from lavender_ext.core.order import (
     graph_colors,
     stable_order,
 )
+from lavender_ext.factor.graph import matrix_components
 
-__all__ = ["ENGINE_ORDERS", "ORDERS", "Order", "block_order", "body_ranks", "colors", "levels", "local_order"]
+__all__ = [
+    "ENGINE_ORDERS",
+    "ORDERS",
+    "Order",
+    "block_order",
+    "blocks_of_each",
+    "body_ranks",
+    "colors",
+    "levels",
+    "local_order",
+    "rows_of_each",
+]
 
 # The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
@@ -129,12 +141,6 @@ def _by_key(key: IntArray, split: int) -> tuple[IntArray, IntArray]:
     return np.concatenate(parts).astype(np.int32), np.concatenate(starts).astype(np.int32)
 
 
-def _block_bodies(problem: Problem) -> IntArray:
-    rows = problem.rows
-    assert rows is not None
-    return np.ascontiguousarray(np.concatenate([rows.joint_body, rows.contact_body]), np.int32)
-
-
 def levels(problem: Problem, ground: Any = None) -> IntArray:
     """Level (k,) of each block: distance from the static bodies, or from the blocks `ground` through A."""
     k = problem.n_blocks
@@ -143,7 +149,7 @@ def levels(problem: Problem, ground: Any = None) -> IntArray:
             raise InputError(
                 "ground= is for problems given as a matrix; with rows the static bodies are known"
             )
-        return body_order_levels(_block_bodies(problem), problem.rows.n_bodies)
+        return body_order_levels(problem.rows.block_bodies, problem.rows.n_bodies)
     if ground is None:
         raise CapabilityError(
             "levels of a matrix need ground=: the blocks that touch the ground (with rows they are known)"
@@ -177,7 +183,7 @@ def body_ranks(problem: Problem) -> IntArray:
     assert problem.rows is not None
     n = problem.rows.n_bodies
     own = np.arange(n, dtype=np.int32)
-    pair = _block_bodies(problem)
+    pair = problem.rows.block_bodies
     pair = pair[(pair >= 0).all(axis=1)]
     if not len(pair) or np.abs(pair[:, 0] - pair[:, 1]).mean() <= NEAR:
         return own
@@ -195,7 +201,7 @@ def local_order(problem: Problem) -> IntArray:
         graph = sp.csr_matrix(_block_graph(problem))
         return np.ascontiguousarray(sp.csgraph.reverse_cuthill_mckee(graph, symmetric_mode=True), np.int32)
     rank = np.append(body_ranks(problem), np.int32(-1))
-    pair = rank[_block_bodies(problem)]
+    pair = rank[problem.rows.block_bodies]
     low, high = pair.min(axis=1), pair.max(axis=1)
     low = np.where(low < 0, high, low)  # on a static body: with the contacts of the other
     is_contact = np.arange(problem.n_blocks) >= problem.rows.n_joints
@@ -208,7 +214,7 @@ def colors(problem: Problem) -> IntArray:
     Blocks of one colour share no moving body (rows), or no entry of A (matrix).
     """
     if problem.rows is not None:
-        return body_colors(_block_bodies(problem), problem.rows.n_bodies)
+        return body_colors(problem.rows.block_bodies, problem.rows.n_bodies)
     graph = _block_graph(problem)
     k = problem.n_blocks
     return graph_colors(
@@ -217,6 +223,20 @@ def colors(problem: Problem) -> IntArray:
         graph.indptr.astype(np.int32),
         graph.indices.astype(np.int32),
     )
+
+
+def rows_of_each(problem: Problem, ptr: IntArray) -> list[IntArray]:
+    """Rows of each island of A, in order; those from ptr[i] to ptr[i + 1] belong together whatever A says."""
+    part = np.repeat(np.arange(len(ptr) - 1, dtype=np.int32), np.diff(ptr))
+    indptr, indices, _ = problem._compressed
+    count, label = matrix_components(ptr, part, indptr, indices)
+    return blocks_of_each(count, label[part])
+
+
+def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
+    """Blocks of each island, in order, from the island of each block (k,)."""
+    order = np.argsort(label, kind="stable").astype(np.int32)
+    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))[:count]
 
 
 def _block_graph(problem: Problem) -> sp.csr_array:

@@ -1,4 +1,4 @@
-"""What became of a run: the claim of a solver held against the judge, and both as a `Solution`."""
+"""The outcome of a solve: compares the solver's claim with the judge's residual and makes the `Solution`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def finish(
     history: History | None,
     sweeps_per_decade: float = math.nan,
 ) -> Solution:
-    """The judge's residual, and the status that it bears out; a claim that it contradicts is told."""
+    """The solution: the judge's residual, the status that it supports, the reason if it contradicts the claim."""
     judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
     status, message = claim.status, claim.message
     relative = judged.relative
@@ -55,14 +55,18 @@ def finish(
         (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
     ):
         status = STALLED
-        message = f"{message}; its test was met on A, as it was formed, alone".removeprefix("; ")
+        message = (
+            f"{message}; its test was met only on A as it was formed, not on the given data".removeprefix(
+                "; "
+            )
+        )
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
         status = FLOOR
     certificate = claim.certificate
     if status is INFEASIBLE and relative <= tol:
         # What meets tol is a solution to tol, whatever can be said of an exact one.
         status, certificate = CONVERGED, None
-        message = f"{message}; the impulse meets tol all the same".removeprefix("; ")
+        message = f"{message}; the impulse meets tol nevertheless".removeprefix("; ")
     contradicted = ""
     if status is CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
@@ -101,13 +105,13 @@ def finish(
 
 
 def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
-    """What a budget that was used up tells, where tol is further away than was done."""
+    """Message for a used-up budget if reaching tol needs more iterations than were done."""
     left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
     if not done < left < math.inf:
         return ""
     return (
-        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol is some {left:.2g} more away; "
-        f"solvers of another kind end sooner: {', '.join(in_one_call(problem))}"
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {left:.2g} more; "
+        f"solvers of another kind may be faster: {', '.join(in_one_call(problem))}"
     )
 
 

@@ -1,4 +1,4 @@
-"""What `auto` would do with a problem, and what it expects that to cost: nothing is run."""
+"""What `auto` would do with a problem, and the cost that it expects; nothing is run."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ __all__ = ["Plan", "explain"]
 
 
 def explain(problem: Problem, tol: float = 1e-6) -> Plan:
-    """The plan of `auto` for a problem: candidates with counted costs, their order, and who is first.
+    """The plan of `auto` for a problem: its candidates, their expected costs, and which runs first. Nothing is solved.
 
     Parameters
     ----------
     problem : Problem
     tol : float, default 1e-6
-        Relative residual that would be asked for.
+        The relative residual that a solve would ask for.
 
     Returns
     -------
     Plan
-        `print` it; `lavender.solve(problem, plan=plan)` goes by it, on problems of the same structure.
+        Print it, or pass it to `lavender.solve(problem, plan=plan)` for problems of the same structure.
 
     Raises
     ------
     InputError
-        Not a problem, or one without rows; `tol` is not above 0.
+        `problem` is not a Problem or has no rows, or `tol` is not above 0.
     CapabilityError
-        `auto` has no candidate that takes the problem.
+        `auto` has no candidate that accepts the problem.
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")

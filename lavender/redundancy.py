@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, IntArray
 from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import CapabilityError, InputError, SolveFailed
+from lavender.ordering import rows_of_each
 from lavender.problem import Problem, check_problem
 from lavender.problem.operators import semidefinite
 from lavender.residuals import residual
@@ -57,7 +58,7 @@ class Redundancy:
     impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
     _scale: FloatArray = field(repr=False)  # (m,) sqrt kg, D^-1/2
     # Rows and orthonormal null basis of D^-1/2 A D^-1/2 on them, of each dense island that has one.
-    _null: tuple[tuple[Places, FloatArray], ...] = field(repr=False)
+    _null: tuple[tuple[IntArray, FloatArray], ...] = field(repr=False)
 
     @property
     def row_names(self) -> tuple[str, ...]:
@@ -175,7 +176,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     m = problem.m
     unique = np.ones(m, bool)
     dependent: list[int] = []
-    null: list[tuple[Places, FloatArray]] = []
+    null: list[tuple[IntArray, FloatArray]] = []
     used, methods = tol, set()
     with np.errstate(all="ignore"):  # what is not finite is told below
         scale = 1.0 / np.sqrt(problem.csr_data.d)
@@ -186,7 +187,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         raise CapabilityError(
             "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
         )
-    for island in _islands(scaled):
+    for island in rows_of_each(problem, np.arange(m + 1, dtype=np.int32)):
         a = scaled[island][:, island]
         sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
         if problem.is_symmetric and len(island) <= DENSE:
@@ -213,15 +214,6 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         _scale=scale,
         _null=tuple(null),
     )
-
-
-def _islands(scaled: sp.csr_array) -> list[Places]:
-    """Rows that hang together, directly or through others."""
-    if not scaled.shape[0]:
-        return []
-    count, label = sp.csgraph.connected_components(scaled, directed=False)
-    sizes = np.bincount(label, minlength=count)
-    return np.split(np.argsort(label, kind="stable"), np.cumsum(sizes)[:-1])
 
 
 def _dense_island(

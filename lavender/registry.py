@@ -1,12 +1,12 @@
-"""Solvers by name: what each can do is data, and each capability is tested on every solver.
+"""Solvers by name. Each has a `SolverSpec`, which lists its capabilities as data; the tests check every one of them.
 
-A solver is an object that holds only its options, made by `SolverSpec.factory(**options)`, with
+A solver is an object that holds only its options. `SolverSpec.factory(**options)` makes it. Its methods:
 
     prepare(problem) -> state         factor, colour, allocate
-    update(state, problem) -> state   the same structure with new numbers, and a fresh start
+    update(state, problem) -> state   for a problem of the same structure with new numbers; a fresh start
     run(state, impulse, max_iter, tol, time_limit) -> Claim
-        `max_iter` more iterations on `impulse` (m,) in place, fewer only when its own test stops it. With
-        `resumable`, n1 then n2 iterations give the bits of n1 + n2 and time_limit is None.
+        do `max_iter` more iterations on `impulse` (m,) in place, fewer only if its own convergence test is met. If
+        `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None
 
 Third parties register through the entry point group "lavender.solvers" (an object that is a
 `SolverSpec`, or a function that returns one) or with `register`.
@@ -50,28 +50,28 @@ class SmallCall(Protocol):
 
 
 class State(Protocol):
-    """What `prepare` returns: anything; the front door asks a resumable solver's state for what it may have."""
+    """What `prepare` returns: any object. `lavender.solve` reads these attributes of a resumable solver, if present."""
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
-        """(relative residual, impulse (m,)) of the best iterate that the solver's own checks saw; (inf, None) before.
+        """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) before.
 
-        Optional, for residuals that rise on the way: where a solve ends at something worse, this is the result.
+        Optional, for solvers whose residual may rise: this is the result if the last iterate is worse.
         """
 
     @property
     def sweeps_per_decade(self) -> float:
-        """Iterations in which the relative residual falls tenfold, by the last checks; NaN where it does not.
+        """Iterations in which the relative residual falls tenfold, by the last checks; NaN if it does not fall.
 
-        Optional, for iterations of equal work.
+        Optional, for solvers whose iterations cost the same.
         """
 
 
 class Solver(Protocol):
     """What a factory returns; see the module.
 
-    A resumable solver whose single steps may be long (factorisations) may have `until(state, deadline)` besides: called
-    before `run` where there is a time limit, a `lavender.deadline.Deadline` after which no such step should end.
+    A resumable solver with long single steps (factorisations) may also have `until(state, deadline)`. It is called
+    before `run` if there is a time limit, with the `lavender.deadline.Deadline` after which no such step should end.
     """
 
     def prepare(self, problem: Problem) -> Any:
@@ -101,20 +101,21 @@ class SolverSpec:
     laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
     summary: str
     reference: str = ""  # paper or manual
-    # Of OPERATORS, those that it reads as they are given; with "matrix" A is formed where another was given.
+    # Forms of A (of OPERATORS) that it reads as given; with "matrix", A is formed from any other form.
     operators: frozenset[str] = frozenset({"rows", "matrix"})
-    exact: bool = False  # finite or to rounding, not to tol
+    exact: bool = False  # ends after finitely many steps or at rounding accuracy, not at tol
     resumable: bool = True
-    impulse: bool = True  # a warm start changes what it does
+    impulse: bool = True  # uses a warm start
     order: bool = False  # takes order= and ground=
     seed: bool = False  # takes seed=
     threads: bool = False  # takes threads=
     callback: bool = True  # takes callback=; needs resumable
     history: bool = True  # records history; needs resumable
-    delegates: bool = False  # may hand over to other solvers: only "auto"
+    delegates: bool = False  # calls other solvers: only "auto"
     round_cones: bool = False  # takes contacts of more than two tangents in one cone
-    # Of "coulomb" and "cone", with which it takes boxes: contacts whose tangents are bounded each by itself. A law that
-    # is not of `laws` besides is taken where there is no disk (of our own, as bounded rows: solvers/polyhedral.py).
+    # Of "coulomb" and "cone", the laws under which it takes boxes: contacts whose tangents are bounded each by
+    # itself. A law that is not in `laws` is taken only without disks (by our own solvers as bounded rows:
+    # solvers/polyhedral.py).
     boxes: frozenset[str] = frozenset()
     rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
     external: bool = False  # another project's code solves; its claims are its own
@@ -122,12 +123,12 @@ class SolverSpec:
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
     requires: tuple[str, ...] = ()  # modules that must be importable
     install: str = ""  # what to install where they are not
-    bounded: str = ""  # of a method for free rows: what to take where rows are bounded
+    bounded: str = ""  # of a solver for free rows: what to use for bounded rows
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
     small: SmallCall | None = (
         None  # problems of few rows with default options, in one compiled call; asked of our own alone
     )
-    own = False  # of this package: others are handed copies, and what they return is checked (`lavender/foreign.py`)
+    own = False  # of this package; other solvers get copies, and what they return is checked (`lavender/foreign.py`)
 
     def __post_init__(self) -> None:
         if (
@@ -209,7 +210,7 @@ class SolverSpec:
         return self.refusal(problem) if self.refusal is not None else None
 
     def load(self) -> Callable[..., Solver]:
-        """The factory, imported now if it was not."""
+        """The factory, imported now if it was not before."""
         if not isinstance(self.factory, str):
             return self.factory
         module, _, attribute = self.factory.partition(":")
@@ -239,7 +240,7 @@ registered: dict[str, SolverSpec] = {}
 
 @cache
 def load() -> None:
-    """Fill `registered` once: what is built in, and what plug-ins offer."""
+    """Fill `registered` once, with the built-in solvers and those of plug-ins."""
     from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
 
     for table in TABLES:
@@ -306,7 +307,7 @@ def get(name: str) -> SolverSpec:
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:
-    """Every solver: None where it can be used here (and takes `problem`), else the reason it cannot."""
+    """Each solver's name with None if it is installed (and accepts `problem`), otherwise with the reason why not."""
     if problem is not None:
         check_problem(problem)
     return {
@@ -316,7 +317,7 @@ def known(problem: Problem | None = None) -> dict[str, str | None]:
 
 
 def available(problem: Problem | None = None, *, law: str | None = None, **capabilities: bool) -> list[str]:
-    """Names of solvers installed here that take `problem`, a law, and have the capabilities.
+    """Names of the installed solvers that accept `problem`, accept the law, and have the capabilities.
 
     >>> from lavender.registry import available
     >>> "pgs" in available(law="lcp", order=True)

@@ -1,4 +1,4 @@
-"""The one judge: how wrong an impulse is, in units, row by row. No solver decides success.
+"""The judge: measures the error of an impulse, in physical units and row by row, independently of the solvers.
 
 With w = A lambda - b recomputed from the problem's data, d = diag(A) (`Problem.d`), e the error of a
 block (an inactive row: w / d, the step that is missing; formulas in `lavender_ext/core/block.pxd`):
@@ -6,33 +6,34 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
     energy    E = sqrt(sum d e^2)                    [sqrt J]
     velocity  V = max sqrt(nu d) |e|                 [m/s]
     relative  max(E / E0, V / V0)                    [-]     E0, V0: E, V of doing nothing, lambda = Pi(0)
-    floor     2^-53 (|A| |lambda| + |b|) put through the same two norms: what rounding lambda to
-              float64 costs; no solver can promise less than about twice that
+    floor     2^-53 (|A| |lambda| + |b|) measured by the same two norms: the error of rounding lambda to
+              float64; no solver can guarantee less than about twice that
     success   relative <= tol
 
 Where rounding A lambda alone costs more than doing nothing and as much as all of b, float64 cannot tell A lambda - b
 from A lambda: the floor is then the relative residual, unless that is more. An impulse that ran away is no solution.
 
-Where doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the
-norms of b stand in for E0 and V0. E sees heavy bodies, V sees light ones.
+If doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the norms of b replace E0
+and V0. E shows errors of heavy bodies, V those of light ones.
 
-An answer made in float32 is held to what it could have been. A number is rounded by at most u = 2^-24 of it, each by
-itself, so squares add up; entry by entry (A^2 is A o A), x = M^-1 J^T lambda, w^2 grows with
+A solution computed in float32 has a floor of its own. Each number is rounded independently by at most u = 2^-24 of
+itself, so the squares of the errors add up. Entry by entry (A^2 is A o A), with x = M^-1 J^T lambda, w^2 grows by
 
     lambda rounded         u^2 A^2 lambda^2                                                                        (1)
     a matrix's A and b     u^2 (A^2 lambda^2 + b^2)                                                                (2)
     J and M^-1 of bodies   u^2 (J^2 x^2 + (J M^-1)^2 J^T^2 lambda^2 + J^2 M^-1^2 (J^T lambda)^2) + (b)             (3)
     J and M                u^2 (J^2 x^2 + (J M^-1)^2 (J^T^2 lambda^2 + M^2 x^2)) + (b)                             (4)
                            (b): u^2 (theta^2 lambda^2 + target^2 + 2 J^2 v*^2), as b = target - J v*
-    lambda read off v+     u^2 A^2 (J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2                                    (5)
+    lambda computed of v+  u^2 A^2 (J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2                                    (5)
 
-(5) where impulses are made by lambda = (target - J v+) / theta, as by engines that minimise over velocities: in
-generalised coordinates, where every row that acts is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
-norms. Numbers that a matrix holds in float32 already cost nothing; forming A and b of J and M in float32 costs about
-what rounding these does.
+(5) counts if impulses are computed by lambda = (target - J v+) / theta, as in engines that minimise over velocities:
+in generalised coordinates, if every active row is soft. The floor is the root of (1) + (2, 3 or 4) + (5) in the two
+norms. A matrix whose numbers are float32 already has no rounding (2); forming A and b from J and M in float32 costs
+about as much as rounding these.
 
-An ellipse is measured as the disk of stretched tangents, `Problem.disk`: energy as it is, velocity along each tangent
-by its share mu_i / max(mu_1, mu_2), its share in what sliding dissipates. e and w come back in the problem's rows.
+An ellipse is measured as the disk of stretched tangents, `Problem.disk`: the energy is unchanged, and the velocity
+along each tangent is weighted by mu_i / max(mu_1, mu_2), its share in the dissipation. e and w are returned in the
+problem's rows.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from lavender_ext.judge import measure
 __all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
 
 FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
-AT_REST = 1e-9  # m/s, V0 below which nobody could tell doing nothing from a solution
+AT_REST = 1e-9  # m/s, V0 below which doing nothing counts as a solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
 CHUNK = 2**22  # numbers of J M^-1 that are formed at once: 32 MB
 
@@ -155,7 +156,7 @@ class Residual:
         return p.disk.metric.weight * np.abs(p.on_disk(self.error))
 
     def __str__(self) -> str:
-        worst = f", worst {self.worst_name} {self.velocity:.2g} m/s" if self.worst_row >= 0 else ""
+        worst = f", worst {self.worst_name} ({self.velocity:.2g} m/s)" if self.worst_row >= 0 else ""
         text = (
             f"relative {self.relative:.2e}, energy {self.energy:.2e} sqrt(J){worst}, floor {self.floor:.1e}"
         )
@@ -235,31 +236,30 @@ def quick(
 
 
 def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None) -> Residual:
-    """Judge an impulse (m,) [N s].
+    """Measure the error of an impulse (m,) [N s]: the judge that every solve uses, for any impulse.
 
     Parameters
     ----------
     problem : Problem
     impulse : (m,) N s
-        Non-finite entries are allowed here and give an infinite relative residual.
+        Entries that are not finite are allowed and give an infinite relative residual.
     precision : {"float64", "float32"}, optional
-        In which the impulse was made: its floor, and with it the verdict. Default: `problem.precision`. The error
-        itself is always measured in float64.
+        Precision in which the impulse was computed. It decides the floor, and with it the verdict. Default:
+        `problem.precision`. The error itself is always measured in float64.
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or holds no numbers; another precision.
+        `impulse` has the wrong length or is not numeric, or `precision` is another word.
 
     Examples
     --------
     >>> import numpy as np
     >>> import lavender as lv
     >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 0.3])
-    >>> exact = np.array([1.7 / 3.0, 0.0])  # of a solver that has missed nothing ...
-    >>> lv.residual(problem, np.float32([0.5, 0.0]), precision="float32").verdict
+    >>> lv.residual(problem, np.float32([0.5, 0.0]), precision="float32").verdict  # the solution
     'at its floor'
-    >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")
+    >>> early = lv.residual(problem, np.float32([0.49, 0.0]), precision="float32")  # 2 % short of it
     >>> early.verdict, early.excess > 1e4
     ('stopped early', True)
     """

@@ -29,53 +29,58 @@ ROUNDED = 1e-5  # above what float32 leaves after some turns, below anything mea
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """J and M^-1 in the layout that sweeps want: joint rows dense, contacts compact.
+    """Bodies, joints and contacts: J and M^-1 in the layout that sweeps read, without forming A.
 
-    Bodies are numbered 0 to n - 1; -1 is static and has no number. The blocks of the problem are the kj joints, then
-    the c contacts. Row of a contact from body a to body b (n normal, t1, t2 = n x t1 tangents, arms from the centres):
-    n.u, t.u with u = v_b + omega_b x arm_b - v_a - omega_a x arm_a, n.(omega_b - omega_a) for spin and
-    t.(omega_b - omega_a) for rolling. An impulse > 0 along n pushes b away from a.
+    Bodies are numbered 0 to n - 1; -1 stands for the static world. The blocks of the problem are the kj joints,
+    followed by the c contacts. A contact between bodies a and b has the normal n from a to b, the tangents t1 and
+    t2 = n x t1, and arms from the bodies' centres to the contact point. Its rows are
+
+        n.u, t1.u, t2.u             u = v_b + omega_b x arm_b - v_a - omega_a x arm_a     [m/s]
+        n.(omega_b - omega_a)       spin, if declared                                     [rad/s]
+        t.(omega_b - omega_a)       rolling, if declared                                  [rad/s]
+
+    A positive impulse along n pushes b away from a.
 
     Parameters
     ----------
     inv_mass : array-like (n,), 1/kg
-        0: a body that moves as it is told, by `v_free` alone.
+        0: a kinematic body, which moves with `v_free` whatever the impulses.
     inv_inertia : array-like (n, 3, 3), 1/(kg m^2)
         In world axes, symmetric, positive semidefinite.
     v_free : array-like (n, 6), m/s and rad/s
         v*: linear and angular velocity at the end of the step without constraint impulses, gravity included.
     jac : array-like (mj, 12), optional
-        Rows of the joints: linear and angular columns of a, then of b.
+        Jacobian rows of the joints: linear and angular columns of body a, then of body b.
     joint_ptr : array-like (kj + 1,) of int, optional
-        First row of each joint, then mj.
+        First row of each joint, followed by mj.
     joint_body : array-like (kj, 2) of int, optional
         Bodies a and b of each joint.
     normal : array-like (c, 3), optional
         Unit vectors from a to b.
     tangent : array-like (c, 3), optional
-        Unit vectors t1, orthogonal to the normal; needed without friction, too.
+        Unit vectors t1, orthogonal to the normal; also needed without friction.
     arm_a, arm_b : array-like (c, 3), m, optional
-        Contact point minus centre of a, of b, in world axes.
+        Contact point minus the centre of a, and of b, in world axes.
     contact_body : array-like (c, 2) of int, optional
         Bodies a and b of each contact.
     copy : bool, default True
-        True leaves the arrays given as they are. False adopts those that fit: they are shared, and marked read-only for
-        the giver, too; inertias are then taken as they are.
+        True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
+        caller and marked read-only, and inertias are not symmetrised.
 
-    Numbers of float32 are widened exactly and taken as what they stand for: normals and tangents off orthogonal unit
-    vectors by up to 1e-5, and inertias off symmetry by as much, are made whole. Where every array of numbers is of
-    float32, so is `precision`, the rows' and their problems'.
+    float32 arrays are converted to float64. Normals and tangents that differ from orthogonal unit vectors by up to 1e-5
+    are corrected, and so are inertias that are asymmetric by as much. If all arrays of numbers are float32, the
+    `precision` of the rows and of their problems is "float32".
 
     Raises
     ------
     InputError
-        Shapes that do not fit, a body that does not exist, a row between a body and itself or two static ones, negative
-        inverse mass, an inertia that is not positive semidefinite, a normal or tangent that is not a unit vector or not
-        orthogonal.
+        Shapes that do not fit; a body that does not exist; a row between a body and itself or between two static ones;
+        a negative inverse mass; an inertia that is not positive semidefinite; a normal or tangent that is not a unit
+        vector, or tangents that are not orthogonal to the normal.
 
     Examples
     --------
-    Three boxes of 1 kg and 1 m on the ground, four contacts under each, after a step of 1/60 s in free fall:
+    A stack of three boxes of 1 kg and 1 m on the ground, with four contacts under each, in a step of 1/60 s:
 
     >>> import numpy as np
     >>> import lavender as lv
@@ -85,7 +90,7 @@ class Rows:
     ...     inv_mass=np.ones(3),
     ...     inv_inertia=np.tile(6.0 * np.eye(3), (3, 1, 1)),  # a cube's moment is m / 6
     ...     v_free=np.tile([0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0], (3, 1)),
-    ...     contact_body=np.repeat([(-1, 0), (0, 1), (1, 2)], 4, axis=0),  # from below to above; -1 is the ground
+    ...     contact_body=np.repeat([(-1, 0), (0, 1), (1, 2)], 4, axis=0),  # a below, b above; -1 is the ground
     ...     normal=np.tile([0.0, 0.0, 1.0], (12, 1)),
     ...     tangent=np.tile([1.0, 0.0, 0.0], (12, 1)),
     ...     arm_a=np.tile(corners + (0, 0, 0.5), (3, 1)),
@@ -96,7 +101,7 @@ class Rows:
     >>> force = solution.impulse.reshape(3, 4, 3) / dt  # N: box, corner, (n, t1, t2)
     >>> force[:, :, 0].sum(axis=1).round(2).tolist()  # the ground carries three boxes, the middle one two
     [29.43, 19.62, 9.81]
-    >>> bool(abs(problem.velocity(solution.impulse)).max() < 1e-8)  # m/s: all of them rest
+    >>> bool(abs(problem.velocity(solution.impulse)).max() < 1e-8)  # m/s: all boxes are at rest
     True
     """
 
@@ -200,6 +205,13 @@ class Rows:
     def n_contacts(self) -> int:
         """Number of contacts, c: the blocks after the joints."""
         return len(self.contact_body)
+
+    @property
+    def block_bodies(self) -> IntArray:
+        """(k, 2) bodies of each block, joints first; -1 is static."""
+        if self.n_joints == 0:
+            return self.contact_body
+        return np.concatenate([self.joint_body, self.contact_body])
 
     def jacobian(self, cones: Cones) -> sp.csr_array:
         """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""

@@ -1,4 +1,4 @@
-"""What comes back from a solve: the iterate, the solver's claim, our residual, and what it cost."""
+"""The result of a solve: the impulse, the solver's claim, the judge's residual, and the cost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn"]
 
 
 class Status(str, Enum):
-    """The solver's claim; the value is its meaning in words."""
+    """The solver's claim about how a solve ended; the value is its meaning in words."""
 
     CONVERGED = "its own test at tol was met"
     FLOOR = "above tol, within twice what rounding to float64 allows"
@@ -44,7 +44,7 @@ class Turn:
 
     solver: str
     work: Mapping[str, int]  # sweeps, factorisations, pivots, ...
-    before: float  # - least relative residual so far, nan where nobody looked
+    before: float  # - least relative residual so far, nan if it was not computed
     after: float
 
 
@@ -110,33 +110,34 @@ class SolverRun:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Solution:
-    """Result of `solve`; returned for every status, with the iterate. `str()` is one line.
+    """Result of `solve`, for every status; it always holds the last iterate. `str()` is a summary on one line.
 
     Parameters
     ----------
     impulse : (m,) N s
         The answer, in the order of the problem's rows.
     residual : Residual
-        How wrong it is, by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
+        Its error, measured by the judge: `relative` [-], `energy` [sqrt J], `velocity` [m/s], the worst row.
     status : Status
-        What the solver claims; `success` and `contradicted` are what the judge says of it.
+        The solver's claim. `success` and `contradicted` are the judge's findings.
     tol : float, -
-        Relative residual asked for.
+        The relative residual that was asked for.
     iterations : int
+        In the solver's own unit.
     work : mapping
-        Sweeps, products, factorisations, pivots: what ran.
+        Counts of sweeps, products, factorisations, pivots, ... that were done.
     setup_time, solve_time : float, s
     solver : SolverRun
-        Name, options, and the form that was solved.
+        Name, options, and the form of the problem that was solved.
     message : str
     history : History or None
         With `history=True`.
     dual : object
         A backend's own multipliers.
     certificate : (m,), or None
-        With INFEASIBLE: why there is no solution.
+        With INFEASIBLE: the proof that there is no solution.
     contradicted : str
-        Why the judge disagrees with `status`; empty where it does not.
+        Why the judge disagrees with `status`; empty if it agrees.
 
     Examples
     --------

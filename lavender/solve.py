@@ -1,8 +1,8 @@
-"""The front door: check the request, run the solver in short chunks, judge what comes back.
+"""`solve` and `prepare`: check the arguments, run the solver in short chunks of iterations, judge the result.
 
-Only this module loops over time: it reads the clock, records history, calls back, and turns Ctrl-C into
-a result. Chunks last about 10 ms and change no result, because every solver's own checks fall at fixed
-iteration counts.
+Between two chunks this module reads the clock, records history, calls the callback, and turns Ctrl-C into a result.
+A chunk lasts about 10 ms. Chunks do not change the result, because every solver checks convergence at fixed numbers
+of iterations.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled s
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
-# What arithmetic on legal numbers may end in: a result, with the solver's last word as its message.
+# Errors of arithmetic on valid numbers: they become a result with the error as its message.
 BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
 INTERRUPTED = Status.INTERRUPTED
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
@@ -71,33 +71,35 @@ def solve(
     callback: Callback | None = None,
     **options: Any,
 ) -> Solution:
-    """Solve a constraint problem with the solver of that name, by default with what `auto` chooses.
+    """Solve a constraint problem with the named solver; the default `auto` chooses and combines solvers.
 
     Parameters
     ----------
     problem : Problem
     solver : str
-        A registered name; `available(problem)` lists those that take the problem here.
+        A registered name; `available(problem)` lists the installed solvers that accept the problem.
     impulse : (m,) N s, optional
-        Warm start. Default: `problem.guess`, else Pi(0), zero clipped to the bounds.
+        Warm start. Default: `problem.guess`, otherwise zero clipped to the bounds.
     tol : float, default 1e-6
-        Relative residual asked for (see `lavender.residuals`). 0 runs exactly `max_iter` iterations.
+        Relative residual to reach: 0 is a solution, 1 is zero impulses (see `lavender.residuals`). `tol=0` runs exactly
+        `max_iter` iterations.
     max_iter : int, optional
-        Budget in the solver's own iterations (sweeps, steps, pivots); default: the spec's.
+        The most iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's spec.
     time_limit : float, optional, s
-        Of solving; checked between chunks. A backend of another package runs in a process of its own, which is kept,
-        and ended at the limit (at twice it where it takes one itself); `isolate=False` runs it here.
+        Limit of the solve time, checked between chunks of iterations. Solvers of other packages run in a separate
+        process, which is kept for later solves and killed at the limit (at twice the limit if the package has a time
+        limit of its own); `isolate=False` runs them in this process.
     history : bool
-        Record iterations, time and residual at fixed counts.
+        Record iterations, time and residual at fixed numbers of iterations.
     callback : callable (iterations, impulse, residual), optional
-        Called where history would be recorded; a true return stops the solve.
+        Called whenever history would be recorded; the solve stops if it returns a true value.
     **options
-        `order`, `ground`, `seed`, `threads` and the solver's own, as its spec lists.
+        `order`, `ground`, `seed`, `threads` and the solver's own options, as listed by its spec.
 
     Returns
     -------
     Solution
-        For every status, with the iterate. Non-convergence is a result, not an exception.
+        Also if the solver did not converge: then it holds the last iterate. See `Solution.status` and `.success`.
 
     Raises
     ------
@@ -106,10 +108,11 @@ def solve(
     SolverUnavailable
         The solver's package is not installed.
     CapabilityError
-        The solver cannot take this problem or option; the message says why.
+        The solver does not accept this problem or option; the message says why.
     InputError
-        Wrong `impulse`, negative or NaN `tol`, `max_iter`, `time_limit`.
+        `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
     """
+    check_problem(problem)  # first, for those who pass A and b
     spec = get(solver)
     if max_iter is None and time_limit is None and callback is None and not (history or options):
         made = solve_small(problem, spec, impulse, tol)
@@ -121,7 +124,7 @@ def solve(
 
 
 def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
-    """Do the part of a solve that does not depend on the iterate: factor, colour, allocate.
+    """Do once the part of a solve that many solves can share: factorisation, colouring, allocation.
 
     Parameters
     ----------
@@ -129,17 +132,18 @@ def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
     solver : str
         Name, as in `solve`.
     **options
-        Of the solver; those of a single call (`tol`, `max_iter`, `impulse`, `time_limit`) belong to `Prepared.solve`.
+        Options of the solver. `tol`, `max_iter`, `impulse` and `time_limit` are arguments of `Prepared.solve`.
 
     Returns
     -------
     Prepared
-        Its `solve(problem2, impulse=..., tol=...)` gives a `Solution` of this problem, or of another with the same
-        structure (blocks, pattern of A or J), as often as wanted; `setup_time` [s] is what preparing took.
+        `prepared.solve(impulse=..., tol=...)` solves this problem; `prepared.solve(problem2, ...)` solves another. If
+        that has the same structure (blocks, sparsity pattern of A or J), the preparation is reused. Both may be called
+        any number of times. `setup_time` [s] is the time that preparing took.
 
     Examples
     --------
-    Ten steps of one structure, each from the impulses (m,) [N s] of the last:
+    Ten steps of one structure, each started from the impulses (m,) [N s] of the step before:
 
     >>> import numpy as np
     >>> import lavender as lv
@@ -157,10 +161,10 @@ def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
 
 
 class Prepared:
-    """A solver ready for a problem; `solve(problem2)` reuses what the structure allows.
+    """A solver prepared for a problem; `solve(problem2)` reuses the preparation if the structure is the same.
 
-    It serves one thread at a time: `solve` while another `solve` of it runs, in another thread or above this
-    one (from its callback), raises `InUse`. Threads share a `Problem` freely, and prepare each their own.
+    It runs one solve at a time: calling `solve` during another `solve`, from another thread or from its callback,
+    raises `InUse`. Threads may share a `Problem`, but each needs a `Prepared` of its own.
     """
 
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
@@ -217,12 +221,12 @@ class Prepared:
         Raises
         ------
         InUse
-            Another call of it has not returned yet.
+            Another call of this object's `solve` has not returned yet.
         """
         if not self._lock.acquire(blocking=False):
             raise InUse(
-                f"this prepared {self.spec.name!r} is solving already, and its state is for one solve at a time: "
-                "make another one for every thread (lavender.prepare)"
+                f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
+                "make one for each thread (lavender.prepare)"
             )
         try:
             plain = max_iter is None and time_limit is None and callback is None and not history
@@ -404,7 +408,7 @@ class _Loop:
         return claim
 
     def _call(self, max_iter: int, time_limit: float | None) -> Claim:
-        """At most so many iterations of the solver; what its arithmetic could not do is a claim."""
+        """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
         try:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
@@ -419,9 +423,9 @@ class _Loop:
         records = self.records is not None or self.callback is not None
         claim = NOTHING_DONE
         if self.time_limit is not None:
-            chunk = 1  # what a solver takes need not be what is counted: over J and M some sweep over A
+            chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
             if hasattr(self.solver, "until"):
-                # Of what cannot be cut into chunks: a factor that would end too late is not begun.
+                # For work that cannot be cut into chunks: a factorisation that would end too late is not begun.
                 self.solver.until(self.state, Deadline(self.time_limit))
         try:
             if records and self._record():
@@ -505,9 +509,9 @@ def next_count(n: int) -> int:
 
 
 def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
-    """What the solver makes of few rows in one compiled call, judged there; None where it leaves that to `Prepared`.
+    """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
 
-    Claim, counts and residual are put in words when somebody asks for them.
+    The fields of claim, counts and residual are made when they are first read.
     """
     small = spec.small
     if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
@@ -515,7 +519,7 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
     if not 0.0 < tol < math.inf:
         return None
     if problem.cones.has_ellipse or (problem.m > SMALL_ROWS and problem.generalized is None):
-        return None  # of islands, which may take long: who hears Ctrl-C asks for these
+        return None  # islands may take long: they are solved where Ctrl-C is heard
     start = perf_counter()
     if impulse is None:
         given = problem.guess
@@ -596,7 +600,7 @@ def check_budget(
         raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
     max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
     if time_limit is not None and (not _is_number(time_limit) or not time_limit > 0.0):
-        raise InputError(f"time_limit is {time_limit!r}; seconds above 0, or None")
+        raise InputError(f"time_limit is {time_limit!r}; a number of seconds above 0, or None, is needed")
     return float(tol), max_iter, None if time_limit == np.inf else time_limit
 
 

@@ -1,15 +1,15 @@
-"""What in a problem looks like a mistake of whoever made it: suspicions, never a refusal.
+"""Possible mistakes in a problem's data, reported as suspicions and never as errors.
 
-A solver takes a normal that points the wrong way as it takes any other, and converges. `diagnose` reads the data
-with the eyes of somebody who knows where such numbers come from:
+A solver converges on a problem with a normal that points the wrong way as on any other. `diagnose` checks relations
+that hold in data of real bodies:
 
     centres     c_b - c_a = arm_a - arm_b, whatever contact of the pair says so; n points from a to b:
                 n.(c_b - c_a) > 0 between bodies without hollows                                        (1)
     size        k^2 = tr(I) / 2m, the radius of gyration, is of the size of the arms                    (2)
     targets     target = b + J v*: zero on tangents, not negative where bodies overlap                  (3)
 
-Every threshold stands off what the built-in suite, the scenes of the gallery, robots and recorded problems hold;
-where another reading of the same numbers would be ordinary (M^-1 read as M), that is part of the suspicion.
+Every threshold keeps a distance from the values in the built-in suite, the scenes of the gallery, robots and recorded
+problems. If the numbers would be ordinary under another reading (M^-1 read as M), the suspicion says so.
 """
 
 from __future__ import annotations
@@ -49,27 +49,27 @@ class Suspicion:
 
 
 def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
-    """What looks like a mistake in a problem's data, or in impulses that a solver found for it.
+    """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
-    Looks at signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys
-    and the guess; solves nothing. A suspicion is no error: hooks have normals against their arms, conveyors targets on
-    tangents. None is no proof either.
+    Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
+    the guess. It solves nothing. A suspicion need not be an error: a hook has normals against its arms, a conveyor has
+    targets on tangents. An empty result proves nothing.
 
     Parameters
     ----------
     problem : Problem
     impulse : (m,) N s, optional
-        A solution to look at; default: the problem's guess.
+        A solution to examine; default: the problem's guess.
 
     Returns
     -------
     tuple of Suspicion
-        Empty where nothing stands out.
+        Empty if nothing is suspicious.
 
     Raises
     ------
     InputError
-        Not a problem, or impulses of another shape.
+        `problem` is not a Problem, or `impulse` has another shape.
 
     Examples
     --------

@@ -5,6 +5,14 @@ import itertools
 import numpy as np
 
 
+def random_bounds(rng, m):
+    """A mix of plain, boxed, upper-only, free and fixed rows."""
+    kind = rng.integers(0, 5, m)
+    return np.choose(kind, [0.0, -1.0, -np.inf, -np.inf, 0.5]), np.choose(
+        kind, [np.inf, 1.0, 0.5, np.inf, 0.5]
+    )
+
+
 def enumerate_lcp(a, b, lower, upper, tol=1e-9):
     """All (lambda, w) that solve the boxed LCP with a nonsingular free block, up to `tol`; n up to 8 or so."""
     sides = [

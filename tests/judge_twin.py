@@ -33,6 +33,31 @@ class Judgement:
     range: float  # largest |log10| of the numbers on the way
 
 
+def norm(x, sqrt=np.sqrt):
+    return abs(x[0]) if len(x) == 1 else sqrt(np.sum(x**2))
+
+
+def project_cone(z, d, bounds, sqrt=np.sqrt):
+    """Nearest point of {|z_g| <= a_g n for each part g} in the metric of d; bounds: (places, a_g) of the parts.
+
+    Its normal part n is where the slope of 1/2 d_n (n - z_n)^2 + sum_g 1/2 d_g (|z_g| - a_g n)+^2 vanishes: each part
+    counts or does not, and the slope of all that do, a line, is the largest there is at its root.
+    """
+    size = [norm(z[at], sqrt) for at, _ in bounds]
+    n = max(0 * d[0], z[0])
+    for counts in list(itertools.product((0, 1), repeat=len(bounds)))[1:]:
+        pull, weight = d[0] * z[0], d[0]
+        for use, (at, reach), t in zip(counts, bounds, size, strict=True):
+            pull, weight = pull + use * d[at[0]] * reach * t, weight + use * d[at[0]] * reach**2
+        n = max(n, pull / weight)
+    out = z.copy()
+    out[0] = n
+    for (at, reach), t in zip(bounds, size, strict=True):
+        if t > reach * n:
+            out[at] = out[at] * (reach * n / t)
+    return out
+
+
 def spec_of(problem):
     """A problem of lavender as plain data."""
     spec = {"operator": problem.operator, "friction": problem.friction, "b": problem.b.tolist()}
@@ -158,9 +183,10 @@ class Problem:
             minv[i, 3:, 3:] = np.array(r["inv_inertia"][i], L)
         minv_size = np.abs(minv)
         soft = np.array(spec.get("compliance", np.zeros(m)), L)
+        self.jac = jac.reshape(m, 6 * n)
         half = np.einsum("mni,nij->mnj", jac, minv)
         half_size = np.einsum("mni,nij->mnj", size, minv_size)
-        self.A = half.reshape(m, 6 * n) @ jac.reshape(m, 6 * n).T + np.diag(soft)
+        self.A = half.reshape(m, 6 * n) @ self.jac.T + np.diag(soft)
         self.size = half_size.reshape(m, 6 * n) @ size.reshape(m, 6 * n).T + np.diag(soft)
         self.A *= np.outer(self.stretch, self.stretch)
         self.size *= np.outer(self.stretch, self.stretch)
@@ -275,25 +301,10 @@ class Problem:
         return e
 
     def _cone(self, k, lam, step):
-        """Error of the projection in the metric of d: each part counts or does not, the normal is the largest."""
-        j, parts = self.cones["ptr"][k], self.parts(k)
-        root = np.sqrt(self.d[j : self.cones["ptr"][k + 1]])
-        y = root * (lam - step)
-        a = [reach * root[at[0]] / root[0] for at, reach in parts]
-        size = [np.sqrt(y[at] @ y[at]) for at, _ in parts]
-        top = max(ZERO, y[0])
-        for some in itertools.product((0, 1), repeat=len(parts)):
-            pull, weight = y[0], L(1.0)
-            for use, slope, t in zip(some, a, size, strict=True):
-                pull, weight = pull + use * slope * t, weight + use * slope * slope
-            top = max(top, pull / weight)
-        e = step.copy()
-        if top != y[0]:
-            e[0] = lam[0] - top / root[0]
-        for (at, _), slope, t in zip(parts, a, size, strict=True):
-            if t > slope * top:
-                e[at] = lam[at] - y[at] * (slope * top / t) / root[at]
-        return e
+        """Error of the projection in the metric of d."""
+        z, d = lam - step, self.d[self.cones["ptr"][k] : self.cones["ptr"][k + 1]]
+        nearest = project_cone(z, d, self.parts(k))
+        return np.where(nearest == z, step, lam - nearest)
 
     def _round(self, k, lam, step):
         """Error of the projection on sum (|y_g| / a_g)^2 <= y_n^2 by bisection on its multiplier."""

@@ -7,10 +7,10 @@ tangent); where a disk slides a square root stands in the equations, and they ho
 """
 
 from fractions import Fraction
-from itertools import product
 from math import isqrt
 
 import numpy as np
+from judge_twin import norm, project_cone
 
 import lavender as lv
 from lavender.cones import ROW
@@ -40,6 +40,24 @@ class Wide:
     @staticmethod
     def rounded(x):
         return x
+
+
+def eliminate(t, columns):
+    """Row echelon form of lists of fractions, in place; the columns that have a pivot."""
+    pivots = []
+    for column in range(columns):
+        row = len(pivots)
+        best = max(range(row, len(t)), key=lambda i: abs(t[i][column]), default=None)
+        if best is None or t[best][column] == 0:
+            continue
+        t[row], t[best] = t[best], t[row]
+        lead = t[row]
+        for i in range(row + 1, len(t)):
+            if t[i][column] != 0:
+                factor = t[i][column] / lead[column]
+                t[i] = [p if q == 0 else p - factor * q for p, q in zip(t[i], lead, strict=True)]
+        pivots.append(column)
+    return pivots
 
 
 class Exact:
@@ -76,22 +94,9 @@ class Exact:
         """A solution of slope x = f by elimination; entries without a pivot are 0."""
         m = len(f)
         t = [[*slope[i], f[i]] for i in range(m)]
-        pivots, row = [], 0
-        for column in range(m):
-            best = max(range(row, m), key=lambda i: abs(t[i][column]), default=None)
-            if best is None or t[best][column] == 0:
-                continue
-            t[row], t[best] = t[best], t[row]
-            lead = t[row]
-            for i in range(row + 1, m):
-                if t[i][column] != 0:
-                    factor = t[i][column] / lead[column]
-                    t[i] = [p if q == 0 else p - factor * q for p, q in zip(t[i], lead, strict=True)]
-            pivots.append(column)
-            row += 1
+        pivots = eliminate(t, m)
         x = np.array([Fraction(0)] * m, object)
-        for r in reversed(range(row)):
-            column = pivots[r]
+        for r, column in reversed(list(enumerate(pivots))):
             x[column] = (t[r][-1] - sum(t[r][k] * x[k] for k in pivots[r + 1 :])) / t[r][column]
         return x
 
@@ -157,10 +162,6 @@ def parts(problem, i, number=float):
     return found
 
 
-def norm(x, numbers):
-    return abs(x[0]) if len(x) == 1 else numbers.sqrt(np.sum(x**2))
-
-
 def solution_in(problem, a, b, numbers):
     """(lambda, w) of the problem with matrix a and right-hand side b; None where no conditions were found to hold."""
     plain = lv.Problem(b.astype(float), problem.cones, a.astype(float), friction=problem.friction)
@@ -197,7 +198,8 @@ def conditions(problem, x, w, d, numbers):
         # A share of the rim decides: on it, what is left of w moves the projection's argument outwards.
         rim = x[j] * numbers.number(1 + 1e-12)
         slides = tuple(
-            bool(norm(z[rows], numbers) > reach * rim) for rows, reach in parts(problem, i, numbers.number)
+            bool(norm(z[rows], numbers.sqrt) > reach * rim)
+            for rows, reach in parts(problem, i, numbers.number)
         )
         modes[j] = "open" if z[j] <= 0 and x[j] <= 0 else slides
     return modes
@@ -235,7 +237,7 @@ def equations(problem, modes, a, x, w, numbers):
         for (rows, reach), slides in zip(parts(problem, i, numbers.number), modes[j], strict=True):
             if not slides:
                 continue
-            size = norm(w[rows], numbers)
+            size = norm(w[rows], numbers.sqrt)
             u = w[rows] / size if size > 0 else 0 * w[rows]
             along = u @ a[rows]
             f[j] -= reach * size
@@ -267,9 +269,9 @@ def holds(problem, modes, a, b, x, w, numbers):
     for i in contacts(problem):
         j, lift = c.ptr[i], 0 * x[0]
         for rows, reach in parts(problem, i, numbers.number):
-            if norm(x[rows], numbers) > reach * x[j] + small:
+            if norm(x[rows], numbers.sqrt) > reach * x[j] + small:
                 return False
-            lift += reach * norm(w[rows], numbers)
+            lift += reach * norm(w[rows], numbers.sqrt)
         if x[j] < -small or w[j] < lift - slow:
             return False
     return True
@@ -285,26 +287,5 @@ def shift_in(problem, a, y, numbers):
     for i in contacts(problem):
         j, end = c.ptr[i], c.ptr[i + 1]
         bounds = [(rows - j, reach) for rows, reach in parts(problem, i, numbers.number)]
-        p[j:end] = project_cone(z[j:end], d[j:end], bounds, numbers)
+        p[j:end] = project_cone(z[j:end], d[j:end], bounds, numbers.sqrt)
     return d * (y - p)
-
-
-def project_cone(z, d, bounds, numbers=Wide):
-    """Nearest point of {|z_g| <= a_g n for each part g} in the metric of d; bounds: (places, a_g) of the parts.
-
-    Its normal part n is where the slope of 1/2 d_n (n - z_n)^2 + sum_g 1/2 d_g (|z_g| - a_g n)+^2 vanishes: each part
-    counts or does not, and the slope of all that do, a line, is the largest there is at its root.
-    """
-    size = [norm(z[at], numbers) for at, _ in bounds]
-    n = 0 * d[0]
-    for counts in product((0, 1), repeat=len(bounds)):
-        pull, weight = d[0] * z[0], d[0]
-        for use, (at, reach), t in zip(counts, bounds, size, strict=True):
-            pull, weight = pull + use * d[at[0]] * reach * t, weight + use * d[at[0]] * reach**2
-        n = max(n, pull / weight)
-    out = z.copy()
-    out[0] = n
-    for (at, reach), t in zip(bounds, size, strict=True):
-        if t > reach * n:
-            out[at] = out[at] * (reach * n / t)
-    return out

@@ -203,6 +203,18 @@ def good(solution, tol=1e-12):
     return solution.residual.relative <= max(tol, 2.0 * solution.residual.floor) and not solution.contradicted
 
 
+def sweeps(problem, name, n, **options):
+    """Impulse after n iterations."""
+    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
+
+
+def warmed(problem, seed):
+    """Targets that are a little different, from the answer; None where there is none."""
+    solution, rng = lv.solve(problem, tol=1e-9), np.random.default_rng(seed)
+    b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
+    return problem.updated(b=b, guess=solution.impulse) if solution.success else None
+
+
 def spd(n, seed=0):
     a = np.random.default_rng(seed).normal(size=(n, n))
     return a @ a.T / n + np.eye(n), np.random.default_rng(seed + 1).normal(size=n)

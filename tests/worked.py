@@ -1,4 +1,4 @@
-"""The examples and the sources, each loaded once for all tests; Python in a process of its own."""
+"""The examples and the sources, each loaded once for all tests; simulations; Python in a process of its own."""
 
 import ast
 import functools
@@ -28,6 +28,16 @@ def syntax_of_package():
     """Path to syntax tree of every file of the package."""
     files = sorted(Path(lavender.__file__).parent.rglob("*.py"))
     return {path: ast.parse(path.read_text(encoding="utf-8")) for path in files}
+
+
+def after(steps, scene, **parameters):
+    """A simulation of a scene, or of one of the gallery by name, that has made so many steps."""
+    simulation = lavender.Simulation(
+        scene if isinstance(scene, lavender.Scene) else lavender.Scene(scene, **parameters)
+    )
+    for _ in range(steps):
+        simulation.step()
+    return simulation
 
 
 def python(*words, status=0, **more):

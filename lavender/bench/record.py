@@ -146,7 +146,7 @@ class CaseInfo(_Texts):
     stored: float = math.nan  # - relative residual of the answer stored beside the problem, an engine's own
     sequence: str = ""  # name of the sequence that this is a step of
     step: int = -1
-    nothing_to_do: bool = False  # doing nothing is right: nobody solves it, nobody fails
+    nothing_to_do: bool = False  # doing nothing is a solution: the case is not ranked
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
     stored_verdict: str = (
         ""  # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
@@ -197,7 +197,7 @@ class Record(_Texts):
     energy: float = math.inf  # sqrt J
     velocity: float = math.inf  # m/s
     floor: float = math.nan  # -
-    motion: float | None = None  # -, relative motion error; None where nobody asked, or where there is none
+    motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
     worst_row: int = -1

@@ -17,19 +17,24 @@ __all__ = ["bench"]
 
 @click.group()
 def bench() -> None:
-    """Our solvers inside your own simulator's steps; files are measured by `lavender report`."""
+    """Measure lavender's solvers inside the steps of your own simulator (`lavender report` measures files)."""
 
 
 @bench.command("mujoco")
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--steps", default=10, show_default=True, help="problems of each model")
-@click.option("--every", default=20, show_default=True, help="steps of the simulator between two problems")
+@click.option("--steps", default=10, show_default=True, help="Problems of each model.")
+@click.option("--every", default=20, show_default=True, help="Simulation steps between two problems.")
 @click.option(
-    "--warm", default=0, show_default=True, help="and so many consecutive steps of each model, warm"
+    "--warm",
+    default=0,
+    show_default=True,
+    help="Also measure this many consecutive steps of each model, warm-started.",
 )
-@click.option("--out", type=click.Path(path_type=Path), help="every problem's numbers, JSON lines")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Write the numbers of every problem as JSON lines."
+)
 def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
-    """Our Newton and MuJoCo's on the steps of your own models (MJCF files), in one run."""
+    """Measure lavender's `newton` beside MuJoCo's Newton solver on steps of your own models (MJCF files)."""
     one_thread()
     try:
         import mujoco as mj

@@ -12,12 +12,15 @@ __all__ = ["cases"]
 @click.command()
 @click.argument("pattern", default="")
 @click.option(
-    "--size", is_flag=True, help="Make each with its defaults and say how many rows it has, seconds."
+    "--size",
+    is_flag=True,
+    help="Build each with its defaults and print its number of rows and the seconds that this took.",
 )
 def cases(pattern: str, size: bool) -> None:
-    """Families of the built-in suite: parameters, defaults, and why they are there.
+    """List the families of the built-in suite: parameters, defaults, purpose.
 
-    PATTERN leaves those whose name or words hold it. A case is a family with parameters: "pyramid(k=20)".
+    PATTERN selects families whose name or description contains it. A case is a family with parameters:
+    "pyramid(k=20)".
     """
     from lavender.errors import UnknownName
     from lavender.suite.case import FAMILIES, spell

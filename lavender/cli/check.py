@@ -22,9 +22,11 @@ __all__ = ["check"]
 
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--solvers", type=Names(), help="Solvers by name; all that take the problem if not given.")
-@click.option("--reference", default="osqp", show_default=True, help="Whose answer to compare with.")
-@click.option("--tol", type=float, default=1e-6, show_default=True)
+@click.option("--solvers", type=Names(), help="Solvers by name; default: all that accept the problem.")
+@click.option(
+    "--reference", default="osqp", show_default=True, help="Solver whose answer the others are compared with."
+)
+@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @precision_option
 @click.pass_context
 def check(
@@ -35,15 +37,16 @@ def check(
     tol: float,
     precision: str | None,
 ) -> None:
-    """Compare solvers with a reference and with the judge.
+    """Compare solvers with a reference solver, and their claims with the judge.
 
-    Of an answer stored in a file it is said whether it stands at the floor of its precision or stopped early.
-    A records.jsonl of somebody's report is verified anew, on the problems that are named after it or else where it
-    says: verdicts must agree, times are shown beside each other.
+    A solution stored in a file is judged too: is it at the floor of its precision, or did its solver stop early?
 
-    Exits with 1 when a claim is contradicted, a verdict or problem of a records.jsonl is another one here, a file met
-    in a folder cannot be read or, with --precision, a stored answer is not at its floor; with 2 when a file that was
-    named cannot be read, or --precision finds no answer.
+    A records.jsonl of a report is verified: each run is repeated on the problems named after it (default: where the
+    records say). Verdicts must agree; times are shown side by side.
+
+    Exit code 1: a claim is contradicted; a verdict or problem differs from the records.jsonl; a file in a folder
+    cannot be read; or, with --precision, a stored solution is not at its floor. Exit code 2: a named file cannot be
+    read, or --precision finds no stored solution.
     """
     from lavender import bench
     from lavender.check import cross_check

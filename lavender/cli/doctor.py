@@ -16,12 +16,14 @@ __all__ = ["doctor"]
 
 @click.command()
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--json", "as_json", is_flag=True, help="Everything as JSON, for a report of a bug.")
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON, for a bug report.")
 def doctor(files: tuple[str, ...], as_json: bool) -> None:
-    """Versions, processor, compiler, backends, and a self-test of bits. Status 1 where bits differ.
+    """Print versions, processor, compiler and backends, and run a self-test; or look for mistakes in problems.
 
-    With problems: what in their data looks like a mistake of whoever made it (flipped normals, masses for their
-    inverses, rows out of order, ...). Status 1 where anything does.
+    Without arguments, exit code 1: the self-test gives other bits than on other machines.
+
+    With problems, print what looks like a mistake in their data (flipped normals, masses in place of their
+    inverses, rows out of order, ...). Exit code 1: there is a suspicion.
     """
     if files:
         _suspect(files, as_json)

@@ -49,7 +49,10 @@ class Commands(click.Group):
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="lavender")
 def cli() -> None:
-    """Constraint solvers of rigid-body simulation: any solver by name, its error in units, its cost."""
+    """Solve and compare constraint problems of rigid-body simulation: any solver by name, its error, its cost.
+
+    Problems are files (.npz, .hdf5), folders of them, or cases of the built-in suite such as "stack(n=64)".
+    """
 
 
 def main(args: Sequence[str] | None = None) -> None:

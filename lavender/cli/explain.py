@@ -11,14 +11,17 @@ __all__ = ["explain"]
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual asked for.")
+@click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @click.option(
-    "--json", "as_data", is_flag=True, help="As data, one plan a line, for `lavender.solve(..., plan=)`."
+    "--json",
+    "as_data",
+    is_flag=True,
+    help="Print one plan per line as JSON, for `lavender.solve(..., plan=)`.",
 )
 def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
-    """What auto would do with problems (files, folders or cases of the suite), and what it expects that to cost.
+    """Print what `auto` would do with problems (files, folders or cases of the suite), and the expected costs.
 
-    Nothing is run. Costs are counted from the structure of a problem, with rates that are the same everywhere.
+    Nothing is solved. Costs are counted from the structure of a problem, with the same rates on every machine.
     """
     from lavender.bench.cases import resolve
     from lavender.plan import explain as plan_of

@@ -16,13 +16,13 @@ __all__ = ["export"]
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
 @click.option(
     "--for", "records", type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="records.jsonl of a report: with the solver it recommends, its settings and test vectors (c alone).",
+    help="records.jsonl of a report: add its recommended solver, settings and test vectors (only with c).",
 )  # fmt: skip
-@click.option("--solver", help="With --for: this solver of the records, not the recommended one.")
-@click.option("--vectors", default=4, show_default=True, help="With --for: problems at most.")
+@click.option("--solver", help="With --for: use this solver of the records, not the recommended one.")
 @click.option(
-    "--replace", is_flag=True, help="Replace files of ours that are others than what would be written."
+    "--vectors", default=4, show_default=True, help="With --for: the most problems in the test vectors."
 )
+@click.option("--replace", is_flag=True, help="Overwrite files of an earlier export that differ.")
 @click.pass_context
 def export(
     context: click.Context,
@@ -33,7 +33,7 @@ def export(
     vectors: int,
     replace: bool,
 ) -> None:
-    """Write the kernels for an engine outside Python: a C library with one header, Rust crates, an npm package."""
+    """Write the kernels for use without Python: a C library with one header, Rust crates, or an npm package."""
     from lavender.export import library
     from lavender.export import vectors as chosen
 

@@ -172,7 +172,7 @@ def was_given(context: click.Context, name: str) -> bool:
 
 def precision_option(command: Callable[..., Any]) -> Callable[..., Any]:
     """`--precision`, of answers that an engine made."""
-    told = "In which the engine made its answers; default: what the problem says, else float64."
+    told = "Precision in which the engine computed its solutions; default: that of the problem, or float64."
     return click.option("--precision", type=click.Choice(["float64", "float32"]), help=told)(command)
 
 
@@ -204,7 +204,7 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         return
     specs = [registry.get(name) for name in solvers]
     if not any(s.resumable and not s.exact for s in specs):
-        refuse_unused(context, ["budgets"], "on solvers that cannot stop anywhere")
+        refuse_unused(context, ["budgets"], "on solvers that cannot stop after any iteration")
     if not any(s.order and not s.exact for s in specs):
         refuse_unused(context, ["orders"], "on solvers that take no order")
     if not any(map(is_foreign, specs)):
@@ -212,25 +212,26 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
 
 
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
-    ("--solvers", {"type": Names(), "help": "Solvers by name; all that are installed if not given."}),
+    ("--solvers", {"type": Names(), "help": "Solvers by name; default: all that are installed."}),
     ("--levels", {"type": Numbers(), "default": "1e-3,1e-6,1e-9", "show_default": True,
                   "help": "Relative residuals to reach."}),
-    ("--motion", {"is_flag": True, "help": "Tell how wrong the bodies move, too: distance to a reference that is "
-                  "solved for once a case."}),
+    ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
+                  "relative to a reference that is solved once for each case."}),
     ("--speed-levels", {"type": Numbers(), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
     ("--budgets", {"type": Numbers(int), "default": "4,8,16,32,64", "show_default": True,
-                   "help": "Exact iteration counts."}),
+                   "help": "Numbers of iterations to run exactly."}),
     ("--orders", {"type": Names(), "default": None,
-                  "help": "Sweep orders beside 'given', at the middle budget; random:3 is seed 3."}),
+                  "help": "Sweep orders to compare with 'given', at the middle budget; random:3 uses seed 3."}),
     ("--repeats", {"type": int, "default": 3, "show_default": True,
-                   "help": "Solves of each kind; minimum and median count."}),
+                   "help": "Repetitions of each solve; minimum and median are kept."}),
     ("--time-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Of one solve; 1 s, or 0.25 s for the built-in suite."}),
+                      "help": "Limit of one solve; default: 1 s, or 0.25 s for the built-in suite."}),
     ("--pass-limit", {"type": float, "default": None, "metavar": "S",
-                      "help": "Of one solver over all steps of a sequence, at one budget or level; 5 s."}),
-    ("--memory", {"type": float, "default": None, "metavar": "GB", "help": "Limit of each process of a backend of "
-                  "another package; default: half of the machine's memory, shared by the workers of a campaign."}),
+                      "help": "Limit of a solver over all steps of a sequence, at one budget or level; default: 5 s."}),
+    ("--memory", {"type": float, "default": None, "metavar": "GB",
+                  "help": "Memory limit of each process of another package's solver; default: half of the "
+                  "machine's memory, shared by the workers of a campaign."}),
 )  # fmt: skip
 
 

@@ -25,22 +25,31 @@ def _names(text: str | None) -> list[str] | None:
 
 @click.command("phenomena")
 @click.argument("names", nargs=-1, metavar="[NAMES]...")
-@click.option("--steppers", default=None, help="Names with commas; default: all of ours. none: without ours.")
-@click.option("--engines", default="none", show_default=True, help="Engines of others, with commas, or all.")
+@click.option(
+    "--steppers",
+    default=None,
+    help="Steppers of lavender, separated by commas; default: all; none: no stepper.",
+)
+@click.option(
+    "--engines", default="none", show_default=True, help="Other engines, separated by commas, or all."
+)
 @click.option(
     "--set",
     "parameters",
     multiple=True,
     metavar="NAME=VALUE",
-    help="A parameter, e.g. slope=0.9: one case in the place of a phenomenon's own; may be repeated.",
+    help="Set a parameter, e.g. slope=0.9: one case instead of the phenomenon's own; may be repeated.",
 )
 @click.option(
     "--limit", type=click.FloatRange(min=1.0), default=120.0, show_default=True, metavar="S",
-    help="Wall time of one case in an engine of others.",
+    help="Limit of the wall time of one case in another engine.",
 )  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Every measurement, JSON.")
+@click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every measurement as JSON.")
 @click.option(
-    "--list", "listed", is_flag=True, help="Tell what each is, its truth and its bounds; run nothing."
+    "--list",
+    "listed",
+    is_flag=True,
+    help="Describe each phenomenon, its exact motion and its bounds; run nothing.",
 )
 def phenomena(
     names: tuple[str, ...],
@@ -51,10 +60,10 @@ def phenomena(
     out: Path | None,
     listed: bool,
 ) -> None:
-    """Scenes whose motion is known, measured in every stepper, and in the engines of others.
+    """Measure every stepper, and other engines, on scenes whose exact motion is known.
 
-    A cell is the worst distance from the truth and the number of cases within all bounds. An engine that is missing,
-    crashes, or cannot build a scene is a note.
+    A cell shows the worst distance from the exact motion and the number of cases within all bounds. A note says which
+    engine is missing, crashed, or cannot build a scene.
     """
     if listed:
         click.echo(tables.described(chosen(names)))

@@ -17,8 +17,8 @@ __all__ = ["reference"]
 def reference(files: tuple[str, ...]) -> None:
     """Solve each problem to the floor and write the solution beside its file.
 
-    `lavender report --motion` then compares with pile.npz.reference in place of solving pile.npz again; whatever
-    such a file holds is judged before it is used.
+    `lavender report --motion` then uses pile.npz.reference instead of solving pile.npz again. The content of such a
+    file is judged before it is used.
 
     Exits with 1 when nothing solves a problem, or a file met in a folder cannot be read.
     """

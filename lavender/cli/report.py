@@ -43,10 +43,12 @@ __all__ = ["report"]
 @click.option(
     "--sequence/--no-sequence",
     default=None,
-    help="Each FOLDER holds the steps of a simulation: carry impulses from step to step. Known by itself of what "
-    "`lavender run --record` leaves.",
+    help="Treat each FOLDER as consecutive steps of a simulation, and carry impulses from step to step. Default: only "
+    "folders that `lavender run --record` wrote.",
 )
-@click.option("--campaign", is_flag=True, help="Error and robustness by many workers; no times.")
+@click.option(
+    "--campaign", is_flag=True, help="Measure error and robustness with many workers, without times."
+)
 @click.option(
     "--seeds",
     type=Seeds(),
@@ -54,42 +56,52 @@ __all__ = ["report"]
     metavar="N | A:B",
     help="With --campaign: seeds 0 to N - 1, or A to B - 1, of cases that take one.",
 )
-@click.option("--workers", type=int, default=-1, help="With --campaign: processes; -1 is one for each core.")
+@click.option(
+    "--workers", type=int, default=-1, help="With --campaign: number of processes; -1: one for each core."
+)
 @click.option(
     "--backend", default="loky", show_default=True, help="With --campaign: a backend of joblib, such as dask."
 )
 @click.option(
     "--compare",
     type=click.Path(path_type=Path),
-    help="Earlier records (.jsonl, or their folder) to compare with.",
+    help="Compare with earlier records (.jsonl, or their folder).",
 )
 @click.option(
     "--time-budgets",
     type=Numbers(),
     default=(),
     metavar="S,S,...",
-    help="Seconds for which a solver is recommended; default: three decades about the fastest times.",
+    help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",
 )
-@click.option("--steps", default=500, show_default=True, help="Of MODEL.xml: steps of its simulation.")
-@click.option("--every", default=5, show_default=True, help="Of MODEL.xml: steps between two problems.")
+@click.option("--steps", default=500, show_default=True, help="MODEL.xml: number of simulation steps.")
+@click.option("--every", default=5, show_default=True, help="MODEL.xml: record every n-th step.")
 @click.option(
-    "--controls", default="random", show_default=True, metavar="zero|random|FILE", help="Of MODEL.xml."
+    "--controls",
+    default="random",
+    show_default=True,
+    metavar="zero|random|FILE",
+    help="MODEL.xml: its controls.",
 )
-@click.option("--tables", is_flag=True, help="Print every case and sequence too.")
-@click.option("--fresh", is_flag=True, help="Measure again what the folder holds already.")
-@click.option("--paper", is_flag=True, help="Also PDF figures, LaTeX tables and the method, in OUT/paper.")
-@click.option("--no-figures", is_flag=True, help="Leave out the SVG and PNG files.")
+@click.option("--tables", is_flag=True, help="Also print every case and sequence.")
+@click.option("--fresh", is_flag=True, help="Repeat runs that the folder already holds.")
+@click.option(
+    "--paper",
+    is_flag=True,
+    help="Also write PDF figures, LaTeX tables and a paragraph on the method to OUT/paper.",
+)
+@click.option("--no-figures", is_flag=True, help="Do not write SVG and PNG files.")
 @click.pass_context
 def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked: Any) -> None:
-    """Speed against error: every solver on every case, to each level and at each budget.
+    """Measure speed against error: every solver on every case, to each level of residual and with each budget.
 
     FILES are problems (.npz, .hdf5), folders of them, folders of recorded steps, or cases of the built-in
-    suite such as "stack(n=64)"; without any, the built-in suite runs. A model of MuJoCo (.xml) is simulated first,
+    suite such as "stack(n=64)"; without any, the built-in suite runs. A MuJoCo model (.xml) is simulated first,
     and its steps are recorded in the folder of the report. A records.jsonl is shown again
-    without solving. The same command goes on where it was stopped.
+    without solving. After an interruption, the same command continues where it stopped.
 
-    Exits with 1 when a file met in a folder cannot be read, with 2 when one that was named cannot, or when
-    another report writes the folder.
+    Exit code 1: a file in a folder cannot be read. Exit code 2: a named file cannot be read, or another report
+    is writing to the folder.
     """
     from lavender import bench
     from lavender.report.contents import engine_table
@@ -98,7 +110,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.text import count
-    from lavender.report.write import write_all
+    from lavender.report.write import write
 
     for limit in asked["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -125,7 +137,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     if engines:
         _say(f"\n{ENGINES}")
         print_table(console(), engine_table(engines))
-    index = write_all(found, out, figures=not asked["no_figures"])
+    index = write(found, out, figures=not asked["no_figures"])
     if asked["paper"]:
         from lavender.report.paper import write_paper
 
@@ -134,7 +146,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     if done.note:
         _say(done.note)
     if done.stopped:
-        console().print("[yellow]Stopped; the same command goes on from here.[/]")
+        console().print("[yellow]Stopped; the same command continues from here.[/]")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if done.lost and not again:
         _say(f"{count(done.lost, 'case')} of a folder did not load", style="yellow")
@@ -163,7 +175,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
             "fresh",
         ]
         refuse_unused(
-            context, of_times, "with --campaign, which ends by iterations and goes on where it stopped"
+            context, of_times, "with --campaign, which ends by iterations and continues where it stopped"
         )
     else:
         refuse_unused(context, ["seeds", "workers", "backend"], "without --campaign")

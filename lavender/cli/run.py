@@ -15,45 +15,49 @@ __all__ = ["run"]
 
 @click.command()
 @click.argument("scene")
-@click.option("--steps", type=int, default=240, show_default=True, help="Steps to run.")
+@click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option(
     "--iterations",
     type=int,
     default=None,
-    help="Sweeps of a solve; 4 to 64 (1 to 64 of other steppers).",
+    help="Sweeps per solve, 4 to 64 (other steppers: 1 to 64).",
 )
 @click.option(
     "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
 )
-@click.option("--stepper", default=None, help="impulses (default), soft_step, xpbd or avbd.")
+@click.option("--stepper", default=None, help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
     "parameters",
     multiple=True,
     metavar="NAME=VALUE",
-    help="A parameter of the scene, e.g. n=20 or order=top_down; may be repeated.",
+    help="Set a parameter of the scene, e.g. n=20 or order=top_down; may be repeated.",
 )
-@click.option("--residual", is_flag=True, help="Judge all rows of every step too.")
-@click.option("--plot", type=click.Path(path_type=Path), default=None, help="Figure of the run (.svg, .png).")
-@click.option("--trace", type=click.Path(path_type=Path), default=None, help="Every step's values, .csv.")
+@click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
+@click.option(
+    "--plot", type=click.Path(path_type=Path), default=None, help="Write a figure of the run (.svg, .png)."
+)
+@click.option(
+    "--trace", type=click.Path(path_type=Path), default=None, help="Write the values of every step (.csv)."
+)
 @click.option(
     "--record",
     type=click.Path(path_type=Path),
     default=None,
-    help="Folder for the problem of every step, .npz.",
+    help="Write the problem of every step (.npz) to this folder.",
 )
 @click.option(
-    "--skip", type=int, default=0, show_default=True, help="Steps before the first that is recorded."
+    "--skip", type=int, default=0, show_default=True, help="Number of steps before the first recorded one."
 )
 @click.option(
-    "--replace", is_flag=True, help="With --record: take the problems of another recording out first."
+    "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
 )
-@click.option("--view", is_flag=True, help="Show the run in a page on this machine, live, then until Ctrl-C.")
+@click.option("--view", is_flag=True, help="Show the run live in a web page on this machine, until Ctrl-C.")
 @click.option(
     "--film",
     type=click.Path(path_type=Path),
     default=None,
-    help="Film of the run: .gif, .mp4 or .png pictures, or a file for `lavender view`.",
+    help="Write a film of the run: .gif, .mp4, .png pictures, or a file for `lavender view`.",
 )
 @click.pass_context
 def run(
@@ -65,7 +69,7 @@ def run(
     parameters: tuple[str, ...],
     **asked: Any,
 ) -> None:
-    """Run a LavenderSim scene of the gallery; record its steps as a sequence for `report`.
+    """Simulate a scene of the gallery; optionally record its steps as a sequence for `lavender report`.
 
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
     newtons_cradle or four_bar.

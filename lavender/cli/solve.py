@@ -16,24 +16,26 @@ __all__ = ["solve"]
 
 @click.command()
 @click.argument("file")
-@click.option("--solver", default="auto", show_default=True, help="Name; see `lavender solvers`.")
+@click.option(
+    "--solver", default="auto", show_default=True, help="Name of the solver; see `lavender solvers`."
+)
 @click.option(
     "--tol",
     type=float,
     default=1e-6,
     show_default=True,
-    help="Relative residual asked for; 0 runs the whole budget.",
+    help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
 )
-@click.option("--max-iter", type=int, default=None, help="Iteration budget; default: the solver's.")
-@click.option("--time-limit", type=float, default=None, metavar="S")
+@click.option("--max-iter", type=int, default=None, help="The most iterations; default: the solver's.")
+@click.option("--time-limit", type=float, default=None, metavar="S", help="Limit of the solve time.")
 @click.option("--order", default=None, help="Sweep order, for solvers that take one.")
-@click.option("--seed", type=int, default=None, help="Of a random order.")
-@click.option("--history", is_flag=True, help="Print the residual along the way.")
+@click.option("--seed", type=int, default=None, help="Seed of a random order.")
+@click.option("--history", is_flag=True, help="Print the residual after fixed numbers of iterations.")
 @click.option(
     "--output",
     type=click.Path(path_type=Path),
     default=None,
-    help="Write impulse, slack and what was said of them, .npz.",
+    help="Write impulse, slack, status and residual to this .npz file.",
 )
 def solve(
     file: str,
@@ -46,10 +48,10 @@ def solve(
     history: bool,
     output: Path | None,
 ) -> None:
-    """Solve one problem (a file, or a case of the suite) and say how wrong the answer is.
+    """Solve one problem (a file, or a case of the suite) and print its error.
 
-    Exits with 0 when the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always),
-    with 1 when it does not, with 3 when the problem is infeasible, proved by a certificate that the judge confirms.
+    Exit code 0: the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always).
+    1: it does not. 3: the problem is infeasible, with a certificate that the judge confirms.
     """
     from lavender import bench
     from lavender.report.text import residual, seconds

@@ -10,9 +10,13 @@ __all__ = ["solvers"]
 
 
 @click.command()
-@click.option("--problem", default=None, help="Say for this problem (file or suite case) who takes it.")
+@click.option(
+    "--problem",
+    default=None,
+    help="Say for each solver whether it accepts this problem (a file, or a case of the suite).",
+)
 def solvers(problem: str | None) -> None:
-    """What is installed, or why not, and what each solver can do."""
+    """List the solvers: what each can do, and what to install for those that are missing."""
     from rich.table import Table
 
     from lavender import bench, registry

@@ -28,28 +28,28 @@ __all__ = ["SOLVER_FIELDS", "Simulation"]
 
 
 class Simulation(Stepping):
-    """Steps a scene. The scene is read once; changing it later changes nothing here.
+    """Steps a scene in time. The scene is copied at the start; changing it later has no effect here.
 
-    Threads may share one: a call waits until those of the others have ended. What a solver calls from inside
-    a step is refused.
+    Threads may share a simulation: a call waits until the calls of other threads have ended. A call from inside a step
+    (by a solver that the step runs) is refused.
 
     Parameters
     ----------
     scene : Scene or str
         A scene, or the name of one of the gallery.
     stepper : str, optional
-        Of `lavender.scene.steppers`, with its default options, in the place of the scene's.
+        A name of `lavender.scene.steppers`, used with its default options instead of the scene's stepper.
     report_residual : bool, default False
-        Put the judge's residual over all rows of the final substep into `info["residual"]`; costs about as
-        much as a step.
+        Put the judge's residual of all rows of the last substep into `info["residual"]`; costs about as much as a
+        step.
     report_motion : bool, default False
-        Put how wrong the bodies move after the final substep into `info["motion"]`; costs a solve to the floor,
-        under Coulomb's law two.
+        Put the motion error of the last substep into `info["motion"]` (how wrong the bodies' velocities are); costs a
+        solve to the floor, and two under Coulomb's law.
 
     Raises
     ------
     InputError
-        Not a scene, or one without bodies.
+        `scene` is not a scene, or has no bodies.
     """
 
     # -- the problem ----------------------------------------------------------------------------

@@ -57,7 +57,7 @@ class Answer:
     words: str  # the backend's own
     x: FloatArray | None = None  # (n,)
     zeta: FloatArray | None = None  # (r,) multipliers of the rows
-    xi: FloatArray | None = None  # (n,) of the bounds
+    xi: FloatArray | None = None  # (n,) of the bounds, or (0,) where there are none
     work: Mapping[str, int] = field(default_factory=dict)
     direction: FloatArray | None = None  # of an unbounded x
     contradiction: FloatArray | None = None  # multipliers that prove the rows contradict each other
@@ -181,7 +181,8 @@ def _once(
     if found and status is not Status.INFEASIBLE:
         assert x is not None
         impulse[:] = lam
-        xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else np.full(qp.n, np.nan)
+        unknown = np.full(qp.n, 0.0 if qp.lb is None else np.nan)
+        xi = answer.xi if answer.xi is not None and len(answer.xi) == qp.n else unknown
         dual = qp.multiplier(x, xi)
     elif status is not Status.INFEASIBLE:
         if status not in (Status.TIME_LIMIT, Status.INTERRUPTED):

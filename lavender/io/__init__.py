@@ -23,7 +23,7 @@ from lavender.io.drake import from_drake
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recording import Recording, record
-from lavender.io.stored import MAX_BYTES, Stored, as_path, first_bytes
+from lavender.io.stored import HDF5, MAX_BYTES, Stored, as_path, first_bytes
 from lavender.problem import Problem
 
 __all__ = [
@@ -39,9 +39,6 @@ __all__ = [
     "record",
     "save",
 ]
-
-NPZ = (".npz",)
-HDF5 = (".hdf5", ".h5", ".hdf")
 
 
 def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
@@ -113,7 +110,7 @@ def save(
     """
     path = as_path(path)
     suffix = path.suffix.lower()
-    if suffix in NPZ:
+    if suffix == ".npz":
         if form is not None or drop:
             raise InputError("form= and drop= are for FCLIB files (.hdf5); an .npz holds everything")
         npz.write(problem, path, impulse=impulse)

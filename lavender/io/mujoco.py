@@ -153,10 +153,9 @@ def impulse(model: Any, data: Any) -> FloatArray:
 
     After `noslip_iterations` it is no solution of the problem.
     """
-    mj = _mujoco(model, data)
-    dt = _timestep(model.opt)
-    scale = _blocks(mj, model, data, _Held.of(data), dt)[1]
-    return np.divide(dt * data.efc_force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
+    scale = scaling(model, data)
+    force = _timestep(model.opt) * data.efc_force
+    return np.divide(force, scale, out=np.zeros(len(scale)), where=scale != 0.0)
 
 
 def scaling(model: Any, data: Any) -> FloatArray:

@@ -18,7 +18,7 @@ from lavender._arrays import FloatArray, as_array, whole_number
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
-from lavender.io.stored import first_bytes, folder_for_steps, write_text
+from lavender.io.stored import as_path, first_bytes, folder_for_steps, write_text
 from lavender.problem import PRECISIONS, Problem
 from lavender.residuals import residual
 
@@ -160,16 +160,17 @@ def record_file(
         import mujoco as mj
     except ImportError:
         raise InputError("mujoco cannot be imported: pip install mujoco") from None
+    path = str(as_path(path))
     try:
-        made = mj.MjModel.from_xml_path(os.fspath(path))
+        made = mj.MjModel.from_xml_path(path)
     except ValueError as error:  # MuJoCo's word about a file that it cannot read
-        raise InputError(f"{os.fspath(path)}: {error}") from None
+        raise InputError(f"{path}: {error}") from None
     if isinstance(control, str) and control not in CONTROLS:
         control = _controls(control)
     found = record(made, mj.MjData(made), folder, steps, control=control, **options)
     if not found.files:
         raise InputError(
-            f"{os.fspath(path)}: no step had a constraint that could be kept: more steps, or other controls"
+            f"{path}: no step had a constraint that could be kept: more steps, or other controls"
         )
     return found
 
@@ -193,7 +194,12 @@ def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], Fl
     n = int(model.nu)
     if callable(control):
         call: Callable[[Any, Any, int], Any] = control
-        return lambda data, step: call(model, data, step)
+
+        def called(data: Any, step: int) -> FloatArray | None:
+            given = call(model, data, step)
+            return None if given is None else as_array(f"control of step {step}", given, (n,))
+
+        return called
     if isinstance(control, str):
         if control not in CONTROLS:
             raise InputError(
@@ -201,7 +207,7 @@ def drive_of(model: Any, control: Control, seed: int) -> Callable[[Any, int], Fl
             )
         if control == "zero":
             return lambda data, step: np.zeros(n)
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(whole_number("seed", seed, high=None))
         limited = np.array(model.actuator_ctrllimited, bool)[:, None]
         low, high = np.where(limited, np.array(model.actuator_ctrlrange), [-1.0, 1.0]).T
         return lambda data, step: rng.uniform(low, high)

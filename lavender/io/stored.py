@@ -13,13 +13,14 @@ from threading import get_native_id
 from types import MappingProxyType
 from typing import Any
 
-from lavender._arrays import FloatArray, whole_number
+from lavender._arrays import FloatArray, flag, whole_number
 from lavender.errors import InputError
 from lavender.problem import Problem
 
 __all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]
 
-SUFFIXES = (".npz", ".hdf5", ".h5", ".hdf")  # of problem files
+HDF5 = (".hdf5", ".h5", ".hdf")
+SUFFIXES = (".npz", *HDF5)  # of problem files
 
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
@@ -46,7 +47,7 @@ def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Pat
 
     `replace` takes the problem files out that it holds.
     """
-    folder = as_path(path)
+    folder, replace = as_path(path), flag("replace", replace)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]

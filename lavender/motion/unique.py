@@ -46,9 +46,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
-from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.motion.reference import kept, reference
+from lavender.ordering import rows_of_each
 from lavender.problem import Problem
 
 __all__ = ["Uniqueness", "uniqueness"]
@@ -88,16 +88,10 @@ def uniqueness(problem: Problem) -> Uniqueness:
         return Uniqueness(True, "the law is convex", 0.0)
     c = problem.cones
     friction = c.reach > 0.0
-    count = np.diff(c.ptr)
     if not friction.any():
         return Uniqueness(True, "no contact has friction", 0.0)
-    a = problem.csr
-    block = np.repeat(np.arange(c.n_blocks), count)
-    # Rows of one contact belong together whatever A says: the disk joins them.
-    chain = sp.csr_array((np.ones(problem.m), (np.arange(problem.m), c.ptr[block])), shape=a.shape)
-    _, label = sp.csgraph.connected_components(abs(a) + chain, directed=False)
     reasons, kappa = [], 0.0
-    for island in _islands(label):
+    for island in rows_of_each(problem, c.ptr):
         if not friction[island].any():
             continue
         reason, k = _island(problem, island, friction[island])
@@ -109,11 +103,6 @@ def uniqueness(problem: Problem) -> Uniqueness:
             reasons.append(reason)
         kappa = max(kappa, k)
     return Uniqueness(True, " and ".join(reasons) + (f" (kappa {kappa:.2g})" if kappa > 0.0 else ""), kappa)
-
-
-def _islands(label: np.ndarray) -> list[np.ndarray]:
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> tuple[str | None, float]:

@@ -46,27 +46,25 @@ class Names(Sequence[str]):
 
     def __init__(self, count: int, make: Callable[[], Sequence[str]]) -> None:
         self._count, self._make = count, make
-        self._made: tuple[str, ...] | None = None
 
+    @cached_property
     def _words(self) -> tuple[str, ...]:
-        if self._made is None:
-            self._made = tuple(self._make())
-        return self._made
+        return tuple(self._make())
 
     def __len__(self) -> int:
         return self._count
 
     def __getitem__(self, i: Any) -> Any:
-        return self._words()[i]
+        return self._words[i]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, (Names, tuple)) and self._words() == tuple(other)
+        return isinstance(other, (Names, tuple)) and self._words == tuple(other)
 
     def __hash__(self) -> int:
-        return hash(self._words())
+        return hash(self._words)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return tuple, (self._words(),)
+        return tuple, (self._words,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +283,10 @@ class ProblemData:
 def check_problem(problem: Any) -> None:
     """Raise where what stands for a problem is none."""
     if not isinstance(problem, ProblemData):
-        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+        raise InputError(
+            f"problem is a {type(problem).__name__}; a lavender.Problem is needed: make one by Problem.lcp(A, b), "
+            "linear, contact, from_rows or from_jacobian"
+        )
 
 
 def _many(n: int, what: str) -> str:

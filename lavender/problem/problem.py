@@ -38,42 +38,44 @@ class VelocityForm:
 
 
 class Problem(Builders):
-    """Find lambda (m,) [N s] with w = A lambda - b [m/s] complementary to it on every block.
+    """A constraint problem: find impulses lambda (m,) [N s] with w = A lambda - b [m/s] complementary to them.
+
+    Usually made by `Problem.lcp`, `linear`, `contact`, `from_rows`, `from_jacobian` or `from_findex`.
 
     Parameters
     ----------
     b : (m,) m/s
-        target - J v*: the relative velocity that the impulses must make up for.
+        target - J v*: the relative velocity that the impulses must supply.
     cones : Cones
         Blocks and bounds.
     matrix : (m, m) array or sparse, 1/kg
-        A, kept exactly as given (asymmetric, indefinite and singular are legal); or
+        A, kept exactly as given (it may be asymmetric, indefinite or singular); or
     rows : Rows
-        J and M^-1; A is then J M^-1 J^T + diag(compliance) and is formed only on request; or
+        J and M^-1 of bodies; A = J M^-1 J^T + diag(compliance) is formed only if needed; or
     generalized : Generalized
-        J and M in generalised coordinates; the same.
+        J and M in generalised coordinates; as with rows, A is formed only if needed.
     friction : {"coulomb", "cone"}
-        Exact Coulomb friction (non-associated), or its convex relaxation.
+        Coulomb friction (non-associated), or its convex relaxation.
     compliance : (m,) 1/kg, not with a matrix
-        Softness of each row, >= 0.
+        Softness of each row, >= 0; added to the diagonal of A.
     guess : (m,) N s, optional
-        Warm start that travels with the problem.
+        Default warm start of every solve of this problem.
     key : (k,) uint64, optional
-        Identity of each block across steps.
+        Identity of each block, by which it is found again in the next step.
     names : sequence of str (k,), optional
-        Names of blocks, e.g. "hinge 7"; see `row_name`.
+        Names of the blocks, e.g. "hinge 7"; see `row_name`.
     name : str
     copy : bool
-        True leaves the arrays given as they are. False adopts those that already fit (b, matrix, compliance, guess):
-        they are shared, and marked read-only for the giver, too.
+        True copies the arrays. False uses b, matrix, compliance and guess without a copy if their type fits; they are
+        then shared with the caller and marked read-only.
     precision : {"float64", "float32"}, optional
-        In which an engine made these numbers, and makes its answers: `lavender.residual` then knows what rounding
-        alone explains. Default: that of `rows`. Numbers are widened exactly and solved in float64 in any case.
+        Precision in which an engine computed these numbers and computes its answers; `lavender.residual` then knows
+        which error rounding alone explains. Default: that of `rows`. Problems are always solved in float64.
 
     Raises
     ------
     InputError
-        Wrong shapes, NaN or infinity, none or several of matrix, rows and generalized, nnz >= 2^31.
+        Wrong shapes, NaN or infinity, none or several of matrix, rows and generalized, or nnz >= 2^31.
     """
 
     def carry(self, previous: Any, keys: Any = None) -> FloatArray:

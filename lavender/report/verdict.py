@@ -139,7 +139,7 @@ def _percent(share: float) -> int:
 
 
 def _sure(race: Race) -> list[str]:
-    """How often the choice wins, and who is as good."""
+    """How often the choice wins, and which solvers are as good."""
     if len(race.ranking) < 2:
         return []
     share = f"It wins in {_percent(race.shares[0])} % of resamplings"

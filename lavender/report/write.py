@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,39 +11,22 @@ from lavender.io.stored import write_text
 
 if TYPE_CHECKING:
     from lavender.report.curves import Figures
-    from lavender.report.engine import Contestant
     from lavender.report.findings import Report
 
-__all__ = ["write", "write_all"]
+__all__ = ["write"]
 
 
-def write(
-    records: Records,
-    folder: str | Path,
-    *,
-    figures: bool = True,
-    old: Records | None = None,
-    times: Sequence[float] = (),
-    sweeps: Sequence[int] = (),
-    engines: Sequence[Contestant] = (),
-) -> Path:
+def write(found: Records | Report, folder: str | Path, *, figures: bool = True) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.
 
     Parameters
     ----------
-    records : Records
-        Times are compared within the newest run alone; csv and json hold all of them.
+    found : Records or Report
+        Records, or a report of them, which says besides what they are compared with and what was asked. Times are
+        compared within the newest run alone; csv and json hold all of them.
     folder : path
     figures : bool
         False leaves out the SVG and PNG files, which take most of the time.
-    old : Records, optional
-        An earlier run to compare with.
-    times : s, optional
-        Time budgets of the recommendation; those of the plan, or `tables.time_budgets`, if none are given.
-    sweeps : int, optional
-        Budgets of sweeps with which a solver is to be named; those of the plan if none are given.
-    engines : sequence of Contestant
-        Answers of the engines that recorded the steps: `lavender.report.engine.contestants`.
 
     Returns
     -------
@@ -56,17 +38,12 @@ def write(
     InputError
         The folder cannot be written.
     """
-    from lavender.report.findings import Report
-
-    return write_all(Report(records, old, times, sweeps, engines), folder, figures=figures)
-
-
-def write_all(report: Report, folder: str | Path, *, figures: bool = True) -> Path:
-    """As `write`."""
     from lavender.report.curves import figures as figures_of
+    from lavender.report.findings import Report
     from lavender.report.markdown import summary
     from lavender.report.page import page
 
+    report = Report(found) if isinstance(found, Records) else found
     folder = Path(folder)
     drawn = figures_of(report.records)
     try:

@@ -7,19 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array
+from lavender._arrays import FloatArray, as_array, number
 from lavender.errors import InputError
 from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
 __all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
 
 
+_put = object.__setattr__  # of a frozen shape, what was given as it is kept
+
+
 @dataclass(frozen=True)
 class Plane:
     """All points x with normal.x <= offset are inside; always static."""
 
-    normal: tuple[float, float, float]  # unit, world
+    normal: tuple[float, float, float]  # world; made a unit vector
     offset: float  # m
+
+    def __post_init__(self) -> None:
+        _put(self, "normal", tuple(unit("normal of a plane", self.normal).tolist()))
+        _put(self, "offset", number("offset of a plane [m]", self.offset))
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,9 @@ class Sphere:
     """A ball round the body's centre."""
 
     radius: float  # m
+
+    def __post_init__(self) -> None:
+        _put(self, "radius", number("radius of a sphere [m]", self.radius, above=0.0))
 
     def inertia(self, mass: float) -> FloatArray:
         """Inertia (3, 3) [kg m^2] of a solid ball."""
@@ -38,6 +48,12 @@ class Box:
     """A box round the body's centre, along the body's axes."""
 
     size: tuple[float, float, float]  # m, whole edges
+
+    def __post_init__(self) -> None:
+        edges = numbers("size of a box [m]", self.size, 3)
+        if not (edges > 0.0).all():
+            raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
+        _put(self, "size", tuple(edges.tolist()))
 
     def inertia(self, mass: float) -> FloatArray:
         """Inertia (3, 3) [kg m^2] of a solid box."""

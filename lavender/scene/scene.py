@@ -220,21 +220,21 @@ def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
 
 
 class Scene:
-    """Bodies and joints with their parameters: a named scene of the gallery, or an empty one to build.
+    """Bodies, joints and parameters of a simulation: a named scene of the gallery, or an empty one to fill.
 
     Parameters
     ----------
     name : str, optional
-        A scene of the gallery, or another that `named_scene` has registered; None: empty.
+        A scene of the gallery, or one registered by `named_scene`. None: an empty scene.
     **parameters
-        Those of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
+        The fields of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
 
     Raises
     ------
     UnknownName
-        No such scene or parameter; the message names the nearest.
+        No such scene or parameter; the message suggests the nearest name.
     InputError
-        A value that makes no sense.
+        A value that is not valid.
 
     Examples
     --------
@@ -387,23 +387,20 @@ class Scene:
 
     def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **more: Any) -> int:
         """Add a box of whole edges `size` (3,) [m]; `more` as in `add_body`. Returns its number."""
-        edges = numbers("size of a box [m]", size, 3)
-        if not (edges > 0.0).all():
-            raise InputError(f"size of a box is {edges.tolist()} m; three positive edges are needed")
-        return self.add_body(mass, shape=Box(tuple(edges.tolist())), **more)
+        return self.add_body(mass, shape=Box(size), **more)
 
     def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **more: Any) -> int:
         """Add a sphere of `radius` [m]; `more` as in `add_body`. Returns its number."""
-        return self.add_body(mass, shape=Sphere(number("radius of a sphere [m]", radius, above=0.0)), **more)
+        return self.add_body(mass, shape=Sphere(radius), **more)
 
     def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **more: Any) -> int:
         """Add a static half-space normal.x <= offset [m]; `more`: name, friction, restitution, patch_radius."""
-        n = unit("normal of a plane", normal)
-        d = number("offset of a plane [m]", offset)
+        plane = Plane(normal, offset)
         for key in ("position", "quaternion", "velocity", "angular_velocity", "inertia", "mass"):
             if key in more:
                 raise InputError(f"a plane is static and has no {key}; give normal and offset")
-        return self.add_body(0.0, static=True, shape=Plane(tuple(n.tolist()), d), position=d * n, **more)
+        place = plane.offset * np.array(plane.normal)
+        return self.add_body(0.0, static=True, shape=plane, position=place, **more)
 
     # -- joints ---------------------------------------------------------------------------------
 

@@ -19,8 +19,9 @@ from lavender_ext.local import gauss_seidel
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
 PATIENCE = 500  # iterations: on mass ratios the residual of a conjugate gradient rises for hundreds first
-# Entries of A for each row, and in all, up to which its rows beat body velocities (measured: 1.65 times as fast at
-# 300 to 8,000 rows of 16 entries, 1.4 at 1,600 of 26, 1.1 to 1.25 at 27,570 of 17, which leave the second-level cache).
+# Entries of A for each row, and in all, up to which its rows are faster than body velocities (measured: 1.65 times as
+# fast at 300 to 8,000 rows of 16 entries, 1.4 at 1,600 of 26, 1.1 to 1.25 at 27,570 of 17, which leave the
+# second-level cache).
 NEIGHBOURS, ENTRIES = 40, 600_000
 CONVEX_OPTION = "iterations under the cone law first, for piles that stick; default 0"
 SWEEP_OPTION = (
@@ -100,9 +101,9 @@ class Accelerated(Sweeping):
 
 
 def operator(problem: Problem) -> Any:
-    """What the sweeps run over: rows of A where a contact has one row and few neighbours, else as it was given.
+    """The form that sweeps run over: rows of A if contacts have one row and few neighbours, otherwise as given.
 
-    Of one row the rows of A cost what body velocities cost, and mixing then need not form the velocities anew.
+    For contacts of one row, rows of A cost as much as body velocities, and mixing does not recompute velocities.
     """
     return swept(problem) if _entries(problem) is None else problem.csr_data
 
@@ -114,7 +115,7 @@ def sweep_work(problem: Problem) -> int:
 
 
 def _entries(problem: Problem) -> int | None:
-    """Entries of A at most, where sweeps over its rows beat body velocities."""
+    """The most entries of A for which sweeps over its rows are faster than over body velocities."""
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None

@@ -3,11 +3,11 @@
     z = Pi_K(u),  y = rho (u - z),  (B + rho) x = c - s + rho z - y,  u <- u + alpha (x - z), then mixed
 
 in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of all blocks at once, s De
-Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). One triangular solve an iteration instead of a
-sweep, so mass ratios and long chains cost factorisations (rho is weighed ever more rarely), not sweeps.
-Friction starts from the convex answer.
-Cholesky of a dense A, L L^T by panels of a sparse one or, where rows have fewer body unknowns than rows, of the
-body form; L U by panels where A is not symmetric, or belongs to a linear system and is not definite.
+Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). An iteration is one triangular solve instead of
+a sweep. So large mass ratios and long chains need more factorisations (rho is adapted, ever more rarely), not more
+iterations. Coulomb friction starts from the solution of the convex relaxation.
+The factorisation is Cholesky for a dense A; L L^T by panels for a sparse A, or for the body form if that has fewer
+unknowns than rows; L U by panels if A is not symmetric, or belongs to a linear system and is not definite.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from lavender.solution import Claim, Status
 from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
-from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.newton_systems.systems import DENSE_FILL, factor_cost
 from lavender.solvers.sweeping import claim, watch_over
@@ -64,7 +63,7 @@ class _TooLate(Exception):
 
 
 class AdmmState:
-    """Scaled problem, factorisation for the present rho, and the vectors of the run, which `open` makes."""
+    """Scaled problem, factorisation for the current rho, and the vectors of the run, which `open` makes."""
 
     def __init__(self, problem: Problem, memory: int) -> None:
         reference(problem)
@@ -127,7 +126,7 @@ class AdmmState:
             return _FULL * m**3 / 3.0
         if self.kind == _BODIES:
             assert problem.rows is not None
-            nptr, nind = body_pattern(block_bodies(problem), problem.rows.n_bodies)[:2]
+            nptr, nind = body_pattern(problem.rows.block_bodies, problem.rows.n_bodies)[:2]
             return _PANELS_WORK * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
         return _PANELS_WORK * self.panels.work if m else 0.0
 

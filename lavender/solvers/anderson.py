@@ -1,11 +1,10 @@
-"""Anderson acceleration of projected Gauss-Seidel: the last few sweeps, combined to cancel their steps.
+"""Anderson acceleration of projected Gauss-Seidel: combines the last few sweeps so that their steps nearly cancel.
 
     y = S(x),   f = D^1/2 (y - x),   x <- Pi(y - sum_i gamma_i (y_{i+1} - y_i)),
     gamma = argmin | f - sum_i gamma_i (f_{i+1} - f_i) |       over the last `memory` sweeps
 
-On a linear problem this is a truncated GMRES of which the sweep is the preconditioner; it asks neither for
-a symmetric A nor for an energy, so friction is accelerated alike. A step that doubles |f| is undone and
-the memory cleared.
+On a linear problem this is a truncated GMRES with the sweep as preconditioner. It needs neither a symmetric A nor an
+energy, so it also accelerates friction. A step that doubles |f| is undone, and the memory is cleared.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
-"""The only solver that hands over to others: each in its turn, by what it is expected to cost from here on.
+"""Chooses and combines other solvers, by their expected costs.
 
-    few rows     one compiled call that ends most of them (`small.py`)
-    others       the candidates of the table (`costs.py`), each with a cost that is counted from the problem's structure
-                 with fitted rates; always the one with the least expected remainder (`schedule.py`)
+    small problems   one compiled call, which solves most of them (`small.py`)
+    others           the candidates of a table, each with a cost that is counted from the problem's structure and fitted
+                     rates (`costs.py`); repeatedly, the candidate with the least expected remaining cost gets a turn
+                     (`schedule.py`)
 
-Costs are counted, never timed: the same problem is solved the same way everywhere; the clock ends a solve, and shortens
-turns under a time limit. The best impulse of all is the result. What is left unsolved is asked for a certificate that
-it has no solution. `turns` says what ran.
+Costs are counted, never timed, so the same problem is solved in the same way on every machine. The clock only ends a
+solve under a time limit, and shortens its turns. The result is the best impulse of all turns. If a problem remains
+unsolved, `auto` looks for a certificate that it has no solution. `Solution.turns` lists what ran.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from lavender.solvers.schedule import race
 from lavender.solvers.small import AUTO, call_ends_within, prepared
 from lavender.solvers.solve_log import SolveLog
 
-# Relative residual of a start up to which sweeps go on from it, though doing nothing has less: which rows it holds free
-# is worth it. Under limits of 1 and 10 ms residuals from stale guesses are then 1.8 and 1.3 times smaller. Where it
-# ends is arbitrary: half or twice as much moves nothing.
+# Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
+# which rows are free. Under limits of 1 and 10 ms, residuals from stale guesses are then 1.8 and 1.3 times smaller. The
+# value is arbitrary: half or twice as much changes nothing.
 STALE = 1e3
 NOTHING_TOLD = Claim(Status.MAX_ITERATIONS, 0)
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
@@ -39,7 +40,7 @@ ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, tak
 
 @dataclass
 class State:
-    """What `auto` has prepared: nothing, but sweeps and what they cost where a time limit is given."""
+    """What `auto` has prepared: nothing, except sweeps and their costs under a time limit."""
 
     problem: Problem
     sweeps: Sweeps | None = None
@@ -49,12 +50,12 @@ class State:
 
 @dataclass(frozen=True)
 class Auto:
-    """Chooses solvers, chains them, and says so.
+    """Chooses and combines other solvers; the solution's message and `turns` name them.
 
     Parameters
     ----------
     plan : Plan or its data, optional
-        What `lavender.explain` returned for a problem of the same structure: its costs, in place of counted ones.
+        Result of `lavender.explain` for a problem of the same structure, whose costs are used instead of counting anew.
     """
 
     plan: Any = None
@@ -157,6 +158,6 @@ SPEC = SolverSpec(
     resumable=False,
     delegates=True,
     max_iter=1_000_000,
-    options={"plan": "what lavender.explain(problem) returned, to go by; default: counted anew"},
-    summary="chooses and chains the other solvers; says what ran",
+    options={"plan": "result of lavender.explain, whose costs are used; default: counted anew"},
+    summary="chooses and combines other solvers by expected cost",
 )

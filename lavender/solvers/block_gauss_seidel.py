@@ -1,12 +1,12 @@
-"""Block Gauss-Seidel: one contact or joint after the other, each solved exactly with the others held still.
+"""Block Gauss-Seidel: one contact or joint after the other, each solved exactly with all others fixed.
 
     find lam_i:   w_i = A_ii lam_i + q_i complementary to lam_i,   q_i = sum_{j != i} A_ij lam_j - b_i
 
 A contact is open, sticks, or slips in the direction that a scalar Newton iteration finds
-(`lavender_ext/local/exact.pxd`); the rows of a joint are a small boxed problem, solved by pivoting. Normal and
-friction of one contact no longer wait for each other as in `pgs`; contacts still do. Works on the rows of
-A, on body velocities where the problem has rows, on J and M where that costs less than A. `work["fallbacks"]` counts
-blocks without an exact answer that were relaxed instead.
+(`lavender_ext/local/exact.pxd`). The rows of a joint are a small boxed problem, solved by pivoting. So normal and
+friction of one contact are solved together, unlike in `pgs`; different contacts are still coupled only by sweeps. Works
+on the rows of A, on body velocities if the problem has rows, on J and M if that costs less than A. `work["fallbacks"]`
+counts blocks without an exact solution, which got the update of `pgs` instead.
 """
 
 from __future__ import annotations

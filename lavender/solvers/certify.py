@@ -1,12 +1,12 @@
-"""A proof that a problem has no solution, which `auto` looks for where nobody gets there.
+"""A certificate that a problem has no solution, which `auto` looks for if all candidates fail.
 
     A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
 
-Of a contact y is along its normal alone, as Coulomb's law needs, and z = A^T y obeys z_n + mu |z_t| <= 0, where the sum
-of |z_t| stands for its norm: what that proves is so, but two tangents leave a few proofs unfound.
+On a contact y is along the normal, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. The sum of
+|z_t| replaces its norm: every certificate found this way is valid, but with two tangents a few are not found.
 
-Of islands that proves it for one: those that are wrong are asked one by one, since a bound above in another one is
-in nobody's way.
+One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
+another island does not matter.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
 from lavender.deadline import Deadline
+from lavender.ordering import blocks_of_each
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
-from lavender.solvers.islands import blocks_of_each, restrict, rows_of
+from lavender.solvers.islands import restrict, rows_of
 from lavender.solvers.solve_log import SolveLog
 
 __all__ = ["certify"]
@@ -34,7 +35,7 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 
 @np.errstate(all="ignore")  # what overflows is judged
 def certify(log: SolveLog) -> None:
-    """Look for a proof that a problem without upper bounds has no solution, whatever its A."""
+    """Look for a certificate that a problem without upper bounds has no solution, for any A."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM):
         return
@@ -57,7 +58,7 @@ def certify(log: SolveLog) -> None:
 
 
 def _parts(log: SolveLog) -> Any:
-    """Islands that are wrong and their rows, the smallest first; all of it where there is one."""
+    """Unsolved islands and their rows, the smallest first; the whole problem if there is only one."""
     problem = log.problem
     if log.islands[0] <= 1:
         yield problem, slice(None)
@@ -76,7 +77,7 @@ def _is_open(problem: Problem) -> bool:
 
 
 def find_direction(problem: Problem, deadline: Deadline) -> FloatArray | None:
-    """What a linear program finds, y (m,), to be checked."""
+    """A direction y (m,) from a linear program, still to be checked."""
     from scipy.optimize import linprog  # 0.1 s to import, needed only here
 
     # max b.y, A^T y + R u <= 0 (= 0 on free rows), |A^T y| <= u on tangents, 0 <= y <= 1, in units of d.

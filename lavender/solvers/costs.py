@@ -1,4 +1,4 @@
-"""Which solvers `auto` asks, and what each is expected to cost: a table, counts of structure, and fitted rates.
+"""The candidates of `auto` and their expected costs: a table, counts of structure, and fitted rates.
 
     cost = start + formed * entries + count * (row * m + work * w)                                            (1)
 
@@ -30,10 +30,10 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "admm": ("admm", {}),
-    # Of Coulomb's law: its answer is the law's own wherever contacts stick.
+    # The convex relaxation of Coulomb's law; its solution is one of Coulomb's law wherever contacts stick.
     "relaxation": ("anderson", {}),
 }
-ROLLING = ("anderson", "nncg", "newton")  # where contacts resist rolling, however given
+ROLLING = ("anderson", "nncg", "newton")  # for contacts that resist rolling, in every form
 _GIVEN = {
     "linear": ("direct", "anderson", "newton"),
     "lcp": ("anderson", "direct", "newton", "nncg"),
@@ -59,7 +59,7 @@ SIXTH = 6.0  # decades that counts of sweeps are fitted for
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one candidate: before its first iteration, each of them, and how many are expected."""
+    """The expected cost of one candidate: set-up, cost of an iteration, expected number of iterations."""
 
     setup: float  # ns
     each: float  # ns
@@ -73,7 +73,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Plan:
-    """What `auto` would do with a problem: its candidates and what each is expected to cost, as counted.
+    """What `auto` would do with a problem: its candidates, and the counted cost of each.
 
     `str()` is one screen; `data()` are plain numbers and words, which `Plan.of` and `lavender.solve(..., plan=)` take.
     """
@@ -81,11 +81,11 @@ class Plan:
     rows: int
     law: str
     operator: str  # rows, matrix or generalized
-    structure: str  # of blocks, law and operator: a plan is for problems of the same
+    structure: str  # hash of blocks, law and operator: a plan is for problems of the same structure
     tol: float  # - relative residual
     small: bool  # one compiled call is tried before all of them
     candidates: tuple[tuple[str, Cost], ...]  # by expected cost, the least first
-    first: tuple[str, int]  # who has the first turn, and how many iterations it is for
+    first: tuple[str, int]  # the candidate with the first turn, and the iterations of that turn
 
     def data(self) -> dict[str, Any]:
         """As JSON has it; costs in nanoseconds."""
@@ -143,21 +143,21 @@ class Plan:
     def __str__(self) -> str:
         name, n = self.first
         lines = [
-            f"{self.rows} rows under the law {self.law!r}, given as {self.operator}; to {self.tol:.0e}",
-            f"{'candidate':<18}{'expected':>12}{'set-up':>12}{'iterations':>12}{'each':>12}",
+            f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}",
+            f"{'candidate':<18}{'total cost':>12}{'set-up':>12}{'iterations':>12}{'each':>12}",
         ]
         for candidate, cost in self.candidates:
             parts = [_time(cost.total), _time(cost.setup), f"{cost.count:.3g}", _time(cost.each)]
             lines.append(f"{candidate:<18}" + "".join(f"{part:>12}" for part in parts))
         if self.small:
-            lines.append("one compiled call for few rows comes before all of them")
+            lines.append("before these, one compiled call for small problems is tried")
         why = (
-            "it is expected to cost least"
+            "the least total cost"
             if name == self.candidates[0][0]
-            else "so many cost little beside the others"
+            else "these cost little compared with the others"
         )
-        lines.append(f"first {name}, for {n} iterations: {why}")
-        lines.append("then always the one with the least expected remainder, for as long as that is")
+        lines.append(f"first turn: {name}, {n} iterations ({why})")
+        lines.append("then, repeatedly, a turn of the candidate with the least expected remaining cost")
         return "\n".join(lines)
 
 
@@ -167,7 +167,7 @@ def _time(ns: float) -> str:
 
 
 def structure_of(problem: Problem) -> str:
-    """Some digits that blocks, law and operator have in common with no other structure."""
+    """A hash of blocks, law and operator."""
     found = sha256(f"{problem.law} {problem.operator} {problem.m}".encode())
     found.update(problem.cones.ptr.tobytes() + problem.cones.kind.tobytes())
     return found.hexdigest()[:12]
@@ -176,7 +176,7 @@ def structure_of(problem: Problem) -> str:
 class Costs:
     """Costs of the candidates on one problem to `tol`.
 
-    `given`: rates in place of those of the file; `plan`: costs in place of counts.
+    `given`: rates to use instead of those of the file; `plan`: costs to use instead of counting.
     """
 
     def __init__(
@@ -196,7 +196,7 @@ class Costs:
 
     @property
     def sure(self) -> float:
-        """Times its counted cost that has to be left for who factors to begin: nine in ten end within it."""
+        """A factorisation begins only if this many times its counted cost is left; nine in ten end within it."""
         return float(self.rates["sure"])
 
     def floor(self, name: str) -> float:

@@ -1,22 +1,22 @@
 """Factor and solve; with bounds, block principal pivoting on the same factorisation.
 
     linear   A lambda = b by band, dense or sparse factorisation, then lambda <- lambda - A^-1 w (refinement)
-    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess which rows are free (all of a
-             narrow band, else those that a few sweeps leave free), solve them, exchange the rows of the
+    boxed    w = A lambda - b complementary to lower <= lambda <= upper: guess the set of free rows (all rows of a
+             narrow band, otherwise those that a few sweeps leave free), solve for them, exchange the rows of the
              wrong sign, repeat (`lavender_ext/pivot/principal.pyx`)
-    singular the same on A + s D, s = 1e-10, around the last answer c: (A + s D) lambda = b + s D c. A fixed
-             point solves A itself (proximal point method); on the rows it settles on, each pass is one
-             refinement that shrinks what A sees by s / (s + sigma). On a problem without a solution the
-             passes keep walking along some y >= 0 with A y = 0, b.y > 0: the certificate.
+    singular the same on A + s D, s = 1e-10, around the last solution c: (A + s D) lambda = b + s D c. A fixed
+             point solves A itself (proximal point method). Once the set of free rows no longer changes, each pass is
+             one step of refinement: it multiplies the error along an eigenvector of eigenvalue sigma by
+             s / (s + sigma). On a problem without a solution the passes diverge along some y >= 0 with A y = 0,
+             b.y > 0, which is the certificate.
 
-Exchanges, passes and what is tried where they are stuck run in `lavender_ext/pivot/direct.pyx`.
+All of this runs in `lavender_ext/pivot/direct.pyx`.
 
-Positive definite A: finite and exact to rounding, whatever `tol`. Singular positive semidefinite A: the
-message says so, and what cannot be refined to rounding is STALLED with the best iterate. Linear systems
-that are asymmetric or indefinite get LU with pivoting, and where that is singular its rank from an SVD.
-Bounded rows whose A is asymmetric are exchanged by LU: finite where exchanges do not go round in circles, which no
-energy then ends. Friction of boxes comes as such rows (`polyhedral.py`); where its exchanges do, complementary pivots
-follow.
+Positive definite A: finite and exact to rounding, for any `tol`. Singular positive semidefinite A: the message says so;
+if refinement does not reach rounding, the status is STALLED, with the best iterate. Linear systems that are asymmetric
+or indefinite are factored by LU with pivoting; if that is singular, an SVD gives the rank. Bounded rows with an
+asymmetric A are exchanged with LU: finite unless the exchanges cycle, which no decreasing energy excludes. Box friction
+becomes such rows (`polyhedral.py`); if its exchanges cycle, complementary pivots follow.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ BATCH = 32  # rounds between two checks of the clock and the residual
 
 @dataclass
 class DirectState:
-    """Factor of a linear system, or the rows of a boxed one; fresh before each run."""
+    """Factor of a linear system, or the rows of a boxed one; made anew before each run."""
 
     problem: Problem
     pivot: PivotState | None = None
@@ -111,14 +111,14 @@ class Direct:
 
 
 class Impatient(Direct):
-    """As `auto` asks first: bounded rows on which pivoting is stuck, or one shift singular, end it at once, STALLED."""
+    """For the first call by `auto`: if pivoting is stuck, or one shift is singular, it ends at once with STALLED."""
 
     patience: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
 class Enough(Direct):
-    """As `auto` asks where every row is free: what meets the tolerance is not refined."""
+    """For calls by `auto` with free rows only: a solution that meets the tolerance is not refined."""
 
     exact: ClassVar[bool] = False
 
@@ -146,7 +146,7 @@ def _general(problem: Problem, why: str) -> DirectState:
 
 
 class _Run:
-    """One solve: the best judged iterate so far, and what was spent."""
+    """One solve: the best judged iterate so far, and the work done."""
 
     def __init__(
         self,

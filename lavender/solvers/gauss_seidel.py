@@ -1,4 +1,4 @@
-"""Gauss-Seidel on free rows: lambda_i <- lambda_i - w_i / d_i, w of this moment (SOR with omega = 1)."""
+"""Gauss-Seidel on free rows: lambda_i <- lambda_i - w_i / d_i with the current w (SOR with omega = 1)."""
 
 from __future__ import annotations
 

@@ -20,27 +20,12 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     """
     cones = problem.cones
     if problem.rows is not None:
-        return graph.body_components(block_bodies(problem), problem.rows.n_bodies)
+        return graph.body_components(problem.rows.block_bodies, problem.rows.n_bodies)
     if problem.generalized is not None:
         return graph.tree_components(problem.derived.view)
     block = np.repeat(np.arange(cones.n_blocks, dtype=np.int32), np.diff(cones.ptr))
     indptr, indices, _ = problem._compressed
     return graph.matrix_components(cones.ptr, block, indptr, indices)
-
-
-def blocks_of_each(count: int, label: IntArray) -> list[IntArray]:
-    """Blocks of each island, in order, from the island of each block (k,)."""
-    order = np.argsort(label, kind="stable").astype(np.int32)
-    return np.split(order, np.searchsorted(label[order], np.arange(1, count)))
-
-
-def block_bodies(problem: Problem) -> IntArray:
-    """Bodies of each block (k, 2), -1 static; only with rows."""
-    rows = problem.rows
-    assert rows is not None
-    if rows.n_joints == 0:
-        return rows.contact_body
-    return np.concatenate([rows.joint_body, rows.contact_body])
 
 
 def rows_of(problem: Problem, blocks: IntArray) -> IntArray:

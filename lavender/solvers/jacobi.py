@@ -1,10 +1,10 @@
-"""Damped Jacobi, projected: every block on the same w = A lambda - b.
+"""Damped projected Jacobi: every block is updated with the same w = A lambda - b.
 
     lambda <- Pi(lambda - omega w / d),   omega = min(1, 1.6 / max_i sum_j |A_ij| / d_i) by default
 
 The row sum bounds the largest eigenvalue L of D^-1 A, and symmetric positive semidefinite A needs
-omega < 2 / L. Undamped (omega = 1), k coincident contacts give the factor k - 1 and never converge
-for k >= 2.
+omega < 2 / L. Without damping (omega = 1), k coincident contacts multiply the error by k - 1 and never
+converge for k >= 2.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Jacobi:
     Parameters
     ----------
     omega : float or None
-        Damping; None takes the safe value above.
+        Damping; None: the safe value above.
     """
 
     omega: float | None = None

@@ -1,7 +1,7 @@
-"""A factored problem written out in sweep order, so that a sweep reads memory from front to back.
+"""A problem with rows copied in sweep order, so that a sweep reads memory from front to back.
 
-Blocks stand in the order of the sweep, bodies are numbered by `lavender.ordering.body_ranks`. What a block reads
-has the same value, so the impulses have the same bits; only sums over all rows run in another order.
+Blocks are in the order of the sweep, and bodies are numbered by `lavender.ordering.body_ranks`. A block reads the same
+values, so the impulses have the same bits; only sums over all rows have another order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from lavender_ext.core.problem import Data
 
 __all__ = ["Layout", "lay_out"]
 
-# Contacts from which writing out pays: their arrays leave the second-level cache (measured: 1.0 to 1.1 times as
+# Contacts from which the copy pays: their arrays exceed the second-level cache (measured: 1.0 to 1.1 times as
 # fast at 10,000, twice at 100,000).
 LARGE = 8_000
 
@@ -43,7 +43,7 @@ class Layout:
 
 
 def pays(problem: Problem, order: Order) -> bool:
-    """A large problem, swept in one order that is not its own, joints first."""
+    """Whether the copy pays: a large problem, swept in a fixed order that is not its own, joints first."""
     rows = problem.rows
     if rows is None or order.is_given or not order.is_fixed or rows.n_contacts < LARGE:
         return False

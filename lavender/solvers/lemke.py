@@ -2,11 +2,12 @@
 
     w = q + M s + c z,   w, s >= 0,  w_i s_i = 0,   z from its first value down to 0
 
-The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (positive semidefinite ones
-are) a ray proves that there is none: its direction is the certificate, checked before INFEASIBLE is said.
-How bounded rows become nonnegative ones stands in `lavender_ext/pivot/lemke.pyx`, where all of it runs: paths, by other
-covering vectors c past rays that prove nothing and past lost ones, and at the end of each the exchanges of `direct`,
-which solve the rows found free on A itself. Ties are broken lexicographically: no cycles, in exact arithmetic.
+The path ends at z = 0, a solution, or on a secondary ray. For copositive-plus M (which includes positive semidefinite
+M) a ray proves that there is no solution; its direction is the certificate, which is checked before INFEASIBLE is
+returned. All of it runs in `lavender_ext/pivot/lemke.pyx`, which also transforms bounded rows into nonnegative ones.
+If a path ends on a ray that proves nothing, or is lost to rounding, another covering vector c is tried. After each
+path the exchanges of `direct` solve for the free rows on A itself. Ties are broken lexicographically, which excludes
+cycles in exact arithmetic.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The candidates of `auto` as its schedule runs them: turns of counted work, each on from where it stood if it can.
+"""The candidates of `auto` as its schedule runs them: turns of counted work, continued if possible.
 
 rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n             (1)
 """
@@ -27,18 +27,18 @@ from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
 
 __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 
-FIRST = 32  # sweeps before the first look at what they promise
+FIRST = 32  # sweeps before the first prediction of their remaining cost
 MOST = 2**30  # sweeps of one call
-PROBE = 0.5  # of the time that is left: for iterations whose pace is not known yet
+PROBE = 0.5  # share of the time left that iterations of unknown pace may take
 
 
 class Candidate:
-    """One of them on the problem of a log; its cost is a bound from below until it is counted."""
+    """A candidate on the problem of a log; its cost is a lower bound until it is counted."""
 
     again = False  # begins anew in each turn
     is_finite = False  # factors
-    patient = False  # has another turn, though the last ended above the tolerance by itself
-    others = np.inf  # least remainder of the others [ns]
+    patient = False  # may have another turn although the last ended by itself above the tolerance
+    others = np.inf  # least remaining cost of the others [ns]
 
     def __init__(self, name: str, log: Any, costs: Costs, spec: SolverSpec) -> None:
         self.name, self.log, self.costs, self.spec = name, log, costs, spec
@@ -53,17 +53,17 @@ class Candidate:
 
     @property
     def shown(self) -> str:
-        """The solver's name, as it is told."""
+        """The solver's name in messages."""
         return self.spec.name
 
     def steps(self, work: float) -> int:
-        """Iterations of a turn of so much work, 0 where not even the first would end in time."""
+        """Iterations of a turn of so much work; 0 if not even the first would end in time."""
         begun = self.spent > 0.0 and not self.again
         setup = 0.0 if begun else self.cost.setup
         n = max(1, int((work - setup) / self.cost.each))
         left = max(self.cost.total - self.spent * begun, 0.0)
         if self.is_finite and self.log.ends_late(self.costs.sure * left):
-            return 0  # what comes of it before its end is seldom worth its time
+            return 0  # what it achieves before its end is seldom worth its time
         return min(n, self.log.left, self.spec.max_iter if self.again else n)
 
     def run(self, work: float, others: float) -> bool:
@@ -77,7 +77,7 @@ class Candidate:
         return self.has_done(claim)
 
     def has_done(self, claim: Claim) -> bool:
-        """What a turn took, and what is left; whether it may have another."""
+        """Count what a turn took and what is left; return whether it may have another."""
         last = max(claim.iterations, 1) * self.cost.each
         if self.again or self.spent == 0.0:
             last += self.cost.setup
@@ -88,16 +88,16 @@ class Candidate:
         return claim.status is Status.MAX_ITERATIONS or self.patient
 
     def turn(self, n: int) -> Claim:
-        """At most n iterations; what came of them is offered to the log."""
+        """Run at most n iterations and offer the result to the log."""
         raise NotImplementedError
 
     def promise(self) -> float:
-        """What is left by what was seen so far [ns]."""
+        """The remaining cost that it predicts [ns]."""
         return 0.0
 
 
 class Resumed(Candidate):
-    """A solver that goes on where it stood, in short runs for the clock and Ctrl-C: cut anywhere, the same bits."""
+    """A solver that continues where it stopped; runs are short, for the clock and Ctrl-C, without changing its bits."""
 
     solver: Any = None
     impulse: FloatArray  # (m,) N s
@@ -116,7 +116,7 @@ class Resumed(Candidate):
         if not self.spent:
             self.begin()
         self.work, done, left = {}, 0, log.deadline.left()
-        while True:  # as many iterations as are likely to end in time; a look at the end costs about one
+        while True:  # as many iterations as are likely to end in time; a check at the end costs about one
             time = CHUNK_TIME if left is None else min(CHUNK_TIME, left if log.pace else PROBE * left)
             step = min(max(1, int(1e9 * time / ((log.pace or 1.0) * each))), n - done)
             last = self.iterate(step)
@@ -132,7 +132,7 @@ class Resumed(Candidate):
         return Claim(self.status, done, self.work)
 
     def iterate(self, n: int) -> int:
-        """At most n iterations; how many there were."""
+        """Run at most n iterations; return their number."""
         claim: Claim = self.solver.run(self.state, self.impulse, n, self.log.tol, None)
         self.status = claim.status
         for kind, count in claim.work.items():
@@ -140,7 +140,7 @@ class Resumed(Candidate):
         return claim.iterations
 
     def close(self) -> None:
-        """Offer what came of a turn."""
+        """Offer the result of a turn."""
         self.log.offer(self.impulse)
         # some states only say why nothing could be prepared
         best = getattr(self.state, "best", (np.inf, None))
@@ -149,26 +149,27 @@ class Resumed(Candidate):
 
 
 class Sweeps(Resumed):
-    """Accelerated sweeps, with looks at what they promise (`lavender_ext/small/checked_sweeps.pyx`)."""
+    """Accelerated sweeps with checks that predict their cost (`lavender_ext/small/checked_sweeps.pyx`)."""
 
-    relative = 1.0  # residual of the last look
-    least = 0.0  # ns that another method takes at least
+    relative = 1.0  # residual of the last check
+    least = 0.0  # ns, lower bound of the cost of any other method
     told = 0, 0  # sweeps and restarts of the turns before
     alone = False  # the first turn has all of the time,
     before = 1.0  # the residual that it begins at,
     claim: Claim  # and what came of it
 
     def set_up(self) -> None:
-        """All that needs no impulse, and what is to be known when time is short."""
+        """Set up everything that does not depend on the impulse, and count the costs that short limits need."""
         problem = self.costs.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
         self.state = CheckedSweeps(problem.metric, operator(problem), problem.law == "cone", split)
         self.count()
 
     def run_first(self, log: SolveLog) -> bool:
-        """Half of the time, and all of it where the other half is too short for any other; whether any may follow.
+        """Sweep for half of the time, or for all of it if the other half is too short for any other method.
 
-        Where none follows nothing but sweeping is done here: `end` judges the last, when the clock has stopped.
+        Return whether another may follow. If not, nothing but sweeps runs here; `end` judges the last impulse when the
+        clock has stopped.
         """
         self.log, self.before = log, log.best
         deadline, each = log.deadline, 1e-9 * self.cost.each
@@ -195,7 +196,7 @@ class Sweeps(Resumed):
         return True
 
     def end(self) -> None:
-        """Of the first turn: what came of it."""
+        """Offer and note the result of the first turn."""
         log, looks = self.log, self.state
         if looks.best is not None:
             log.take(looks.best)
@@ -217,7 +218,7 @@ class Sweeps(Resumed):
             self.set_up()
 
     def iterate(self, n: int) -> int:
-        """At most n, given up where they promise no end for less than the others."""
+        """Run at most n sweeps; stop early if they predict a larger remaining cost than that of the others."""
         looks = self.state
         done, step = looks.done, min(max(looks.done // 2, FIRST), n)
         looks.run(self.impulse, self.relative, n, self.log.tol, step, FIRST, self.others / self.cost.each)
@@ -237,11 +238,11 @@ class Sweeps(Resumed):
 
 
 class Relaxation(Resumed):
-    """Sweeps of the convex relaxation from doing nothing, judged by Coulomb's law; from where these stand `nncg`."""
+    """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law; then `nncg` from their result."""
 
     relative = 1.0  # by Coulomb's law, at the last look
     left = np.inf  # sweeps, by (1)
-    slow = False  # the relaxation is not the answer, or not soon
+    slow = False  # the relaxation does not solve the problem, or not soon
     done = 0  # iterations of all turns
 
     def begin(self) -> None:
@@ -262,7 +263,7 @@ class Relaxation(Resumed):
     shown_by = "relaxation"
 
     def iterate(self, n: int) -> int:
-        """With looks at Coulomb's residual, which goes on falling with the relaxation's where contacts stick."""
+        """With checks of the residual under Coulomb's law, which falls with the relaxation's where contacts stick."""
         log, done = self.log, 0
         while done < n:
             step = min(max((self.done + done) // 2, FIRST), n - done)
@@ -279,7 +280,7 @@ class Relaxation(Resumed):
         return done
 
     def close(self) -> None:
-        """Offered at each look; where the relaxation brought no end, the next turn is of another kind."""
+        """Results were offered at each check; if the relaxation has not converged, the next turn is by `nncg`."""
         self.slow = True
 
     def promise(self) -> float:
@@ -291,7 +292,7 @@ class Relaxation(Resumed):
 
 
 class Velocities(Candidate):
-    """Newton's method over generalised velocities, on from where its steps were used up."""
+    """Newton's method over generalised velocities, continued where its steps were used up."""
 
     is_finite = True
     begun = False

@@ -2,22 +2,22 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   s = H z - g complementary to z on every block
 
-0. A warm start over bodies is judged first; then at most 64 sweeps (counted in `work`), or one banded factorisation of
-   joints alone, where these will do (`warm_start.py`).
-1. Bounded rows by exchanges (Newton's method on the natural map) from the warm start and from the solution of H z = g.
-2. A cold Mehrotra interior point, polished on the identified rows as soon as it has found them, to the floor of
-   float64.
-3. Where that stops short on rows that nearly depend on each other: both again through the augmented
-   system of the bodies.
-4. Coulomb friction by a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
-   law, whose convex problem moves with every step.
+0. A warm start over bodies is judged first. If at most 64 sweeps (counted in `work`), or one banded factorisation of
+   joints without other rows, can bring it to tol, these run (`warm_start.py`).
+1. Bounded rows: active-set exchanges (Newton's method on the natural map) from the warm start and from the solution of
+   H z = g.
+2. A cold-started Mehrotra interior point. As soon as the active rows are identified, the solution on them is computed
+   to the floor of float64.
+3. If rows are nearly dependent and 1 and 2 fail: both again, with the augmented system of the bodies.
+4. Coulomb friction: a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
+   law, whose convex problem changes with every step.
 
-Problems in generalised coordinates go over their velocities first (`newton_systems/general.py`), where A is never
-formed; what that leaves goes on as above, over the rows of A, unless form="velocity".
+Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
+forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity".
 
-1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and taken in turns; the clock, Ctrl-C and proofs are asked for in
-between. Their systems stand in `newton_systems/`. Form "velocity" factors I + K^T V K over the bodies and never
-squares J; "impulse" factors over the rows.
+1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and run one factorisation at a time; in between, Python checks the
+clock, Ctrl-C and certificates. `newton_systems/` makes their linear systems. Form "velocity" factors I + K^T V K over
+the bodies and does not square J; "impulse" factors over the rows.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ WARM = 1e-3  # relative residual from which rows of A go on from what velocities
 
 @dataclass
 class NewtonState:
-    """The system of a problem, made once."""
+    """The linear system of a problem, made once."""
 
     problem: Problem
     system: System | None  # None where nothing moves

@@ -3,14 +3,14 @@
     x_k = y_{k-1} + beta_{k-1} p_{k-2},    y_k = S(x_k),    g_k = x_k - y_k
     beta_k = g_k.D g_k / g_{k-1}.D g_{k-1},    p_k = beta_k p_{k-1} - g_k,    D = diag d
 
-A sweep S stands in for a gradient step, Fletcher and Reeves' beta for the line search; beta > 1 restarts.
-One sweep and three passes over vectors an iteration; on piles a third of the sweeps of `pgs` to 1e-9.
-With order="symmetric" an iteration is a sweep and the same sweep backwards, near to a preconditioned
-conjugate gradient: slower where `pgs` is fast, much faster on tall stacks and mass ratios.
+A sweep S replaces the gradient step, and beta is that of Fletcher and Reeves, without a line search; the method
+restarts if beta > 1. An iteration is one sweep and three passes over vectors. On piles it needs a third of the sweeps
+of `pgs` to reach 1e-9. With order="symmetric" an iteration is a sweep and the same sweep backwards, similar to a
+preconditioned conjugate gradient step: slower where `pgs` is fast, much faster on tall stacks and large mass ratios.
 
-Where contacts slide, g is no gradient: sweeps then creep along one direction, g hardly changing, until a contact
-sticks, lifts or slips. There beta > 1 says nothing, and with restart="against" p is dropped only where it points
-against the sweep as well, p.D g > 0, else kept whole, beta = 1: creeping becomes running.
+If contacts slide, g is not a gradient: sweeps then move slowly along one direction with nearly constant g until a
+contact sticks, lifts or slips, and beta > 1 carries no information. With restart="against", p is dropped only if it
+also points against the sweep, p.D g > 0; otherwise it is kept with beta = 1, which speeds up this slow motion.
 """
 
 from __future__ import annotations

@@ -1,13 +1,12 @@
-"""Projected Gauss-Seidel: one block after the other on w = A lambda - b of this moment.
-
-In generalised coordinates over u = Y^T lambda, J M^-1 J^T = Y Y^T, where that costs less than A (w = Y u - b).
+"""Projected Gauss-Seidel: updates one block after the other with the current w = A lambda - b.
 
     row       lambda <- clip(lambda - w / d, lower, upper)
     contact   lambda_n <- max(0, lambda_n - w_n / d_n), then the tangents together with one scalar step
               1 / lambda_max(A_tt) projected radially on mu lambda_n, then spin
 
-Linear convergence for symmetric positive semidefinite A. A sweep over A is `relax_csr_block` of
-`lavender_ext/sweep/pgs.pxd` for one block after the other.
+It converges linearly for symmetric positive semidefinite A. A sweep over A calls `relax_csr_block` of
+`lavender_ext/sweep/pgs.pxd` for one block after the other. In generalised coordinates it keeps u = Y^T lambda instead,
+with J M^-1 J^T = Y Y^T and w = Y u - b, if that costs less than forming A.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs t
 
 
 class Timed:
-    """A factorisation by Python, which is not begun where it would end after the deadline."""
+    """A factorisation by Python, which does not begin if it would end after the deadline."""
 
     def __init__(self, inner: Factor, seconds: float) -> None:
         self.inner = inner
@@ -39,7 +39,7 @@ class Timed:
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """As `Factor`; -1 where it is not begun."""
+        """As `Factor`; -1 if it was not begun."""
         if self.deadline.passed(self.seconds):
             return -1
         watch = Stopwatch()
@@ -95,7 +95,7 @@ class PivotState:
 
     @property
     def sweeps(self) -> int:
-        """Symmetric sweeps that guess the free rows: few before a compiled factor, else as cost a share of one."""
+        """Symmetric sweeps that guess the free rows: few before a compiled factor, else a share of its cost."""
         if self.outside is None:
             return SWEEPS
         m, data = self.problem.m, self.problem.csr_data

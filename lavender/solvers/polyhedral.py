@@ -1,4 +1,4 @@
-"""Friction whose every row is bounded by itself, as a problem of bounded rows, for solvers that take nothing else.
+"""Friction with a bound for each tangent, as a problem of bounded rows, for solvers that accept only these.
 
 Of a contact with the normal impulse n and bounds |t_i| <= c_i n, lambda = E z:
 
@@ -42,7 +42,7 @@ class AsRows:
     back: sp.csr_array  # E (m, n)
 
     def start(self, impulse: FloatArray) -> FloatArray:
-        """Some z (n,) of a feasible impulse (m,), the nearest one of what is not."""
+        """Some z (n,) of a feasible impulse (m,), or of the nearest feasible one."""
         c, out = self.problem.cones, []
         x = project(c, impulse)
         for i, sides in _blocks(self.problem):
@@ -117,7 +117,7 @@ def as_rows(problem: Problem) -> AsRows:
 
 
 def count_rows(problem: Problem) -> int:
-    """At most so many rows, n: what (1) or (2) of a problem without disks has."""
+    """Upper bound of the number of rows n of (1) or (2), for a problem without disks."""
     c = problem.cones
     if problem.law == "cone":
         sides = np.where(c.kind == ROW, 0, np.diff(c.ptr) - 1)
@@ -170,7 +170,7 @@ class ThroughRows:
     def run(
         self, held: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        """At most n iterations; the claim is of the problem itself."""
+        """Run at most n iterations; the claim refers to the original problem."""
         if not isinstance(held, Held):
             return self.solver.run(held, impulse, max_iter, tol, time_limit)
         form = held.form

@@ -1,18 +1,18 @@
-"""The schedule of `auto`: always the method with the least expected remainder, for as long as that is.
+"""The schedule of `auto`: repeatedly, the method with the least expected remaining cost gets a turn of that length.
 
-Of k methods each has a remainder r_i, first its expected cost e_i. The one with the least r_i has a turn of r_i; where
-that is not the end,
+Each of k methods has an expected remaining cost r_i, at first its expected cost e_i. The method with the least r_i runs
+for a turn of length r_i. If it has not converged, then
 
-    r_i = s_i, what it has spent so far, or what it promises, if that is more, up to BELIEVED s_i               (1)
+    r_i = max(s_i, min(p_i, BELIEVED s_i))     s_i: spent so far, p_i: remaining cost that it predicts          (1)
 
-Where j would end after c_j, and every method goes on where it stood,
+If method j would converge after c_j, and every method continues where it stopped,
 
     all turns together <= (2k - 1) max(e_j, BELIEVED c_j)                                                      (2)
 
-since r_j <= max(e_j, BELIEVED s_j) all the time, the last turn of any other began with r_i <= r_j and was no longer,
-and by (1) it had spent no more than r_i before. Without promises BELIEVED is 1 in (2). A method that begins anew in
-each turn has r_i = twice its last run in place of s_i, which is no less than all it has spent; its turns may be
-BELIEVED r_i long, so that it is rarely cut short, and in (2) it counts for 1 + BELIEVED where others count for 2.
+because r_j <= max(e_j, BELIEVED s_j) at all times, the last turn of any other method began with r_i <= r_j and was no
+longer, and by (1) it had spent at most r_i before. Without predictions BELIEVED is 1 in (2). A method that begins anew
+in each turn has r_i = twice its last run in place of s_i, which is at least all that it has spent. Its turns may be
+BELIEVED r_i long, so that it is rarely cut short; in (2) it counts for 1 + BELIEVED where others count for 2.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from typing import Any, Protocol
 
 __all__ = ["BELIEVED", "Method", "first", "race", "remainder"]
 
-# Times what a method has spent, that its promise of a remainder may be, and times its remainder, that a turn of one may
-# be which cannot go on where it stood. Arbitrary: half or twice as much moves regret by less than 0.01, of either.
+# The largest prediction, relative to what a method has spent; and the longest turn of a method that begins anew,
+# relative to its remaining cost. Arbitrary: half or twice as much changes regret by less than 0.01, for either.
 BELIEVED = 8.0
 
 
 class Method(Protocol):
     """What the schedule knows of a method."""
 
-    rest: float  # expected remainder [ns]
-    counted: bool  # `rest` was counted closely; else it is a bound from below
+    rest: float  # expected remaining cost [ns]
+    counted: bool  # `rest` is the counted cost; otherwise it is a lower bound
 
     def count(self) -> None:
-        """Count `rest` closely."""
+        """Replace the lower bound `rest` by the counted cost."""
 
     def run(self, work: float, others: float) -> bool:
-        """A turn of so much work [ns]; whether it may have another, with a new `rest`.
+        """Run a turn of so much work [ns]; return whether it may have another, with a new `rest`.
 
         It may end sooner, where what is left of the turn promises less than the least remainder of the others.
         """
 
 
 def race(methods: list[Method], done: Callable[[], bool]) -> None:
-    """Turns until `done()` or nobody is left; of equal remainders the first in the list comes first."""
+    """Run turns until `done()` or no method is left; of equal remaining costs, the first in the list is chosen."""
     left = list(methods)
     while left and not done():
         chosen = first(left)
@@ -55,7 +55,7 @@ def race(methods: list[Method], done: Callable[[], bool]) -> None:
 
 
 def first(methods: list[Any]) -> Any:
-    """Who has the next turn; bounds from below are counted closely where they are the least."""
+    """The method of the next turn; a lower bound that is the least is first replaced by the counted cost."""
     while True:
         chosen = min(methods, key=lambda method: method.rest)
         if chosen.counted:
@@ -64,5 +64,5 @@ def first(methods: list[Any]) -> Any:
 
 
 def remainder(spent: float, promised: float) -> float:
-    """(1) of a method that goes on where it stood."""
+    """(1) for a method that continues where it stopped."""
     return max(spent, min(promised, BELIEVED * spent))

@@ -1,11 +1,11 @@
-"""Sequential impulses: projected Gauss-Seidel on body velocities, A never formed.
+"""Sequential impulses: projected Gauss-Seidel on body velocities, without forming A.
 
     w_i = J_i v - b_i + c_i lambda_i,   lambda_i <- update of `lavender_ext/core/block.pxd`,
     v <- v + M^-1 J_i^T (change of lambda_i)
 
-with v = M^-1 J^T lambda, the change of velocity. Equal to `pgs` on the same order, sweep by sweep, to
-rounding; a contact costs the same whatever the number of its neighbours. In a fixed order contacts
-and joints are swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
+with v = M^-1 J^T lambda, the change of velocity. In the same order, each sweep equals one of `pgs` up to rounding,
+but the cost of a contact does not depend on the number of its neighbours. In a fixed order, contacts and joints are
+swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from lavender_ext.sweep import serial
 class ImpulseState(SweepState):
     """A sweep state with v = M^-1 J^T lambda (n + 2, 6), formed once and kept by the sweeps.
 
-    Behind the bodies stand zeros, and what packed blocks write for a static one. A large problem that is swept
-    in an order of its own is written out in that order; the impulse of the sweeps is then `laid`.
+    The last two rows are zeros, and a dummy to which packed blocks write the velocity of a static body. A large problem
+    with an order of its own is copied in that order; the impulse of the sweeps is then `laid`.
     """
 
     velocity: FloatArray | None = None

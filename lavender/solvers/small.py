@@ -1,8 +1,9 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
-Few rows of bodies or of A, islands of few rows under friction (`lavender_ext/small/call.pyx`), generalised coordinates
-where Newton's method is counted to cost little (`lavender_ext/small/many.pyx`): what Python costs outweighs such a
-problem. The call ends with a solution or not at all: then the solver runs as on any problem, from the beginning.
+It is used for few rows of bodies or of A and for small islands under friction (`lavender_ext/small/call.pyx`), and
+for generalised coordinates if Newton's method is counted to cost little (`lavender_ext/small/many.pyx`), because
+Python would cost more than such a solve. If the call does not find a solution it returns nothing, and the solver runs
+as on any other problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first
 
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
-# Rows of an island at most: dense factors of so many cost less than the sweeps and factors of all islands together.
+# The most rows of an island: up to these, dense factors cost less than sweeps and factors of all islands together.
 ISLAND = 150
-SWEPT = 32  # sweeps of a part at most, before its factors
-FACTORED = 0.05  # ns of a multiply-add of factors of parts
-# ns over generalised velocities, as counted, up to which `auto` looks at nothing else before, since sweeps often end
-# Coulomb's law sooner; and up to which nobody looks at the clock in between.
+SWEPT = 32  # the most sweeps of a part before its first factorisation
+FACTORED = 0.05  # ns per multiply-add of the factorisations of parts
+# Counted cost [ns] of Newton's method over generalised velocities up to which `auto` tries it first (less under
+# Coulomb's law, where sweeps often converge sooner); and MOST, up to which the clock is not read in between.
 AT_ONCE = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
 MOST = 1e7
 
@@ -46,7 +47,7 @@ def velocities_cost(problem: Problem, largest: int) -> float:
 
 
 def limits(most: float, most_coulomb: float) -> Limits:
-    """What may be counted to cost so much at most [ns] is let in."""
+    """Limits of the compiled call: the most counted cost [ns], and that under Coulomb's law."""
     v = rates()["velocities"]
     count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
     return Limits(
@@ -55,7 +56,7 @@ def limits(most: float, most_coulomb: float) -> Limits:
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
-    """The compiled call takes a quarter of the limit [s] at most: without an end it leaves nothing."""
+    """Whether the compiled call, which may return nothing, takes at most a quarter of the limit [s]."""
     if time_limit is None or (problem.generalized is None and problem.law in ("linear", "lcp")):
         return True
     if problem.generalized is not None:
@@ -69,7 +70,7 @@ def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
 
 
 def prepared(problem: Problem) -> Any:
-    """The compiled call of a problem of few rows or of islands of few, kept with it; None where it has none."""
+    """The compiled call of a small problem or of small islands, kept with the problem; None if it has none."""
     kept = problem.derived.small
     if kept is None:
         kept = problem.derived.small = _make(problem) or False
@@ -113,9 +114,9 @@ class SmallCall:
     hands_over: bool = False
 
     def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, capped: bool = False) -> Any:
-        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left.
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None if it does not converge.
 
-        capped: under a time limit, with no more factors than `call_ends_within` counts.
+        capped: under a time limit, with no more factorisations than `call_ends_within` counts.
         """
         kept = problem.derived
         if not tol > 0.0 or problem.m == 0:
@@ -135,14 +136,14 @@ class SmallCall:
             if not small or not (self.pivots if small.pivots else self.hands_over):
                 return None
             found = small.run(impulse, tol, self.hands_over, WARM, capped)
-        if found is None and not capped:  # the steps of who solves it the long way need not come twice before
+        if found is None and not capped:  # the same steps need not be done again before the full solver
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found
 
     def claim(
         self, problem: Problem, counts: tuple[int, ...] | None, start: FloatArray | None, after: float
     ) -> Claim:
-        """What the solver says of a call that did so much from a start (m,) or from none to a residual `after`."""
+        """The claim for a call with these counts, from a start (m,) or from none to a residual `after`."""
         if counts is None:
             return Claim(Status.CONVERGED, 0, {}, "the start is a solution")
         if problem.generalized is not None:

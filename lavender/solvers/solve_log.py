@@ -20,8 +20,9 @@ from lavender_ext.judge.measure import Judged
 
 __all__ = ["SolveLog"]
 
-STILL = 32  # turns in a row, most of them longer than those before, that leave
-GAIN = 0.99  # of the residual: then nobody gets anywhere
+# `auto` gives up after STILL turns in a row that reduced the residual by less than the factor GAIN.
+STILL = 32
+GAIN = 0.99
 
 
 class SolveLog:
@@ -39,16 +40,16 @@ class SolveLog:
         self.by = (
             problem.metric if by is None else by
         )  # what impulses are judged by: as given, or A formed of it
-        self.end: Callable[[], None] | None = None  # what is left to do when the clock has stopped
+        self.end: Callable[[], None] | None = None  # called when the clock has stopped
         self.interrupted = False
-        self.timed_out = False  # it ended for want of time, a little before the deadline
+        self.timed_out = False  # it ended a little before the deadline, as the rest of the time was too short
         self.best, self.impulse = np.inf, problem._start  # least relative residual, (m,) N s
-        self.given: FloatArray | None = None  # (m,) N s, a start that doing nothing is better than
+        self.given: FloatArray | None = None  # (m,) N s, a start that is worse than doing nothing
         self.turns: list[Turn] = []
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
-        self.pace = 0.0  # s for each counted ns, times 1e9, as far as a time limit asks for it; 0: not known
+        self.pace = 0.0  # measured time / counted time, under a time limit; 0: not known
 
     def offer(self, impulse: FloatArray) -> float:
         """Judge an impulse (m,) and keep it if it is the best."""
@@ -60,9 +61,9 @@ class SolveLog:
         return relative
 
     def take(self, last: Judged) -> float:
-        """Keep what was judged if it is the best, for who judges the result as well; its relative residual.
+        """Keep a judged impulse if it is the best, also for the final judgement; return its relative residual.
 
-        A that was formed bears no solution out: rounding made it another problem.
+        A solution is judged by the given data, not by an A formed from them, which rounding has changed.
         """
         if last.relative <= self.tol and last.data is not self.problem.metric:
             last = Judged(self.problem.metric, last.impulse)
@@ -73,7 +74,7 @@ class SolveLog:
         return relative
 
     def note(self, name: str, claim: Claim, before: float) -> None:
-        """A turn has ended: what it did since the residual was `before`."""
+        """Record a turn that has ended; the residual was `before`."""
         self.iterations += claim.iterations
         for kind, count in claim.work.items():
             self.work[kind] = self.work.get(kind, 0) + count
@@ -97,7 +98,7 @@ class SolveLog:
 
     @property
     def time_left(self) -> float | None:
-        """s until the time limit, as solvers take it."""
+        """s until the time limit, for a solver's `time_limit`."""
         return self.deadline.left(1e-5)
 
     @property
@@ -105,12 +106,12 @@ class SolveLog:
         return self.timed_out or self.deadline.passed()
 
     def ends_late(self, cost: float) -> bool:
-        """What is counted for so long [ns] would end after the deadline, at the pace so far."""
+        """Whether a step of this counted cost [ns] would end after the deadline, at the pace so far."""
         return self.deadline.passed(1e-9 * (self.pace or 1.0) * cost)
 
     @property
     def still(self) -> bool:
-        """The last turns gained next to nothing."""
+        """The last turns hardly reduced the residual."""
         return len(self.turns) > STILL and self.best > GAIN * self.turns[-STILL].before
 
     @property
@@ -119,7 +120,7 @@ class SolveLog:
         return bool(self.turns) and self.best > GAIN * self.turns[-1].before
 
     def done(self) -> bool:
-        """Solved, proven to have no solution, or at an end."""
+        """Solved, proved infeasible, or out of time, iterations or progress."""
         return (
             self.still
             or self.best <= self.tol
@@ -154,8 +155,10 @@ class SolveLog:
         return Status.MAX_ITERATIONS if self.left <= 0 else Status.STALLED
 
     def claim(self) -> Claim:
-        """All of it, told."""
-        nothing = "no time for anything" if self.budget > 0 else "no iterations were asked for"
+        """The claim of the whole solve."""
+        nothing = (
+            "the time limit left no time for a solver" if self.budget > 0 else "no iterations were asked for"
+        )
         if self.best <= self.tol:
             nothing = "the start is a solution"
         return Claim(
@@ -171,11 +174,11 @@ class SolveLog:
 
     @cached_property
     def islands(self) -> tuple[int, IntArray]:
-        """How many, and the island of each block."""
+        """The number of islands, and the island of each block."""
         return islands(self.problem)
 
     def wrong_islands(self) -> IntArray:
-        """Which islands miss an equal share of the whole tolerance, in energy, or the tolerance in velocity.
+        """The islands that miss an equal share of the tolerance in energy, or the tolerance in velocity.
 
         A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
         """

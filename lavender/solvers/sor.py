@@ -1,4 +1,4 @@
-"""Successive over-relaxation on free rows: lambda_i <- lambda_i - omega w_i / d_i, w of this moment.
+"""Successive over-relaxation on free rows: lambda_i <- lambda_i - omega w_i / d_i with the current w.
 
 Converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Reich).
 """

@@ -1,4 +1,4 @@
-"""What the structure of a problem says of the work of each method, counted when it is first asked and then kept.
+"""The work of each method on a problem, counted from its structure when first needed, and kept.
 
 sweep        multiply-adds of one sweep
 factor       weighted multiply-adds of one factorisation: of A (`direct`), of Newton's matrix over rows, bodies or
@@ -18,7 +18,6 @@ from lavender.registry import SMALL_ROWS
 from lavender.solvers import weights
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
-from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.small import AT_ONCE, prepared, velocities_cost
@@ -57,7 +56,7 @@ class Structure:
 
     @cached_property
     def formed(self) -> float:
-        """Entries of A that are formed of J and M by who needs it; 0 where A was given, or sweeps form it as well."""
+        """Entries of A that a method has to form from J and M; 0 if A was given, or if sweeps form it as well."""
         return self.entries if reads_whitened(self.problem) else 0.0
 
     def admm(self, n: float) -> tuple[float, float]:
@@ -69,11 +68,11 @@ class Structure:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Nearly every contact between two bodies of its own, not one of a face: sweeps then settle which stick."""
+        """Nearly every contact joins another pair of bodies: sweeps then decide which contacts stick."""
         p = self.problem
         if p.rows is None or not p.rows.n_bodies:
             return False
-        return 4 * graph.body_pairs(block_bodies(p), p.rows.n_bodies, True) > 3 * p.n_blocks
+        return 4 * graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) > 3 * p.n_blocks
 
     # -- factors of A ------------------------------------------------------------------------------
 
@@ -112,7 +111,7 @@ class Structure:
         """Of A in the order of blocks, or of a tree."""
         p = self.problem
         assert p.rows is not None
-        bodies, n = block_bodies(p), p.rows.n_bodies
+        bodies, n = p.rows.block_bodies, p.rows.n_bodies
         width = float(graph.body_spread(p.cones.ptr, bodies, n) + 1)
         if self._loops <= TREE:
             of = np.repeat(bodies, np.diff(p.cones.ptr), axis=0)
@@ -130,7 +129,7 @@ class Structure:
 
     @cached_property
     def system(self) -> System:
-        """Newton's system over the bodies, else over the rows of A; who factors later takes it over."""
+        """Newton's system over the bodies, or over the rows of A; a later factorisation uses it."""
         rows = self.problem.rows
         return make_system(self.problem, "impulse" if rows is None or rows.n_bodies == 0 else "velocity")
 
@@ -141,7 +140,7 @@ class Structure:
 
     @property
     def newton_least(self) -> float:
-        """At least that of a tree of bodies, or of a diagonal; loops fill it."""
+        """A lower bound: the factor for a tree of bodies, or for a diagonal matrix; loops add fill-in."""
         p = self.problem
         if p.rows is not None and p.rows.n_bodies:
             turns = p.rows.inv_inertia.any() and (p.rows.n_joints or p.m > p.n_blocks)
@@ -160,18 +159,18 @@ class Structure:
         p = self.problem
         if p.rows is None or p.rows.n_bodies == 0:
             return 1.0
-        return max(1.0, graph.body_pairs(block_bodies(p), p.rows.n_bodies, False) / p.rows.n_bodies)
+        return max(1.0, graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, False) / p.rows.n_bodies)
 
     # -- velocities of generalised coordinates -----------------------------------------------------
 
     @cached_property
     def kernel(self) -> Any:
-        """Newton's method over them with its room; None where there is none for it."""
+        """Newton's method over them with its memory; None if the problem is too large for it."""
         return None if self.problem.generalized is None else general.prepare(self.problem)
 
     @cached_property
     def goes_first(self) -> bool:
-        """It is what the compiled call for few rows does."""
+        """The compiled call does the same."""
         kernel = self.kernel
         return (
             kernel is not None and velocities_cost(self.problem, kernel.largest) <= AT_ONCE[self.problem.law]

@@ -1,6 +1,7 @@
-"""What every sweep solver shares: an order, a count of sweeps, and checks at counts that the numbers set.
+"""What every sweep solver shares: an order, a count of sweeps, and residual checks.
 
-The checks are in `lavender_ext/judge/watch.pxd`: the judge's arithmetic, half way to the expected end each time.
+The checks are in `lavender_ext/judge/watch.pxd`. They use the judge's arithmetic; each comes half way to the expected
+end, so their places depend only on the numbers.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def watch_over(problem: Problem, data: Any, patience: int) -> Watch:
 
 
 class SweepState:
-    """Where a run stands; the watch counts sweeps and keeps the best checked iterate."""
+    """State of a run; the watch counts sweeps and keeps the best checked iterate."""
 
     alone: dict[str, Any] | None = None  # how long the leader of several threads goes on alone
 
@@ -68,12 +69,12 @@ class SweepState:
 
     @property
     def sweeps_per_decade(self) -> float:
-        """Sweeps in which the residual falls tenfold; NaN where it does not."""
+        """Sweeps in which the residual falls tenfold; NaN if it does not fall."""
         return float(self.watch.sweeps_per_decade)
 
 
 def claim(status: int, done: int) -> Claim:
-    """What a kernel of sweeps says: how it ended, and after how many."""
+    """The claim from what a kernel of sweeps returns: how it ended, and after how many sweeps."""
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
@@ -139,7 +140,7 @@ def swept(problem: Problem) -> Any:
 
 
 def over(data: Any) -> str:
-    """What sweeps ran over, in words."""
+    """The form that sweeps ran over, in words."""
     return "whitened J" if data.is_general else "body velocities" if data.factored else "rows of A"
 
 
@@ -157,7 +158,7 @@ class Sweeping:
         return self._state(problem, order, None)
 
     def update(self, state: Any, problem: Problem) -> Any:
-        """The same of new numbers: levels, colours and places of a fixed order come from the structure, and stay."""
+        """The state for new numbers; levels, colours and places of a fixed order are kept."""
         if not state.plan.is_fixed:
             return self.prepare(problem)
         return self._state(problem, state.plan, state)
@@ -182,7 +183,7 @@ class Threaded(Sweeping):
             )
 
     def uses_threads(self, state: SweepState) -> bool:
-        """More threads than one were asked for, and the colours are large enough to gain by them."""
+        """More than one thread was asked for, and the colours are large enough to gain from it."""
         ptr = state.order.color_ptr
         if self.threads == 1 or ptr is None or len(ptr) < 2:
             return False

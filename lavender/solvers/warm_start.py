@@ -1,7 +1,7 @@
 """The first phase of `newton` from a warm start: judge it, a few sweeps; or free joints at once.
 
-The step of a simulation at rest, or of a chain, ends here. `lavender_ext/warm/start.pxd` has the equations; what is not
-within tol after it goes on from the start it came with.
+It solves steps of a simulation at rest, or of a chain. `lavender_ext/warm/start.pxd` has the equations. If the result
+is not within tol, `newton` continues from the original start.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ENDED = {
 
 
 class Tried(NamedTuple):
-    """What the first phase made of a start."""
+    """Result of the first phase."""
 
     how: int  # how it ended, a number of the kernel; 0 where it decided nothing
     sweeps: int = 0
@@ -40,7 +40,7 @@ class Tried(NamedTuple):
 
 
 def claim_of(tried: Tried) -> Claim | None:
-    """What `newton` says of a warm start that ended in its first phase; None where it did not."""
+    """The claim of `newton` for a warm start solved in the first phase; None if it was not."""
     message = ENDED[tried.how]
     if message is None:
         return None
@@ -54,7 +54,7 @@ def claim_of(tried: Tried) -> Claim | None:
 def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
 ) -> Tried:
-    """Carry `impulse` (m,) to tol in place where the first phase can; else nothing is changed."""
+    """Solve `impulse` (m,) to tol in place if the first phase can; otherwise leave it unchanged."""
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
         return Tried(0)
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:

@@ -1,4 +1,4 @@
-"""What one factor or one sweep of a problem costs, counted from its structure [ns], and the rates of whole solvers.
+"""Cost of one factorisation or one sweep [ns], counted from a problem's structure, and the rates of whole solvers.
 
 Nanoseconds of one core; constants, the same on every machine: no clock is read. What `auto` expects of a solver as a
 whole are the fitted rates of `rates.json` (`costs.py`).
@@ -45,7 +45,7 @@ def law_of(problem: Problem) -> str:
 
 
 def of_law(rate: Any, law: str) -> float:
-    """A rate that depends on the law: bounded rows, whether they have bounds or not, and each law of friction."""
+    """The value of a rate for this law: one for rows with or without bounds, and one for each law of friction."""
     if not isinstance(rate, Mapping):
         return float(rate)
     like = "coulomb" if law == "rolling" else law
@@ -53,7 +53,7 @@ def of_law(rate: Any, law: str) -> float:
 
 
 def sweep_cost(problem: Problem, work: float | None = None) -> float:
-    """Of one sweep [ns]; `work`: its multiply-adds, where they are not those of what `anderson` sweeps over."""
+    """Cost of one sweep [ns]; `work`: its multiply-adds, by default those of the sweeps of `anderson`."""
     return SWEEP[problem.law] * (sweep_work(problem) if work is None else work) + SWEEP_ROW * problem.m
 
 

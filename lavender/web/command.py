@@ -19,7 +19,7 @@ NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only say where the
 @NO_BROWSER
 @click.pass_context
 def web(context: click.Context, port: int, no_browser: bool) -> None:
-    """The kernels in WebAssembly: without a subcommand, open the page that runs them in a browser."""
+    """Open a page that runs the kernels (WebAssembly) in a browser, or build the module or the page."""
     if context.invoked_subcommand is None:
         _show(port, no_browser)
 
@@ -54,7 +54,7 @@ def _show(port: int, no_browser: bool) -> None:
     type=click.Choice(["lavender", "newton"]),
     default="lavender",
     show_default=True,
-    help="The module that stands alone, or the one for exact solves that is loaded beside it.",
+    help="lavender: the module that works alone; newton: the one for exact solves, loaded beside it.",
 )
 def build(out: Path, part: str) -> None:
     """Compile the kernels to one WebAssembly module; needs the extra `wasm`, or a compiler named in

@@ -24,48 +24,17 @@ from lavender.bench.running import runner, timing
 QUICK = bench.Plan(levels=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
 
 
-@dataclasses.dataclass(frozen=True)
-class Fake:
-    """A solver that does what a test asks of it."""
-
-    what: str
-
-    def prepare(self, problem):
-        return problem
-
-    def update(self, state, problem):
-        return problem
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        if self.what == "raise":
-            raise RuntimeError("of the backend")
-        if self.what == "interrupt":
-            raise KeyboardInterrupt
-        if self.what == "lie":
-            return lv.Claim(lv.Status.CONVERGED, 1)
-        if self.what == "nan":
-            impulse[:] = np.nan
-            return lv.Claim(lv.Status.NUMERICAL_ERROR, 1)
-        raise AssertionError(self.what)
+def broken(problem, impulse):
+    raise RuntimeError("of the backend")
 
 
-@pytest.fixture
-def fakes(register):
-    """Registers solvers `fake_lie` and so on for one test."""
+def interrupted(problem, impulse):
+    raise KeyboardInterrupt
 
-    def add(*whats):
-        for what in whats:
-            register(
-                lv.SolverSpec(
-                    f"fake_{what}",
-                    lambda what=what: Fake(what),
-                    laws={"linear", "lcp"},
-                    summary="of a test",
-                    resumable=False,
-                )
-            )
 
-    return add
+def lost(problem, impulse):
+    impulse[:] = np.nan
+    return lv.Claim(lv.Status.NUMERICAL_ERROR, 1)
 
 
 def test_a_record_holds_what_the_judge_says_and_what_it_cost():
@@ -119,8 +88,9 @@ def test_exact_solvers_run_once_and_hopeless_levels_are_left_out():
     assert [r.tol for r in records if r.mode == "tol"] == [1e-3]
 
 
-def test_a_solver_that_raises_costs_its_own_record(fakes):
-    fakes("raise", "nan", "lie")
+def test_a_solver_that_raises_costs_its_own_record(plug_in):
+    plug_in(broken, "fake_raise"), plug_in(lost, "fake_nan")
+    plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "fake_lie")
     records = bench.run(
         [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
     )
@@ -201,8 +171,8 @@ def test_a_changed_problem_of_the_same_name_is_measured_again(tmp_path):
     assert len(bench.read(path)) == 2
 
 
-def test_ctrl_c_keeps_what_there_is(tmp_path, fakes):
-    fakes("interrupt")
+def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
+    plug_in(interrupted, "fake_interrupt")
     path, into = tmp_path / "records.jsonl", []
     with pytest.raises(KeyboardInterrupt):
         bench.run([stack(5)], ["pgs", "fake_interrupt", "direct"], QUICK, path, into=into)
@@ -211,7 +181,7 @@ def test_ctrl_c_keeps_what_there_is(tmp_path, fakes):
     assert into[0].records == kept
 
 
-def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path, monkeypatch):
+def test_a_full_disk_is_said_and_the_next_run_goes_on(tmp_path):
     path = tmp_path / "records.jsonl"
     full = OSError(28, "No space left on device")
     counter = itertools.count()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from worked import after
 
 import lavender as lv
 from benchmarks.stability import command, critical_gain, model, modes, slowest
@@ -12,9 +13,7 @@ H = 1 / 60
 
 def left_by_sweeps(n, sweeps):
     """Share of the slowest error in the velocities that `sweeps` sweeps leave, of a tower at rest."""
-    sim = lv.Simulation(lv.Scene("stack", n=n, dt=H, substeps=1, order="given", solver_iterations=64))
-    for _ in range(300):
-        sim.step()
+    sim = after(300, "stack", n=n, dt=H, substeps=1, order="given", solver_iterations=64)
     problem = sim.constraint_problem()
     size, rest = 1e-6, problem.guess
     columns = []

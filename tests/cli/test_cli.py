@@ -9,6 +9,7 @@ import time
 
 import numpy as np
 import pytest
+from stacks import stack
 
 import lavender as lv
 from lavender import bench, cli, io, registry
@@ -16,14 +17,9 @@ from lavender import check as checking
 from lavender.bench.record import Skip, to_json
 
 
-def problem(n=8):
-    a = np.diag(np.full(n, 2.0)) - np.diag(np.ones(n - 1), 1) - np.diag(np.ones(n - 1), -1)
-    return lv.Problem.lcp(a, np.linspace(1.0, -0.2, n))
-
-
 @pytest.fixture
 def path(tmp_path):
-    io.save(problem(), tmp_path / "stack8.npz")
+    io.save(stack(8), tmp_path / "stack8.npz")
     return tmp_path / "stack8.npz"
 
 
@@ -132,16 +128,10 @@ def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
     assert "pgs: CONVERGED" in out
     assert "iterations" in out
     with np.load(target, allow_pickle=False) as answer:
-        exact = lv.solve(problem(), "pgs", tol=1e-10)
+        exact = lv.solve(stack(8), "pgs", tol=1e-10)
         np.testing.assert_array_equal(answer["impulse"], exact.impulse)
         assert answer["relative"] == exact.residual.relative
         assert str(answer["status"]) == "CONVERGED"
-
-
-def test_solve_takes_cases_of_the_suite(lavender):
-    code, out, _ = lavender("solve", "stack(n=8)", "--solver", "direct")
-    assert code == 0
-    assert "8 rows" in out
 
 
 def test_solvers_lists_all_with_reasons(lavender):
@@ -150,6 +140,12 @@ def test_solvers_lists_all_with_reasons(lavender):
     for name, spec in registry.specs().items():
         assert name in out
         assert spec.missing() is None or "pip install" in out
+    lines = out.splitlines()
+    place = {line.split()[0]: i for i, line in enumerate(lines) if line.strip()}
+    reasons = registry.known()
+    here = [place[n] for n, reason in reasons.items() if reason is None]
+    away = [place[n] for n, reason in reasons.items() if reason is not None]
+    assert max(here) < min(away, default=len(lines)), "those that are here come first"
     code, out, _ = lavender("solvers", "--problem", "stack(n=8)")
     assert code == 0
     assert "takes laws linear" in out  # gauss_seidel, sor
@@ -192,6 +188,12 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
         (("nonsense",), "No such command"),
+        (("report", "random_spd", "--campaign", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
+        (("solve", "random_spd(n=10000000)"), "not enough memory"),  # 8e14 bytes
+        *(
+            (("report", "stack(n=4)", "--campaign", "--workers", n), f"workers is {n}")
+            for n in (0, -2, 1_000_000_000)
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
@@ -240,7 +242,7 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     n = 300
     big = np.kron(np.eye(n), a) + 1e-9 * np.eye(2 * n)
     io.save(lv.Problem.lcp(big, np.random.default_rng(0).standard_normal(2 * n)), tmp_path / "hard.npz")
-    io.save(problem(), tmp_path / "easy.npz")
+    io.save(stack(8), tmp_path / "easy.npz")
     command = [sys.executable, "-m", "lavender.cli", "report", tmp_path / "easy.npz", tmp_path / "hard.npz"]
     command += ["--solvers", "pgs,jacobi", "--time-limit", "60", "--no-figures", "--out", out]
     process = subprocess.Popen(
@@ -254,7 +256,7 @@ def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     printed, said = process.communicate(timeout=600)
     assert process.returncode == 130, said
     assert b"Traceback" not in said
-    assert b"goes on from here" in printed
+    assert b"continues from here" in printed
     assert (out / "index.html").exists()
     kept = [json.loads(line) for line in records.read_text().splitlines()]
     assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)
@@ -331,7 +333,7 @@ def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tm
 
 def test_nothing_is_cut_off_in_a_pipe(path, tmp_path):
     long = tmp_path / ("a" * 100 + ".npz")
-    io.save(problem(), long)
+    io.save(stack(8), long)
     words = [
         sys.executable,
         "-m",
@@ -356,7 +358,7 @@ def test_a_named_file_that_does_not_load_touches_nothing_and_one_in_a_folder_is_
 ):
     folder = tmp_path / "problems"
     folder.mkdir()
-    io.save(problem(), folder / "good.npz")
+    io.save(stack(8), folder / "good.npz")
     broken = folder / "broken.npz"
     broken.write_bytes(path.read_bytes()[:100])
     more = ("--solvers", "pgs", *QUICK[:-1], "--out", tmp_path / "out")
@@ -375,6 +377,7 @@ def test_a_named_file_that_does_not_load_touches_nothing_and_one_in_a_folder_is_
 def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
     assert lavender("solve", path)[0] == 0  # auto
     assert "auto: CONVERGED" in lavender("solve", path)[1]
+    assert "8 rows" in lavender("solve", "stack(n=8)", "--solver", "direct")[1]
     assert lavender("solve", path, "--solver", "pgs", "--max-iter", 1)[0] == cli.EXIT_UNMET
     assert (
         lavender("solve", path, "--solver", "pgs", "--tol", 0, "--max-iter", 1)[0] == 0
@@ -394,7 +397,7 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
 def test_the_nearest_name_is_found_whatever_its_case(lavender):
     assert "did you mean 'pgs'" in lavender("solve", "stack(n=4)", "--solver", "PGS")[2]
     with pytest.raises(lv.UnknownName, match="did you mean 'max_iter'"):
-        lv.solve(problem(), "pgs", max_iters=3)
+        lv.solve(stack(8), "pgs", max_iters=3)
 
 
 def test_cases_lists_families_with_parameters_and_reasons(lavender):
@@ -412,36 +415,7 @@ def test_cases_lists_families_with_parameters_and_reasons(lavender):
     assert lavender("cases", "nosuchthing")[0] == 2
 
 
-def test_solvers_that_are_here_come_first(lavender):
-    reasons = registry.known()
-    lines = lavender("solvers")[1].splitlines()
-    place = {line.split()[0]: i for i, line in enumerate(lines) if line.strip()}
-    here = [place[n] for n, reason in reasons.items() if reason is None]
-    away = [place[n] for n, reason in reasons.items() if reason is not None]
-    assert max(here) < min(away, default=len(lines))
-
-
 # -- what nobody should ask for ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("workers", [0, -2, 1_000_000_000])
-def test_a_number_of_workers_that_means_nothing_is_refused(lavender, path, tmp_path, workers):
-    code, _, err = lavender("report", path, "--campaign", "--workers", workers, "--out", tmp_path / "out")
-    assert code == 2
-    assert f"workers is {workers}" in err
-
-
-def test_seeds_without_end_are_refused_at_once(lavender):
-    words = ("report", "random_spd", "--campaign", "--out", "out", "--seeds", "0:1000000000000")
-    code, _, err = lavender(*words)
-    assert code == 2
-    assert "1000000000000 seeds" in err
-
-
-def test_a_case_that_no_memory_holds_is_refused(lavender):
-    code, _, err = lavender("solve", "random_spd(n=10000000)")  # 8e14 bytes
-    assert code == 2
-    assert "not enough memory" in err and "smaller" in err
 
 
 def test_memory_that_ends_elsewhere_is_told_in_a_line(lavender, path, monkeypatch):
@@ -505,9 +479,14 @@ sys.meta_path.insert(0, Finder())
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
-@pytest.mark.parametrize("way", [("-m", "lavender"), ("-m", "lavender.cli")])
 @pytest.mark.parametrize(
-    "module", ["numpy", "lavender.problem", "lavender.cli.options", "lavender.cli.solvers"]
+    ("way", "module"),
+    [
+        (("-m", "lavender"), "numpy"),
+        (("-m", "lavender"), "lavender.cli.solvers"),
+        (("-m", "lavender.cli"), "lavender.problem"),
+        (("-m", "lavender.cli"), "lavender.cli.options"),
+    ],
 )
 def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_path):
     """The signal comes where the import of a module begins, whatever the machine's speed."""

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from worked import after
 
 import lavender as lv
 from lavender.engine.layout import HEAD
@@ -235,15 +236,8 @@ def test_jointed_bodies_touch_only_when_asked_to():
 # -- cache ------------------------------------------------------------------------------------------
 
 
-def settled(**more):
-    sim = lv.Simulation(lv.Scene("stack", **more))
-    for _ in range(60):
-        sim.step()
-    return sim
-
-
 def test_shuffled_and_false_keys_do_no_harm():
-    start = settled(n=4)
+    start = after(60, "stack", n=4)
     cold = start.snapshot()
     rng = np.random.default_rng(0)
     worst = {}
@@ -268,7 +262,7 @@ def test_shuffled_and_false_keys_do_no_harm():
 
 
 def test_an_entry_far_from_the_contact_is_stale():
-    sim = settled(n=2, substeps=1)
+    sim = after(60, "stack", n=2, substeps=1)
     a, n = sim.state.a, int(sim.state.head[HEAD["cached"]])
     a["cache_local"][:n] += 10.0
     assert sim.step()[0]["solver"][3] == 0

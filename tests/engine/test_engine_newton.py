@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from worked import after
 
 import lavender as lv
 from lavender import registry
@@ -82,9 +83,7 @@ def test_the_first_phase_ends_in_each_of_its_ways():
 
 
 def test_a_warm_start_within_tol_comes_back_as_it_is():
-    sim = lv.Simulation(lv.Scene("pyramid", base=4))
-    for _ in range(100):
-        sim.step()
+    sim = after(100, "pyramid", base=4)
     problem = sim.constraint_problem()
     exact = lv.solve(problem, "newton", tol=1e-10).impulse
     again = lv.solve(problem, "newton", impulse=exact, tol=1e-8)

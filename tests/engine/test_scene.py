@@ -10,7 +10,7 @@ import pytest
 
 import lavender as lv
 from lavender.engine.layout import SIZE
-from lavender.scene import SCENES
+from lavender.scene import SCENES, Box, Plane, Sphere
 from lavender.scene.parts import quaternion, rotation
 
 
@@ -46,14 +46,9 @@ def test_observations_are_fresh_copies():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_every_scene_of_the_gallery_steps_and_says_why_it_exists(name):
+def test_every_scene_of_the_gallery_says_why_it_exists(name):
     text = inspect.getdoc(SCENES[name])
     assert text and text.splitlines()[0].endswith(".")
-    sim = lv.Simulation(name)
-    for _ in range(60):
-        observation, _, terminated, *_ = sim.step()
-    assert not terminated
-    assert np.isfinite(observation["positions"]).all()
     assert repr(lv.Scene(name)).startswith(f"<Scene {name!r}")
 
 
@@ -143,6 +138,11 @@ def test_contacts_of_one_scene_may_have_different_rows():
         (lambda s: s.add_body(velocity=(0, 0, 1j)), "velocity .* complex"),
         (lambda s: s.add_body(inertia=np.ma.array([1.0, 1.0, 1.0], mask=[0, 0, 1])), "inertia .* no value"),
         (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
+        (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
+        (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),
+        (lambda s: s.add_body(shape=Box((1.0, -1.0, 1.0))), "positive edges"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
         (lambda s: s.add_box(static="no"), "static .* True or False"),
         (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), collide="no"), "collide"),
         (lambda s: s.add_body(quaternion=(1, 0, 0)), "quaternion"),
@@ -312,11 +312,6 @@ def test_inertia_of_the_shapes():
     scene.add_sphere(2.0, 5.0)
     np.testing.assert_allclose(scene.bodies[0].inertia, np.diag([13.0, 10.0, 5.0]), rtol=1e-15)
     np.testing.assert_allclose(scene.bodies[1].inertia, np.eye(3) * 8.0, rtol=1e-15)
-
-
-def test_a_rotation_turns_as_it_says():
-    r = rotation(quaternion((0, 0, 2), np.pi / 2))
-    np.testing.assert_allclose(r @ [1, 0, 0], [0, 1, 0], atol=1e-15)
 
 
 def test_anchors_lie_where_they_were_given():

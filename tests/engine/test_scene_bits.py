@@ -3,7 +3,6 @@
 import json
 import os
 from fractions import Fraction
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from lavender.errors import InputError
 from lavender.scene import arithmetic
 from lavender.scene.parts import quaternion, rotation
 
-ROOT = Path(__file__).resolve().parent.parent.parent
 STARTS = """
 import hashlib, json, lavender as lv
 from lavender.scene.scene import SCENES

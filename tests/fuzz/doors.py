@@ -68,10 +68,6 @@ def door_specs():
         "memory": {"model": st.integers(0, 11), "edits": st.lists(edits, min_size=1, max_size=3)},
         "plug-in": lie,
         "far": {"problem": problems.parts(8), "exponent": st.integers(-1070, 1020)},
-        "rank": {
-            "form": pick(("masses", "rows", "matrix")),
-            "spread": st.integers(0, 60).map(lambda x: 2 * x),
-        },
         "command": {"words": words},
     }
     common = {"kind": st.just("door"), "seed": st.integers(0, 10**6)}

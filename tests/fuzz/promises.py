@@ -5,8 +5,9 @@ A spec names where its problem comes from (a seed says the rest), so that it sta
 
 import hypothesis.strategies as st
 import numpy as np
-from random_problems import nearly_singular
+from random_problems import nearly_singular, warmed
 from strategies import plain
+from worked import after
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -61,20 +62,13 @@ def build(spec):
     """The problem of a spec, with its warm start."""
     source = spec["source"]
     if source == "scene":
-        simulation = lv.Simulation(lv.Scene(spec["scene"], **spec["parameters"]))
-        for _ in range(spec["steps"]):
-            simulation.step()
-        return simulation.constraint_problem()
+        return after(spec["steps"], spec["scene"], **spec["parameters"]).constraint_problem()
     if source == "hard":
         return suite.case(spec["text"]).problem
     if source == "singular":
         return nearly_singular(spec["seed"])
     problem = wild(seed=spec["seed"], rows=200).problem
-    if source == "wild":
-        return problem
-    rng = np.random.default_rng(spec["seed"])
-    b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
-    return problem.updated(b=b, guess=lv.solve(problem, tol=1e-9).impulse)
+    return problem if source == "wild" else warmed(problem, spec["seed"]) or problem
 
 
 def check(spec, counts):

@@ -30,9 +30,13 @@ SCENE = """<mujoco><option cone="{cone}" solver="{solver}" timestep="0.004" tole
   </worldbody><equality><connect name="string" body1="bob" anchor="0 0 .2"/></equality></mujoco>"""
 
 
+def scene(cone="elliptic", solver="Newton", condim=3, jacobian="dense"):
+    return SCENE.format(cone=cone, solver=solver, condim=condim, jacobian=jacobian)
+
+
 def state(cone="elliptic", solver="Newton", condim=3, jacobian="dense", steps=25):
     """The upper box slides and turns on the lower one, which sticks; a hinge and a ball move. After `mj_forward`."""
-    text = SCENE.format(cone=cone, solver=solver, condim=condim, jacobian=jacobian)
+    text = scene(cone, solver, condim, jacobian)
     model = mj.MjModel.from_xml_string(text)
     data = mj.MjData(model)
     for _ in range(steps):
@@ -150,7 +154,7 @@ def test_nothing_touches():
 
 @pytest.mark.parametrize("condim", [3, 4, 6])
 def test_coefficients_that_differ_are_made_round_without_changing_the_problem(condim):
-    text = SCENE.format(cone="elliptic", solver="Newton", condim=condim, jacobian="dense")
+    text = scene(condim=condim)
     pair = (
         '<contact><pair geom1="low" geom2="high" condim="{}" friction="0.6 0.2 0.02 0.003 0.001"/></contact>'
     )
@@ -203,7 +207,7 @@ def test_the_problem_knows_velocities_keys_and_the_engines_own_impulse():
 def test_an_integrator_that_puts_damping_into_m_is_refused():
     if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
         pytest.skip("this MuJoCo has no such integrator")
-    text = SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    text = scene()
     model = mj.MjModel.from_xml_string(text.replace('name="door"', 'name="door" damping="2"'))
     for integrator, refused in (("DISCRETE", True), ("IMPLICITFAST", False), ("EULER", False)):
         data = mj.MjData(model)
@@ -276,7 +280,7 @@ def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_pat
 def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
     if not hasattr(mj.mjtIntegrator, "mjINT_DISCRETE"):
         pytest.skip("this MuJoCo has no such integrator")
-    text = SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    text = scene()
     model = mj.MjModel.from_xml_string(text.replace('name="door"', 'name="door" damping="2"'))
     model.opt.integrator = mj.mjtIntegrator.mjINT_DISCRETE
     found = lv.io.record(model, mj.MjData(model), tmp_path, 20, every=10)
@@ -301,9 +305,14 @@ def test_controls_are_played_drawn_or_called(tmp_path):
     assert data.ctrl[0] == 1.0
     lv.io.record(model, data, tmp_path, 1, control="random", seed=3)
     assert -2.0 <= data.ctrl[0] <= 3.0
-    for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1))):
+    calls = [lambda *_, given=given: given for given in ([np.nan], [1.0, 2.0], "fast")]
+    for wrong in ("ramp", np.zeros((3, 2)), np.zeros((0, 1)), *calls):
         with pytest.raises(lv.InputError, match="control"):
             lv.io.record(model, data, tmp_path, 1, control=wrong)
+    with pytest.raises(lv.InputError, match="seed is -1"):
+        lv.io.record(model, data, tmp_path, 1, control="random", seed=-1)
+    with pytest.raises(lv.InputError, match="replace is 'no'"):
+        lv.io.record(model, data, tmp_path, 1, replace="no")
     with pytest.raises(lv.InputError, match="steps is 0"):
         lv.io.record(model, data, tmp_path, 0)
 
@@ -314,7 +323,7 @@ def test_record_then_report_from_the_command_line(tmp_path):
     from lavender.cli import cli
 
     model = tmp_path / "scene.xml"
-    model.write_text(SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense"))
+    model.write_text(scene())
     out = tmp_path / "steps"
     done = CliRunner().invoke(
         cli, ["record", str(model), "--steps", "30", "--every", "15", "--out", str(out)]
@@ -523,7 +532,7 @@ def test_numbers_that_are_not_finite_are_refused(name, value, noslip):
 
 def test_data_of_a_second_model_are_refused():
     model, data = state()
-    text = SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
+    text = scene()
     # As many velocities, of six joints where one was.
     ways = "".join(
         f'<joint type="{kind}" axis="{axis}"/>'
@@ -541,9 +550,7 @@ def test_data_of_a_second_model_are_refused():
     "kind", ["archive", "words", "objects", "one row", "short", "huge", "folder", "nothing"]
 )
 def test_controls_of_another_thing_are_refused_by_name(tmp_path, kind):
-    (tmp_path / "model.xml").write_text(
-        SCENE.format(cone="elliptic", solver="Newton", condim=3, jacobian="dense")
-    )
+    (tmp_path / "model.xml").write_text(scene())
     path = tmp_path / "controls.npy"
     if kind == "archive":
         np.savez(tmp_path / "controls.npz", a=np.zeros((3, 1)), b=np.zeros(2))

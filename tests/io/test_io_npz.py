@@ -112,25 +112,6 @@ def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
         lavender.io.save(problem, tmp_path / "p.npz", form="local")
 
 
-def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "p.npz"
-    old, new = random_lcp(1), random_lcp(2)
-    lavender.io.save(old, path)
-
-    def full(stream, *args, **kwargs):
-        stream.write(b"PK\x03\x04 half an archive")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(np, "savez_compressed", full)
-    with pytest.raises(lv.InputError, match="No space left"):
-        lavender.io.save(new, path)
-    monkeypatch.undo()
-    assert lavender.io.load(path) == old
-    assert os.listdir(tmp_path) == ["p.npz"]
-    lavender.io.save(new, path)
-    assert lavender.io.load(path) == new
-
-
 # -- foreign, truncated, malicious ----------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ from lavender.engine import run
 from lavender.engine.picture import save_picture
 from lavender.io.stored import write_atomically, write_text
 
+resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
 
 
@@ -46,7 +47,7 @@ WRITERS = {
     "records": (".jsonl", store),
     "records as CSV": (".csv", lambda made, path: bench.write_csv(Records(), path)),
     "records as JSON": (".json", lambda made, path: bench.write_json(Records(), path)),
-    "text": (".txt", lambda made, path: write_text(path, "a")),
+    "text": (".txt", lambda made, path: write_text(path, "abc")),
 }
 everybody = pytest.mark.parametrize(("suffix", "write"), WRITERS.values(), ids=WRITERS)
 
@@ -103,8 +104,8 @@ def test_what_is_no_file_is_refused_and_left_as_it_is(kind, suffix, write, made,
 
 
 @everybody
-def test_a_full_disk_leaves_the_file_of_before(suffix, write, made, tmp_path, monkeypatch):
-    """A disk that is full where the new file would be renamed, for everybody the last moment."""
+@pytest.mark.parametrize("where", ["in the middle of the file", "where it is renamed"])
+def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_path, monkeypatch):
     path = tmp_path / f"there{suffix}"
     if suffix == ".jsonl":
         pytest.skip("records are added to")
@@ -113,9 +114,16 @@ def test_a_full_disk_leaves_the_file_of_before(suffix, write, made, tmp_path, mo
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(lv.InputError, match="No space left"):
-        write(made, path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if where == "where it is renamed":
+        monkeypatch.setattr(os, "replace", full)
+    else:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1, limits[1]))  # a second byte is one too many
+    try:
+        with pytest.raises(lv.InputError, match=r"No space left|cannot write"):
+            write(made, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == BEFORE
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 

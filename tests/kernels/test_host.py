@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from worked import after
 
 import lavender as lv
 from lavender.engine.layout import SETTING
@@ -12,13 +13,6 @@ from lavender_ext.host import memory
 
 def buffers(state):
     return state.size, state.real, state.index, state.keys
-
-
-def running(name, steps=30, **parameters):
-    simulation = lv.Simulation(lv.Scene(name, **parameters))
-    for _ in range(steps):
-        simulation.step()
-    return simulation
 
 
 @pytest.mark.parametrize("name", ["stack", "chain", "spinner", "pile", "four_bar"])
@@ -43,7 +37,7 @@ def test_arrays_lie_where_the_engine_has_them(name):
 
 @pytest.mark.parametrize("more", [{}, {"rolling_radius": 0.01}], ids=["slides", "rolls"])
 def test_moving_while_running_keeps_the_motion(more):
-    simulation, twin = (running("pile", n=40, kind="mixed", steps=60, **more) for _ in range(2))
+    simulation, twin = (after(60, "pile", n=40, kind="mixed", **more) for _ in range(2))
     state = simulation.state
     size = state.size.copy()
     size[8:] += 100
@@ -59,7 +53,7 @@ def test_moving_while_running_keeps_the_motion(more):
 @pytest.mark.parametrize("name", ["stack", "chain", "bridge", "pile"])
 @pytest.mark.parametrize("order", ["given", "random", "top_down"])
 def test_watched_sweeps_are_the_sweeps(name, order):
-    simulation = running(name, order=order, solver_iterations=12)
+    simulation = after(30, name, order=order, solver_iterations=12)
     watched, plain = simulation.state.copy(), simulation.state.copy()
     for state in (watched, plain):
         assert state.kernel.prepare() == 0

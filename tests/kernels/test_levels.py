@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from random_problems import random_contact_problem
+from worked import after
 
 import lavender as lv
 from benchmarks.kernels import lattice_pile
@@ -69,9 +70,7 @@ def test_what_is_not_packed(options):
 
 def test_one_chain_is_swept_one_by_one():
     """Where each contact waits for the one before, pairs gain nothing."""
-    sim = lv.Simulation(lv.Scene("stack", n=40))
-    for _ in range(5):
-        sim.step()
+    sim = after(5, "stack", n=40)
     assert swept(sim.constraint_problem(), "nncg", [40])[2] == 0
 
 

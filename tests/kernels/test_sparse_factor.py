@@ -32,22 +32,6 @@ def definite(a):
     return a
 
 
-@given(
-    n=st.integers(1, 60),
-    pairs=st.lists(st.tuples(st.integers(0, 59), st.integers(0, 59)), max_size=250),
-    heavy=st.integers(1, 9),
-)
-@settings(max_examples=200, deadline=None)
-def test_every_vertex_has_one_place_in_any_graph(n, pairs, heavy):
-    met = np.eye(n)
-    for i, j in pairs:
-        if i < n and j < n:
-            met[i, j] = met[j, i] = 1.0
-    of = np.repeat(np.arange(n), 1 + np.arange(n) % heavy)  # rows of one pattern are one vertex
-    panels = SparsePanels(*raw(sp.csr_array(met[of][:, of])), False)
-    assert np.array_equal(np.sort(panels.order), np.arange(len(of)))
-
-
 def test_trees_and_stars_fill_nothing():
     rng = np.random.default_rng(0)
     for n in (2, 50, 3000):

@@ -33,24 +33,20 @@ def problems(law, seed):
 # -- the bound -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(
-    not HAS_WIDE, reason="no long double beyond float64 here: there is no truth to hold it beside"
-)
-@settings(max_examples=150)
-@given(seed=seeds)
-def test_no_bound_is_broken(seed):
-    found = draw(np.random.default_rng(seed))
-    held = None if found is None else truth(found)
-    assert held is None or not held.broken
+@pytest.mark.parametrize("numbers, draws", [(Wide, 150), (Exact, 20)])
+def test_no_bound_is_broken(numbers, draws):
+    """In rational numbers no rounding decides: exact where cones are polyhedral, to 2^-240 where a disk slides."""
+    if numbers is Wide and not HAS_WIDE:
+        pytest.skip("no long double beyond float64 here: there is no truth to hold it beside")
 
+    @settings(max_examples=draws)
+    @given(seed=seeds)
+    def holds(seed):
+        found = draw(np.random.default_rng(seed))
+        held = None if found is None else truth(found, numbers)
+        assert held is None or not held.broken
 
-@settings(max_examples=20)
-@given(seed=seeds)
-def test_no_bound_is_broken_in_rational_numbers(seed):
-    """No rounding decides: exact where cones are polyhedral, to 2^-240 where a disk slides."""
-    found = draw(np.random.default_rng(seed))
-    held = None if found is None else truth(found, Exact)
-    assert held is None or not held.broken
+    holds()
 
 
 @pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")

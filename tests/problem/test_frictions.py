@@ -52,15 +52,7 @@ def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
     touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)
 
 
-def test_a_problem_is_saved_and_loaded_where_it_is_at_hand(tmp_path):
-    problem = lv.Problem.lcp(np.eye(2), np.ones(2), name="two")
-    problem.save(tmp_path / "p.npz")
-    assert lv.load(tmp_path / "p.npz") == problem
-    with pytest.raises(lv.InputError):
-        problem.save(tmp_path / "p.txt")
-
-
-def test_things_show_themselves_shortly_and_in_notebooks(tmp_path):
+def test_things_show_themselves_shortly_and_in_notebooks():
     problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
     assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
     solution = lv.solve(problem, "pgs", history=True)

@@ -8,7 +8,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import seeds
+from random_problems import as_matrix, seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
@@ -19,14 +19,6 @@ from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import general
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.generalized.newton import ENDS
-
-
-def as_matrix(problem):
-    """The same problem given by a dense A of its own."""
-    mass, jac = problem.generalized.mass.toarray(), problem.jacobian.toarray()
-    a = jac @ np.linalg.solve(mass, jac.T) + np.diag(problem.compliance)
-    return lv.Problem(problem.b, problem.cones, 0.5 * (a + a.T), friction=problem.friction)
-
 
 # -- the operator ----------------------------------------------------------------------------------
 

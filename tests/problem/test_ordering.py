@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
 
 import lavender as lv
 from lavender.ordering import ORDERS, block_order, body_ranks, colors, levels
-
-
-def sweeps(problem, name, n, **options):
-    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
 
 
 @given(seed=seeds)

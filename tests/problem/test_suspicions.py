@@ -4,22 +4,15 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from worked import after
 
 import lavender as lv
 from lavender import suite
 
-
-def step(name, steps, **parameters):
-    simulation = lv.Simulation(lv.Scene(name, **parameters))
-    for _ in range(steps):
-        simulation.step()
-    return simulation.constraint_problem()
-
-
 SCENES = {
-    "stack": step("stack", 2, n=12, size=0.5, mass=60.0),
-    "bridge": step("bridge", 40),
-    "pit": step("pile", 60, n=60, size=0.3),
+    "stack": after(2, "stack", n=12, size=0.5, mass=60.0).constraint_problem(),
+    "bridge": after(40, "bridge").constraint_problem(),
+    "pit": after(60, "pile", n=60, size=0.3).constraint_problem(),
 }
 
 
@@ -151,7 +144,7 @@ def test_friction_keys_and_forces_are_told():
 
 def boxes(n=3):
     """Boxes side by side on the ground in generalised coordinates: J (12 n, 6 n), M, v*."""
-    problem = step("stack", 1, n=1, size=0.5, mass=60.0)
+    problem = after(1, "stack", n=1, size=0.5, mass=60.0).constraint_problem()
     j = problem.jacobian.toarray()
     mass = np.linalg.inv(problem.rows.inverse_mass_matrix().toarray())
     return np.kron(np.eye(n), j), np.kron(np.eye(n), mass), np.tile(problem.rows.v_free.ravel(), n)

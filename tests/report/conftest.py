@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from stacks import chain
 
 import lavender as lv
 from lavender import bench
@@ -12,7 +13,7 @@ LEVELS = (1e-3, 1e-6)
 @pytest.fixture(scope="session")
 def real():
     """Records of three real problems, one named as an attacker would."""
-    a = np.diag(np.full(8, 2.0)) - np.diag(np.ones(7), 1) - np.diag(np.ones(7), -1)
+    a = chain(8).matrix
     evil = '</script><script>alert("x")</script>&|'
     problems = [
         lv.Problem.lcp(a, np.ones(8), name=evil, names=[f"<b>row {i}" for i in range(8)], guess=np.ones(8)),

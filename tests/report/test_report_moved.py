@@ -81,11 +81,14 @@ def test_recommendations_by_speed_name_who_gets_there(records):
         assert fastest in (a.best.solver, *a.ties)  # within noise an order is fixed
 
 
-def test_without_motion_errors_there_is_nothing_to_show():
+def test_without_motion_errors_there_is_nothing_to_show(tmp_path):
     plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
     assert len(moved.by_speed(plain)) == 0
     assert contents.moved_table(Report(plain)).rows == contents.speed_table(Report(plain)).rows == []
     assert moved.speed_levels(plain) == ()
+    assert figures(plain).moved is None
+    page = write(plain, tmp_path, figures=False).read_text(encoding="utf-8")
+    assert "by-motion" not in page.split("<body>")[1]
 
 
 def test_what_has_nothing_to_do_is_in_no_ranking(records):
@@ -230,15 +233,6 @@ def test_figures_by_motion_error_hold_the_speeds_of_the_records(records):
     assert error.levels == (1e-2, 1e-4)
     names = [figure.name for figure in found]
     assert len(names) == len(set(names))  # each has a file of its own
-
-
-def test_without_motion_errors_there_is_no_switch(tmp_path):
-    plain = bench.run(["stack(n=4)"], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=()))
-    assert figures(plain).moved is None
-    assert (
-        "by-motion"
-        not in write(plain, tmp_path, figures=False).read_text(encoding="utf-8").split("<body>")[1]
-    )
 
 
 @pytest.mark.slow

@@ -100,32 +100,23 @@ def test_a_pattern_that_is_not_symmetric():
     np.testing.assert_allclose(a @ solution.impulse, problem.b, rtol=1e-10)
 
 
-def test_pivots_across_panels():
-    # A chain of whose diagonal rho = 0.1 leaves nothing: every pivot is a neighbour's.
-    m = 60
-    i = np.arange(m - 1)
-    a = np.diag(np.full(m, -0.1))
-    a[i, i + 1], a[i + 1, i] = 1.0, -0.999
-    problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
-    state = lv.prepare(problem, "admm").state
-    assert not isinstance(state, str), state
-    assert state.full
-    r = np.linspace(-1.0, 1.0, m)
-    x = state.factor[2][0].solve(r)
-    np.testing.assert_allclose(state.matrix @ x + state.rho * x, r, atol=1e-12)
-
-
 @pytest.mark.parametrize("m", [60, 1200])
 def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
+    # A chain of whose diagonal rho = 0.1 leaves nothing: every pivot is a neighbour's.
     a = sp.diags_array([np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1])
     problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
     prepared = lv.prepare(problem, "admm")
-    assert (prepared.state.factor is None) == (m > 1000), "of 60 rows at once"
+    state = prepared.state
+    assert (state.factor is None) == (m > 1000), "of 60 rows at once"
+    if m == 60:
+        assert state.full
+        r = np.linspace(-1.0, 1.0, m)
+        x = state.factor[2][0].solve(r)
+        np.testing.assert_allclose(state.matrix @ x + state.rho * x, r, atol=1e-12)
     # A minute is enough for 60 rows on any machine; of 1200 the factor is expected to take longer than 50 ms.
     solution = prepared.solve(time_limit=60.0 if m == 60 else 0.05, max_iter=30)
     assert (solution.status is lv.Status.TIME_LIMIT and solution.iterations == 0) == (m > 1000)
-    if m == 60:
-        assert solution.work["factorisations"] >= 1
+    assert m > 60 or solution.work["factorisations"] >= 1
     assert lv.solve(problem, "admm", max_iter=3).work["factorisations"] == 1
 
 

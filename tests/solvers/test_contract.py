@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from enumeration import enumerate_lcp
+from enumeration import enumerate_lcp, random_bounds
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, touching
@@ -404,13 +404,13 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, max(1, m // 2) if kind == "semidefinite" else m + 2))
     skew, b = rng.normal(size=(m, m)), 2.0 * rng.normal(size=m)
-    bound = rng.integers(0, 5, m)  # plain, boxed, upper alone, free, fixed
+    low, high = random_bounds(rng, m)
     if whole:
         g, skew, b = np.rint(g), np.rint(skew), np.rint(b)
+        if kind == "semidefinite":  # rows twice: ties at every pivot
+            g[m // 2 :] = g[: m - m // 2]
     a = g @ g.T + (0.0 if kind == "semidefinite" else 0.5 * np.eye(m))
     a = a + (skew - skew.T if kind == "asymmetric" else 0.0)
-    low = np.choose(bound, [0.0, -1.0, -np.inf, -np.inf, 0.5])
-    high = np.choose(bound, [np.inf, 1.0, 0.5, np.inf, 0.5])
     if kind == "semidefinite":  # what has a solution
         low, high = np.zeros(m), np.full(m, np.inf)
         b = a @ np.maximum(b, 0.0) - np.maximum(skew[0], 0.0)

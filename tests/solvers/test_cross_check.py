@@ -9,8 +9,6 @@ import lavender as lv
 from lavender import check, registry, suite
 from lavender.check import cross_check
 
-ITERATIVE = ["pgs", "jacobi", "sequential_impulses"]
-
 
 def bounded_problem(seed, stiff=0.3, contacts=8):
     """Joints with and without bounds, contacts without friction; every row a little compliant."""

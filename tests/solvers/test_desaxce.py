@@ -7,11 +7,11 @@ from unittest import mock
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, good, random_contact_problem, seeds
+from random_problems import good, random_contact_problem, seeds
 from twins import block_diagonal
+from worked import after
 
 import lavender as lv
-from lavender import suite
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender_ext.core.problem import LAWS
@@ -122,10 +122,7 @@ ONE = {"substeps": 1, "order": "given"}
 
 def problem_in(scene, step, **parameters):
     """What `step + 1` steps of a scene lead to, without its warm start."""
-    sim = lv.Simulation(lv.Scene(scene, **parameters))
-    for _ in range(step + 1):
-        sim.step()
-    return dataclasses.replace(sim.constraint_problem(), guess=None)
+    return dataclasses.replace(after(step + 1, scene, **parameters).constraint_problem(), guess=None)
 
 
 @pytest.mark.parametrize(
@@ -176,19 +173,6 @@ def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
     assert smallest < 1e-9  # far below what K K^T keeps beside contacts with W of 1e-10 to 1e10
     solution = lv.solve(problem if law == "coulomb" else problem.relaxed("cone"), "newton", tol=1e-8)
     assert good(solution, 1e-8), str(solution)
-
-
-@pytest.mark.parametrize("name", ["auto", "newton"])
-@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
-def test_sliding_pyramid_at_any_mass_ratio(ratio, name):
-    problem = suite.pyramid(k=6, mass_ratio=ratio, friction="coulomb", sliding=0.5).problem
-    assert good(lv.solve(problem, name, tol=1e-8), 1e-8)
-
-
-@pytest.mark.parametrize("ratio", [1e3, 1e6])
-def test_slow_box_stack_given_as_a_matrix(ratio):
-    problem = suite.box_stack(n=5, mass_ratio=ratio, friction="coulomb", sliding=0.05).problem
-    assert good(lv.solve(as_matrix(problem), "newton", tol=1e-8), 1e-8)
 
 
 def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():

@@ -1,11 +1,11 @@
 """Room, start and step: the same method without Python, in any number of turns, and in WebAssembly."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
@@ -15,7 +15,6 @@ from lavender.certificates import check_certificate
 from lavender_ext.driver.driver import Driver
 
 MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
-ROOT = Path(__file__).resolve().parent.parent.parent
 
 
 def driven(problem, tol=1e-9, budget=1500, work=10**6):
@@ -38,10 +37,10 @@ def forms(problem):
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
-@given(seed=seeds)
-@settings(max_examples=15)
-def test_contacts_are_solved_as_newton_solves_them(friction, seed):
-    base = random_contact_problem(seed, friction=friction, bodies=5, contacts=6, joints=2)
+@given(seed=seeds, rolling=st.booleans())
+@settings(max_examples=20)
+def test_contacts_are_solved_as_newton_solves_them(friction, seed, rolling):
+    base = random_contact_problem(seed, friction, rolling=rolling, bodies=5, contacts=6, joints=2)
     for problem in forms(base):
         expected = lv.solve(problem, "newton", tol=1e-9)
         how, done, relative, impulse = driven(problem)
@@ -68,15 +67,12 @@ def test_turns_of_any_length_give_the_same_bits(seed):
 
 
 def test_generalised_coordinates_are_driven_by_the_same_names():
-    taken = 0
     for seed in (44017, 44027, 44030):
         problem = wild(seed=seed).problem
         assert problem.generalized is not None
         how, done, _, impulse = driven(problem, 1e-8)
         assert how == REACHED and done > 0
         assert lv.residual(problem, impulse).relative <= 1e-8
-        taken += 1
-    assert taken == 3
 
 
 def test_rows_that_cannot_move_stay_and_push_the_others():
@@ -100,16 +96,6 @@ def test_rows_that_cannot_move_stay_and_push_the_others():
         how, _, _, impulse = driven(still)
         assert how == REACHED and impulse[1] == 0.2
         assert lv.residual(still, impulse).relative <= 1e-9
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("friction", ["coulomb", "cone"])
-def test_contacts_that_roll_are_solved_over_bodies_and_rows(friction, seed):
-    for problem in forms(random_contact_problem(seed, friction, rolling=True, bodies=4, contacts=5)):
-        how, _, _, impulse = driven(problem)
-        expected = lv.solve(problem, "newton", tol=1e-9)
-        assert (how == REACHED) == expected.success
-        assert how != REACHED or lv.residual(problem, impulse).relative <= 1e-9
 
 
 def test_a_budget_ends_it_and_a_proof_too():

@@ -3,14 +3,10 @@
 import numpy as np
 import pytest
 from hypothesis import given
-from random_problems import random_lcp, seeds
+from random_problems import random_lcp, seeds, sweeps
 
 import lavender as lv
 from lavender.solvers.jacobi import safe_damping
-
-
-def sweeps(problem, name, n, **options):
-    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
 
 
 @pytest.mark.parametrize("k", [2, 3, 5])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import as_matrix, good, random_contact_problem, seeds
+from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from twins import block_diagonal
 
 import lavender as lv
@@ -70,7 +70,10 @@ def test_a_problem_is_scaled_by_its_definition(form, seed):
 
 def test_many_bodies_on_one_leave_half_of_the_rows():
     # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
-    # the entries of a full factor and an eighth of its work.
+    # the entries of a full factor and an eighth of its work. Bounded rows as full as that stay full.
+    bounded = wild(seed=7566).problem
+    assert bounded.law == "lcp" and bounded.csr.nnz / bounded.m**2 < systems.DENSE_FILL
+    assert make_system(bounded, "impulse").dense
     problem = wild(seed=7012).problem
     assert problem.matrix is not None
     assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
@@ -86,13 +89,6 @@ def test_many_bodies_on_one_leave_half_of_the_rows():
     np.testing.assert_allclose(
         problem.csr @ sparse_one.impulse, problem.csr @ full.impulse, atol=1e-6 * np.abs(problem.b).max()
     )
-
-
-def test_bounded_rows_as_full_as_that_stay_full():
-    problem = wild(seed=7566).problem
-    assert problem.law == "lcp"
-    assert problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
-    assert make_system(problem, "impulse").dense
 
 
 def system_in(problem, form):
@@ -314,54 +310,39 @@ def random_columns(rng, node, n, s):
     return k, whole
 
 
-def test_block_factor_on_a_graph_of_bodies_matches_dense():
-    rng = np.random.default_rng(3)
-    n, s = 12, 3
-    body = np.array(
-        [(i, j) for i in range(n) for j in range(i) if rng.random() < 0.3] + [(0, -1), (5, -1)], np.int32
-    )
-    nptr, nind, node, slot, turned = body_pattern(body, n)
-    assert (node[:, 0] > node[:, 1]).all() and 0 < turned.sum() < len(body)
-    rank = {tuple(sorted(pair)) for pair in node.tolist()}
-    assert len(rank) == len(body)
-    m = len(body)
-    k, whole = random_columns(rng, node, n, s)
-    structure = nptr, nind, *symbolic.factor_pattern(nptr, nind)
-    v, r = rng.uniform(0.1, 10.0, m), rng.normal(size=m)
-    expected = np.linalg.solve(np.diag(1.0 / v) + whole @ whole.T, r)
-    for what in ("barrier", "pair"):
-        solve = on_bodies(k, s, node, slot, structure, what == "pair")
-        solve.v[:] = v
-        assert solve.factor(what)
-        np.testing.assert_allclose(
-            solve.solve(what, r), expected, rtol=0, atol=1e-12 * np.abs(expected).max()
-        )
-
-
 @pytest.mark.parametrize("s", [1, 2, 3, 6])
 @pytest.mark.parametrize(("few", "share"), [(1, 0.0), (6, 0.1), (100, 1.0)])
-def test_panels_solve_what_a_dense_matrix_solves_with_the_same_bits_at_any_width(s, few, share):
+def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, few, share):
+    """Blockwise, with and without pivots, and by panels, these with the same bits at any width."""
     rng = np.random.default_rng(100 * s + few)
     n, m = 40, 110
     body = rng.integers(-1, n, (m, 2))
     body = np.ascontiguousarray(body[body[:, 0] != body[:, 1]], np.int32)
     m = len(body)
-    nptr, nind, node, slot, _ = body_pattern(body, n)
+    nptr, nind, node, slot, turned = body_pattern(body, n)
+    assert (node[:, 0] > node[:, 1]).all() and 0 < turned.sum() < len(body)
     structure = nptr, nind, *symbolic.factor_pattern(nptr, nind)
     panels = symbolic.block_panels(*structure[:4], s, few, share)
     assert len(panels[2]) // 2 - 1 < n
     k, whole = random_columns(rng, node, n, s)
     v, r = rng.uniform(0.1, 10.0, m), rng.normal(size=m)
     expected = np.linalg.solve(np.diag(1.0 / v) + whole @ whole.T, r)
-    outs = []
-    for wide in (True, False):
-        solve = on_bodies(k, s, node, slot, structure, False, panels, wide)
+    outs = set()
+    for what, wide, given_panels in (
+        ("barrier", True, panels),
+        ("barrier", False, panels),
+        ("barrier", True, None),
+        ("pair", True, None),
+    ):
+        solve = on_bodies(k, s, node, slot, structure, what == "pair", given_panels, wide)
         solve.v[:] = v
         for _ in range(2):  # what a factor leaves behind does not reach the next
-            assert solve.factor("barrier")
-            outs.append(solve.solve("barrier", r))
-            np.testing.assert_allclose(outs[-1], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    assert len({out.tobytes() for out in outs}) == 1
+            assert solve.factor(what)
+            out = solve.solve(what, r)
+            np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+            if given_panels is not None:
+                outs.add(out.tobytes())
+    assert len(outs) == 1
 
 
 def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
@@ -389,24 +370,27 @@ def test_a_chain_of_bodies_does_not_fill_in():
 # -- answers ------------------------------------------------------------------------------------------
 
 
+BOXES = {
+    "pyramid": lambda ratio: suite.pyramid(k=5, mass_ratio=ratio),
+    "boxes": lambda ratio: suite.box_stack(n=8, mass_ratio=ratio),
+    "with friction": lambda ratio: suite.pyramid(k=4, mass_ratio=ratio, friction="coulomb"),
+    "sliding": lambda ratio: suite.pyramid(k=6, mass_ratio=ratio, friction="coulomb", sliding=0.5),
+    "slow": lambda ratio: suite.box_stack(n=5, mass_ratio=ratio, friction="coulomb", sliding=0.05),
+}
+
+
 @pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
-@pytest.mark.parametrize("form", ["velocity", "impulse"])
-@pytest.mark.parametrize("family", [suite.pyramid, suite.box_stack])
-def test_redundant_boxes_cold_at_every_mass_ratio(family, form, ratio):
-    size = {"k": 5} if family is suite.pyramid else {"n": 8}
-    problem = family(mass_ratio=ratio, **size).problem
-    solution = lv.solve(problem, "newton", tol=1e-10, form=form)
-    assert good(solution, 1e-10), solution
-    assert solution.work["factorisations"] <= 30
-    assert solution.solver.form == form
-
-
-@pytest.mark.parametrize("ratio", [1.0, 1e6])
-@pytest.mark.parametrize("law", ["cone", "coulomb"])
-def test_friction_on_redundant_boxes(law, ratio):
-    problem = suite.pyramid(k=4, mass_ratio=ratio, friction="coulomb").problem.relaxed(law)
-    solution = lv.solve(problem, "newton", tol=1e-9)
-    assert good(solution, 1e-9), solution
+@pytest.mark.parametrize("form", ["velocity", "impulse", "cone", "matrix", "auto"])
+@pytest.mark.parametrize("name", BOXES)
+def test_redundant_boxes_cold_at_every_mass_ratio(name, form, ratio):
+    problem = BOXES[name](ratio).problem
+    if form == "cone" or form == "matrix":
+        problem = problem.relaxed("cone") if form == "cone" else as_matrix(problem)
+    asked = {"form": form} if form in ("velocity", "impulse") else {}
+    solution = lv.solve(problem, "auto" if form == "auto" else "newton", tol=1e-8, **asked)
+    assert good(solution, 1e-8), solution
+    if asked and problem.law == "lcp":
+        assert solution.work["factorisations"] <= 30 and solution.solver.form == form
 
 
 def test_sliding_boxes_obey_coulomb_and_not_the_relaxation():
@@ -477,6 +461,12 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     )
 
 
+def in_contacts(problem):
+    """Its matrix under the cone law: 166 contacts and two bounded rows."""
+    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+    return lv.Problem(problem.b, cones, problem.csr, friction="cone")
+
+
 @pytest.mark.parametrize("even", [True, False])
 def test_one_analysis_serves_all_factors_of_few_entries(even, monkeypatch):
     made = []
@@ -487,12 +477,13 @@ def test_one_analysis_serves_all_factors_of_few_entries(even, monkeypatch):
             super().__init__(*args)
 
     monkeypatch.setattr(sparse, "SparsePanels", Counted)
-    problem = sparse_rows(1, even=even)
-    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
-    problem = lv.Problem(problem.b, cones, problem.csr, friction="cone")
+    problem = in_contacts(sparse_rows(1, even=even))
     solution = lv.solve(problem, "newton", tol=1e-8)
     assert solution.success and solution.work["factorisations"] > 5
     assert sum(like is None for like in made) == 1
+    monkeypatch.setattr(sparse.SparseRows, "solve_panels", lambda *_: None)
+    for most in (1, 3):  # where SuperLU takes over, that is one factorisation
+        assert lv.solve(problem, "newton", tol=1e-12, max_iter=most).iterations <= most
 
 
 def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
@@ -505,16 +496,6 @@ def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
             solution = lv.solve(problem, "newton", tol=1e-10)
         assert solution.success
         np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
-
-
-@pytest.mark.parametrize("most", [1, 3])
-def test_where_superlu_takes_over_that_is_one_factorisation(monkeypatch, most):
-    problem = sparse_rows(1)
-    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
-    problem = lv.Problem(problem.b, cones, problem.csr, friction="cone")
-    monkeypatch.setattr(sparse.SparseRows, "solve_panels", lambda *_: None)
-    solution = lv.solve(problem, "newton", tol=1e-12, max_iter=most)
-    assert solution.iterations <= most
 
 
 def test_pivots_inside_panels_are_refined_or_given_up():
@@ -578,31 +559,16 @@ def test_rows_are_exchanged_where_an_interior_point_stops_short():
     assert good(lv.solve(problem, "newton", tol=1e-10), 1e-10)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_coulomb_contacts_without_friction_are_bounded_rows(seed):
-    """mu = 0, rows that depend on each other, a matrix: the law has no slip, and the cone law is the same."""
-    p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
+@pytest.mark.parametrize("form", FORMS)
+@given(seed=seeds)
+@settings(max_examples=4)
+def test_where_nothing_rubs_the_law_has_no_slip_and_no_rounds(form, seed):
+    """mu = 0 or joints alone, rows that depend on each other: under either law the same convex problem."""
+    contacts = 0 if form == "J and M" else 25
+    p = random_contact_problem(seed, bodies=3, joints=5, contacts=contacts, tangents=2, spin=False)
     p = replace(p, compliance=np.zeros(p.m), cones=replace(p.cones, mu=np.zeros(p.n_blocks)))
-    for problem in (p, as_matrix(p)):
-        coulomb, cone = lv.solve(problem, "newton"), lv.solve(problem.relaxed("cone"), "newton")
-        assert not coulomb.contradicted
-        assert coulomb.status == cone.status
-        assert np.array_equal(coulomb.impulse, cone.impulse)
-
-
-@pytest.mark.parametrize("upper", [np.inf, 0.3])
-def test_where_nothing_rubs_no_law_of_friction_is_asked_for(upper):
-    # A chain on J and M, rows free or bounded: under either law the same convex problem.
-    n = 80
-    jac = np.eye(n)[:-1] - np.eye(n)[1:]
-    mass = np.diag(np.random.default_rng(5).uniform(0.5, 2.0, n))
-    cones = (
-        lv.Cones.free(n - 1) if np.isinf(upper) else lv.Cones.bounded([-upper] * (n - 1), [upper] * (n - 1))
-    )
-    solutions = []
-    for law in ("coulomb", "cone"):
-        problem = lv.Problem.from_jacobian(jac, mass, np.sin(np.arange(n)), cones=cones, friction=law)
-        solutions.append(lv.solve(problem, "newton", tol=1e-9, time_limit=10.0))
-    assert all(good(s, 1e-9) for s in solutions)
-    assert all("Coulomb rounds" not in s.work for s in solutions)
-    assert solutions[0].impulse.tobytes() == solutions[1].impulse.tobytes()
+    problem = FORMS[form](p)
+    coulomb, cone = lv.solve(problem, "newton"), lv.solve(problem.relaxed("cone"), "newton")
+    assert not coulomb.contradicted and "Coulomb rounds" not in coulomb.work
+    assert coulomb.status == cone.status
+    assert np.array_equal(coulomb.impulse, cone.impulse)

@@ -186,7 +186,7 @@ def test_a_late_solution_is_a_solution():
     again = pickle.loads(pickle.dumps(lv.solve(problem)))
     assert facts(again) == facts(late)
     assert late.success and late.raise_for_status() is late
-    assert not late.impulse.flags.writeable and not late.slack.flags.writeable
+    assert not any(x.flags.writeable for x in (late.impulse, late.slack, late.residual.error))
     with pytest.raises(TypeError):
         late.work["x"] = 1
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

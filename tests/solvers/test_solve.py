@@ -19,6 +19,7 @@ TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 
 REFUSED = {
     "no problem": (lambda: lv.solve(np.eye(2), "pgs"), lv.InputError, "Problem"),
+    "a matrix and a vector": (lambda: lv.solve(np.eye(2), [1.0, -1.0]), lv.InputError, "Problem.lcp"),
     "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
     "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
     "an option of others": (lambda: lv.solve(TINY, "direct", order="reverse"), lv.CapabilityError, "order"),
@@ -33,6 +34,16 @@ REFUSED = {
     "a start not finite": (lambda: lv.solve(TINY, "pgs", impulse=[1.0, np.inf]), lv.InputError, "impulse"),
     "a start of words": (lambda: lv.solve(TINY, "pgs", impulse=["a", "b"]), lv.InputError, "impulse"),
     "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
+    **{
+        f"{name} {value} of {count} problems": (
+            lambda name=name, value=value, count=count: lv.solve_many([TINY] * count, **{name: value}),
+            lv.InputError,
+            f"{name} is",
+        )
+        for name, value in (("tol", -3), ("tol", 1j), ("tol", None), ("time_limit", True), ("max_iter", True))
+        for count in (0, 1)
+    },
+    "tol true": (lambda: lv.solve(TINY, tol=True), lv.InputError, "tol is"),
     "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
     "history of a finite solver": (
         lambda: lv.solve(TINY, "direct", history=True),
@@ -141,21 +152,6 @@ def test_with_a_time_limit_the_first_look_at_the_clock_is_after_one_iteration(mo
     lv.solve(problem, "jacobi", tol=1e-12, max_iter=500, time_limit=limit)
     assert (asked[0] == 1) == (limit is not None)
     assert all(later <= 8 * one for one, later in itertools.pairwise(asked))
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"tol": -3}, {"tol": True}, {"tol": 1j}, {"tol": None}, {"time_limit": True}, {"max_iter": True}],
-)
-def test_what_is_no_number_of_a_budget_is_refused_of_no_problems_too(wrong):
-    problem = lv.Problem.lcp(np.eye(2), [1.0, -1.0])
-    said = next(iter(wrong)) + " is"
-    for solver in ("auto", "pgs"):
-        with pytest.raises(lv.InputError, match=said):
-            lv.solve(problem, solver, **wrong)
-        for problems in ([], [problem]):
-            with pytest.raises(lv.InputError, match=said):
-                lv.solve_many(problems, solver, **wrong)
 
 
 @pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from random_problems import warmed
+from worked import after
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -43,11 +45,9 @@ def drawn():
     for seed in range(90):
         problem = wild(seed=seed, rows=ROWS).problem
         yield f"wild {seed}", problem
-        solution = lv.solve(problem, tol=1e-9)
-        if solution.success:
-            rng = np.random.default_rng(seed)
-            b = problem.b * (1.0 + rng.choice([1e-3, 1e-2, 0.1]) * rng.standard_normal(problem.m))
-            yield f"wild {seed}, warm", problem.updated(b=b, guess=solution.impulse)
+        warm = warmed(problem, seed)
+        if warm is not None:
+            yield f"wild {seed}, warm", warm
 
 
 @pytest.fixture(scope="module")
@@ -105,34 +105,25 @@ def test_what_rests_is_told_within_twice_the_sweeps(text, options, sweeps):
 
 def test_checks_over_a_weigh_rows_as_the_judge_does():
     """In A nothing tells a hinge's angular rows from linear ones: the body's masses must come along."""
-    simulation = lv.Simulation(lv.Scene("four_bar"))
-    for _ in range(20):
-        simulation.step()
-    problem = simulation.constraint_problem()
+    problem = after(20, "four_bar").constraint_problem()
     assert np.any(problem.metric.nu != problem.metric.d)
     np.testing.assert_array_equal(problem.csr_data.nu, problem.metric.nu)
 
 
-def warm_stack():
-    simulation = lv.Simulation(lv.Scene("stack"))
-    for _ in range(15):
-        simulation.step()
-    return simulation.constraint_problem()
-
-
 @pytest.mark.parametrize("name", ["pgs", "sequential_impulses", "block_gauss_seidel"])
 def test_what_falls_slowly_goes_on_to_its_budget_and_says_how_slowly(name):
-    problem = warm_stack()
+    problem = after(15, "stack").constraint_problem()
     solution = lv.solve(problem, name, max_iter=1000)
     assert solution.status is lv.Status.MAX_ITERATIONS and solution.iterations == 1000
     # As many sweeps more bring it down tenfold, within a factor of three: the slope is that of the last half.
     more = lv.solve(problem, name, tol=0.0, max_iter=1000 + round(solution.sweeps_per_decade))
     assert 1 / 30 < more.residual.relative / solution.residual.relative < 0.3
+    assert "tol needs about" in solution.message
     sooner = solution.message.rpartition(": ")[2].split(", ")
     assert set(sooner) <= set(lv.available(problem, resumable=False)) and "newton" in sooner
     assert all(lv.solve(problem, other).success for other in sooner)
     enough = lv.solve(problem, name, max_iter=20_000)
-    assert enough.success and "more away" not in enough.message
+    assert enough.success and "tol needs about" not in enough.message
 
 
 @pytest.mark.parametrize("ratio", [10.0, 100.0])

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 import twins
 from hypothesis import given, settings
-from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds, sweeps
 
 import lavender as lv
 from lavender.ordering import ORDERS
-from lavender.solvers import sweeping
-
-
-def sweeps(problem, name, n, **options):
-    return lv.solve(problem, name, tol=0.0, max_iter=n, **options).impulse
 
 
 @pytest.mark.parametrize("kind", CONTACTS)
@@ -152,26 +147,7 @@ def test_stack_contracts_by_cos_squared(n, order):
     assert rate == pytest.approx(np.cos(np.pi / (2 * n)) ** 2, rel=2e-3)
 
 
-@pytest.mark.parametrize("ratio", [1.0, 10.0, 100.0])
-def test_heavy_on_light_contracts_by_r_over_one_plus_r(ratio):
-    """Mass R on mass 1 on the ground: A = [[1, -1], [-1, 1 + 1/R]]."""
-    problem = lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + 1.0 / ratio]], [0.1, 0.0])
-    assert contraction(problem, "pgs", 2, 6) == pytest.approx(ratio / (1.0 + ratio), rel=1e-9)
-
-
 # -- threads -------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", lv.available(threads=True))
-def test_threads_change_no_bit(name, monkeypatch):
-    """Small problems fall back to one thread; here they may not."""
-    monkeypatch.setattr(sweeping, "GRAIN", 0)
-    problem = random_contact_problem(3, bodies=40, joints=20, contacts=200)
-    results = {
-        t: lv.solve(problem, name, order="colored", threads=t, tol=1e-8, max_iter=40) for t in (1, 2, 3, 4)
-    }
-    assert len({s.impulse.tobytes() for s in results.values()}) == 1
-    assert len({s.iterations for s in results.values()}) == 1
 
 
 def test_threads_need_colors():

@@ -5,6 +5,8 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from judge_twin import Problem, spec_of
+from kkt_truth import Exact
 
 import lavender as lv
 from lavender import suite
@@ -99,28 +101,6 @@ def test_sets_and_families_are_listed():
 # -- geometry -------------------------------------------------------------------------------------
 
 
-def naive_delassus(rows, tangents):
-    """A of contacts, row by row: n.(velocity of the point on b minus on a)."""
-    n = rows.n_bodies
-    jac = []
-    for i in range(rows.n_contacts):
-        axes = [rows.normal[i], rows.tangent[i], np.cross(rows.normal[i], rows.tangent[i])][: 1 + tangents]
-        for u in axes:
-            row = np.zeros(6 * n)
-            for side, arm, sign in ((0, rows.arm_a, -1.0), (1, rows.arm_b, 1.0)):
-                k = rows.contact_body[i, side]
-                if k >= 0:
-                    row[6 * k : 6 * k + 3] += sign * u
-                    row[6 * k + 3 : 6 * k + 6] += sign * np.cross(arm[i], u)
-            jac.append(row)
-    jac = np.array(jac)
-    inv = np.zeros((6 * n, 6 * n))
-    for k in range(n):
-        inv[6 * k : 6 * k + 3, 6 * k : 6 * k + 3] = rows.inv_mass[k] * np.eye(3)
-        inv[6 * k + 3 : 6 * k + 6, 6 * k + 3 : 6 * k + 6] = rows.inv_inertia[k]
-    return jac @ inv @ jac.T, -jac @ rows.v_free.ravel()
-
-
 @pytest.mark.parametrize(
     "name",
     [
@@ -132,9 +112,10 @@ def naive_delassus(rows, tangents):
 )
 def test_problems_are_those_of_their_bodies_and_points(name):
     problem = suite.case(name).problem
-    a, b = naive_delassus(problem.rows, 2)
-    assert np.allclose(problem.dense(), a, rtol=0, atol=1e-13 * np.abs(a).max())  # sums of a few products
-    assert np.allclose(problem.b, b, rtol=0, atol=1e-14)
+    twin = Problem(spec_of(problem))
+    b = -twin.jac @ problem.rows.v_free.ravel()
+    assert np.allclose(problem.dense(), twin.A.astype(float), rtol=1e-13, atol=1e-13 * np.abs(twin.A).max())
+    assert np.allclose(problem.b, b.astype(float), rtol=0, atol=1e-14)
 
 
 def test_boxed_friction_has_the_rows_of_the_contacts_and_bounds_of_their_loads():
@@ -261,7 +242,7 @@ def test_the_toy_stack_is_solved_by_trying_all_active_sets_in_fractions():
     found = []
     for active in itertools.product((False, True), repeat=8):
         rows = [i for i in range(8) if active[i]]
-        x = solve_fractions([[a[i][j] for j in rows] for i in rows], [b[i] for i in rows])
+        x = Exact.solve([[a[i][j] for j in rows] for i in rows], [b[i] for i in rows])
         lam = [Fraction(0)] * 8
         for i, value in zip(rows, x, strict=True):
             lam[i] = value
@@ -273,20 +254,6 @@ def test_the_toy_stack_is_solved_by_trying_all_active_sets_in_fractions():
         assert np.allclose(lam, suite.toy_stack().reference.impulse, rtol=0, atol=1e-15)
     clamped = np.maximum(np.linalg.solve(problem.dense(), problem.b), 0.0)
     assert lv.residual(problem, clamped).relative > 0.1  # solving, then clamping once, is another answer
-
-
-def solve_fractions(a, b):
-    """Gaussian elimination; A positive definite."""
-    n = len(b)
-    m = [[*row, x] for row, x in zip(a, b, strict=True)]
-    for k in range(n):
-        for i in range(k + 1, n):
-            f = m[i][k] / m[k][k]
-            m[i] = [x - f * y for x, y in zip(m[i], m[k], strict=True)]
-    out = [Fraction(0)] * n
-    for k in reversed(range(n)):
-        out[k] = (m[k][n] - sum(m[k][j] * out[j] for j in range(k + 1, n))) / m[k][k]
-    return out
 
 
 def test_two_particles_follow_the_formula_of_the_docstring():
@@ -314,7 +281,7 @@ def test_extended_precision_beats_float64_and_refuses_what_it_cannot_solve():
     wide = exact.solve_linear(case.problem)
     plain = np.linalg.solve(a, b)
     rows = [[Fraction(x) for x in row] for row in a.tolist()]
-    truth = np.array([float(x) for x in solve_fractions(rows, [Fraction(x) for x in b.tolist()])])
+    truth = np.array([float(x) for x in Exact.solve(rows, [Fraction(x) for x in b.tolist()])])
     assert np.array_equal(wide, truth)  # both are the exact solution, rounded once
     assert np.abs(plain - truth).max() > 1e-12
     with pytest.raises(lv.InputError, match="singular"):

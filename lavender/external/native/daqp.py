@@ -17,7 +17,6 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
     import daqp
 
     _, low, high = two_sided(qp, False)
-    bounded = qp.lb is not None
     lb = np.zeros(0) if qp.lb is None else qp.lb
     ub = np.zeros(0) if qp.ub is None else qp.ub
     low, high = (np.clip(np.concatenate(p), -1e30, 1e30) for p in ((lb, low), (ub, high)))
@@ -61,7 +60,7 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
         words=f"{words} (exit flag {flag})",
         x=np.asarray(x),
         zeta=multipliers[k:],
-        xi=multipliers[:k] if bounded else np.zeros(qp.n),
+        xi=multipliers[:k],
         work={"iterations": info["iterations"]},
         direction=direction,
         contradiction=contradiction,

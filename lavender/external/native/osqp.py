@@ -50,8 +50,7 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
         words = "P is not positive semidefinite" if str(error) == "4" else "see its list of error codes"
         return Answer(Status.NUMERICAL_ERROR, f"OSQPException {error}: {words}")
     x, zeta, xi = qp.start(impulse)
-    bounded = qp.lb is not None
-    solver.warm_start(x=x, y=np.concatenate([zeta, xi]) if bounded else zeta)
+    solver.warm_start(x=x, y=np.concatenate([zeta, xi])[: len(low)])
     result = solver.solve(raise_error=False)
     info = result.info
     status = {
@@ -73,7 +72,7 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
         words=f"{info.status}{polished}",
         x=np.asarray(result.x),
         zeta=y[:r],
-        xi=y[r:] if bounded else np.zeros(qp.n),
+        xi=y[r:],
         work={"iterations": info.iter, "factorisations": 1 + info.rho_updates},
         direction=certificate(result.dual_inf_cert, qp.n),
         contradiction=certificate(None if result.prim_inf_cert is None else result.prim_inf_cert[:r], r),

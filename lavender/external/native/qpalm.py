@@ -33,8 +33,7 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
     set_all(settings, extra, "qpalm")
     solver = qpalm.Solver(data, settings)
     x, zeta, xi = qp.start(impulse)
-    bounded = qp.lb is not None
-    solver.warm_start(x, np.concatenate([zeta, xi]) if bounded else zeta)
+    solver.warm_start(x, np.concatenate([zeta, xi])[: len(low)])
     solver.solve()
     name = str(solver.info.status)
     status = {
@@ -51,7 +50,7 @@ def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> A
         words=name,
         x=np.array(solver.solution.x),
         zeta=y[:r],
-        xi=y[r:] if bounded else np.zeros(qp.n),
+        xi=y[r:],
         work={"iterations": solver.info.iter, "outer": solver.info.iter_out},
         direction=certificate(np.array(solver.dual_inf_certificate), qp.n) if "dual inf" in name else None,
         contradiction=certificate(np.array(solver.prim_inf_certificate)[:r], r)

@@ -79,7 +79,7 @@ class Advice:
 
     @property
     def best(self) -> Choice | None:
-        """The recommended one; None when nobody got there."""
+        """The recommended one; None if no solver reached the level."""
         return self.ranking[0] if self.ranking and self.ranking[0].solved else None
 
     @property
@@ -92,7 +92,7 @@ Place = tuple[tuple[float, ...], Choice]  # a smaller key is better whatever the
 
 
 def ranked(family: str, target: float, places: Iterable[Place], noise: float) -> Advice:
-    """Order of merit: by key, then by score; who is within noise of the best, by name, so that a rerun agrees.
+    """Ranking by key, then by score; solvers within noise of the best are ordered by name, so that a rerun agrees.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Lines that were timed in turns with each other: who wins, and in how many resamplings.
+"""Lines that were timed interleaved with each other: which wins, and in how many resamplings.
 
 A resampling draws the cases and the repetitions of the whole with replacement (a sequence's steps in blocks of
 consecutive ones, since neighbours are alike). In each the lines are ranked as the tables rank; who is within noise of

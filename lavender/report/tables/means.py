@@ -47,7 +47,7 @@ def geometric_mean(values: Sequence[float], shift: float = 0.0) -> float:
 
 
 def times_to(records: Records, level: float) -> dict[str, dict[str, float]]:
-    """Case -> solver -> time [s] to a level from a cold start, inf where missed; who refused is absent."""
+    """Case -> solver -> time [s] to a level from a cold start, inf if missed; solvers that refused it are absent."""
     out: dict[str, dict[str, float]] = defaultdict(dict)
     for reach in reaches(records, [level]):
         if reach.start == "cold":

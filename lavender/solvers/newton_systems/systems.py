@@ -15,7 +15,6 @@ from lavender._arrays import IntArray
 from lavender._later import sparse as sp
 from lavender.problem import Problem
 from lavender.residuals import reference
-from lavender.solvers.islands import block_bodies
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import symbolic
@@ -82,7 +81,7 @@ class VelocitySystem(System):
         super().__init__(problem, Solve(problem.metric))
         rows, solve = problem.rows, self.solve
         assert rows is not None
-        self.bodies = np.ascontiguousarray(block_bodies(problem)[solve.block], np.int32)
+        self.bodies = np.ascontiguousarray(rows.block_bodies[solve.block], np.int32)
         panel, used = solve.jacobian()
         columns = [c for c in range(6) if used >> c & 1]
         s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
