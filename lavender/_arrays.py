@@ -102,6 +102,14 @@ def as_array(
     return read_only(array)
 
 
+def shape_of(what: str, value: Any) -> tuple[int, ...]:
+    """The shape of what may be an array of numbers, or InputError for nested sequences of several lengths."""
+    try:
+        return np.shape(value)
+    except ValueError as error:
+        raise InputError(f"{what} is not an array of numbers ({error})") from None
+
+
 def number(
     what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
 ) -> float:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lavender.errors import InputError, LavenderError
-from lavender.problem import Problem
+from lavender.problem import Problem, check_problem
 from lavender.registry import available, get, known
 from lavender.residuals import FLOOR_MOST, WRONG
 from lavender.solution import Solution, Status, uninterrupted
@@ -170,6 +170,7 @@ def cross_check(
     InputError
         Wrong `tol` or limits.
     """
+    check_problem(problem)
     names = (
         available(problem) if solvers is None else [solvers] if isinstance(solvers, str) else list(solvers)
     )

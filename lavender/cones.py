@@ -32,6 +32,7 @@ from lavender._arrays import (
     check_not_nan,
     check_not_negative,
     equal,
+    shape_of,
     whole_number,
 )
 from lavender.errors import InputError, UnknownName
@@ -275,7 +276,10 @@ class Cones:
         """
         if type(tangents) is not int or not 0 <= tangents <= 5:
             tangents = whole_number("tangents", tangents, 0, 5)
-        box, pair = check_shape("shape", shape) == "box", type(mu) is not float and np.ndim(mu) > 1
+        box, pair = (
+            check_shape("shape", shape) == "box",
+            type(mu) is not float and len(shape_of("mu", mu)) > 1,
+        )
         if patch_radius is not None or rolling is not None or tangents != 2:
             _check_parts(mu, tangents, patch_radius is not None, rolling is not None, box, pair)
         ratio, sides = None, 0
@@ -530,20 +534,20 @@ def _fitting(kind: IntArray, size: IntArray) -> IntArray:
     return kind
 
 
-def _mu_array(mu: Any) -> FloatArray:
-    """Finite, of any shape."""
-    return as_array("mu", mu, (None,) * np.ndim(mu))
+def _pairs(mu: Any) -> FloatArray:
+    """mu (k, 2), one for each of two tangents, checked."""
+    given = as_array("mu", mu, (None,) * np.ndim(mu))
+    check_not_negative("mu", given.ravel())
+    if given.ndim != 2 or given.shape[1] != 2:
+        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
+    return given
 
 
 def _sides(mu: Any) -> tuple[Any, FloatArray]:
     """mu_1 (float or (k,)) of boxes and mu_2 / mu_1, (1,) or (k,), from mu: scalar, (k,) or (k, 2)."""
-    given = _mu_array(mu)
-    check_not_negative("mu", given.ravel())
-    if given.ndim < 2:
+    if np.ndim(mu) < 2:
         return mu, np.ones(1)
-    if given.ndim > 2 or given.shape[1] != 2:
-        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
-    first, second = given[:, 0], given[:, 1]
+    first, second = _pairs(mu).T
     first = np.where((first <= LEAST_SHARE * second) & (second > 0.0), LEAST_SHARE * second, first)
     some = first > 0.0
     return first, np.divide(second, first, out=np.zeros(len(first)), where=some)
@@ -551,10 +555,7 @@ def _sides(mu: Any) -> tuple[Any, FloatArray]:
 
 def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
     """mu_1 (k,) of ellipses and mu_2 / mu_1 (k,), None where all are disks, from mu (k, 2)."""
-    given = _mu_array(mu)
-    check_not_negative("mu", given.ravel())
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
+    given = _pairs(mu)
     flat = np.flatnonzero(
         (given.min(axis=1) < 2.0 * LEAST_SHARE * given.max(axis=1)) & (given.max(axis=1) > 0.0)
     )

@@ -170,7 +170,6 @@ class Prepared:
     def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
         start = perf_counter()  # a check may form A, which is set-up
         _check_problem(problem, spec)
-        self._given, problem = problem, problem.disk
         for name in options:
             if name not in spec.accepts:
                 if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
@@ -180,15 +179,18 @@ class Prepared:
                     )
                 raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *FRONT_DOOR})
         self.spec = spec
-        self.options = dict(options)
-        self.problem = problem
+        self.options = options
+        self._given, self.problem = problem, problem.disk
         self._lock = Lock()
-        self._fresh = True
-        self.setup_time = 0.0
         # `auto` prepares nothing before its compiled call for small problems was made.
         if options or not spec.delegates:
             self._begin()
         self.setup_time = perf_counter() - start
+
+    solver: Any = None  # made when it is first needed
+    setup_time = 0.0  # s
+    _fresh = True  # nothing was solved with what was set up
+    _broken = ""  # why there is no state
 
     def _begin(self) -> None:
         start = perf_counter()
@@ -223,7 +225,7 @@ class Prepared:
         InUse
             Another call of this object's `solve` has not returned yet.
         """
-        if not self._lock.acquire(blocking=False):
+        if not self._lock.acquire(False):
             raise InUse(
                 f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
                 "make one for each thread (lavender.prepare)"
@@ -301,9 +303,6 @@ class Prepared:
     def __reduce__(self) -> tuple[Any, ...]:
         """Copied or pickled it is prepared anew: a state is for one solve at a time."""
         return partial(prepare, **self.options), (self._given, self.spec.name)
-
-    solver: Any = None
-    _broken = ""  # why there is no state
 
     def _set_up(self, problem: Problem, anew: bool) -> None:
         """Prepare, or update the state of a problem of the same structure."""
@@ -484,7 +483,7 @@ class _Loop:
         r = residual(self.problem, self.impulse, "float64")
         if self.records is not None:
             self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self._next_record = next_count(self.done)
+        self._next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
         return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
 
     _next_record = 0
@@ -501,11 +500,6 @@ class _Loop:
             self._record()
         columns = list(zip(*self.records, strict=True))
         return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
-
-
-def next_count(n: int) -> int:
-    """The iteration count of the record after n: 1, 2, ... 16, then an eighth more each time."""
-    return n + max(1, n >> 3)
 
 
 def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
@@ -525,10 +519,9 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
         given = problem.guess
     elif (
         type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
-    ):
-        given = (
-            impulse if impulse.flags.c_contiguous and all_finite(impulse) else problem.impulse_array(impulse)
-        )
+        and impulse.flags.c_contiguous and all_finite(impulse)
+    ):  # fmt: skip
+        given = impulse
     else:
         given = problem.impulse_array(impulse)
     found = small.solve(problem, given, tol)

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of
+from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
 from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, Cones, check_shape
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -74,7 +74,7 @@ class Builders(Operators):
             The rows do not part among the contacts; mu > 0 where contacts have no row for friction.
         """
         b = as_array("b", b, (None,), unit="m/s")
-        if np.ndim(mu) > 1:
+        if len(shape_of("mu", mu)) > 1:
             return cls(b, Cones.contacts(mu, 2, patch_radius, rolling=rolling), A, **more)
         turns = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:

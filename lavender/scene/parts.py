@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, number
+from lavender._arrays import FloatArray, as_array, number, shape_of
 from lavender.errors import InputError
 from lavender.scene.arithmetic import norm, sine_cosine, turned_back
 
@@ -141,7 +141,7 @@ def quaternion(axis: tuple[float, float, float], angle: float) -> FloatArray:
 
 def numbers(what: str, value: Any, n: int) -> FloatArray:
     """`value` as a new finite array (n,)."""
-    if np.ndim(value) == 0:
+    if shape_of(what, value) == ():
         raise InputError(f"{what} is {value!r}; {n} numbers are needed")
     return as_array(what, value, (n,)).copy()
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, flag, number, whole_number
+from lavender._arrays import FloatArray, as_array, flag, number, shape_of, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
@@ -90,7 +90,7 @@ class Parameters:
         for name, allowed in RANGES.items():
             put(self, name, number(name, getattr(self, name), **allowed))
         gravity: Any = self.gravity
-        if np.ndim(gravity) == 0:
+        if shape_of("gravity", gravity) == ():
             gravity = (0.0, 0.0, -number("gravity", gravity))
         put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
         for name in ("solver_options", "stepper_options"):
@@ -586,9 +586,10 @@ def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
 
 
 def _tensor(label: str, given: Any) -> FloatArray:
-    if np.shape(given) not in ((3,), (3, 3)):
+    shape = shape_of(f"inertia of {label}", given)
+    if shape not in ((3,), (3, 3)):
         raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed")
-    x = as_array(f"inertia of {label} [kg m^2]", given, np.shape(given))
+    x = as_array(f"inertia of {label} [kg m^2]", given, shape)
     if x.ndim == 1:
         x = np.diag(x)
     scale = np.abs(x).max()

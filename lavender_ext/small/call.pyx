@@ -42,7 +42,6 @@ cdef enum:
     ROUNDS = 32                 # of exchanges
     PATH = 8                    # pivots of Lemke's for each row
     FEW = 12                    # rows of an island that has all of its sweeps before its factors
-    PATIENT = 4                 # times its share of factors (SHORT) that islands may take before the whole is left
     LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
 
 
@@ -393,7 +392,7 @@ cdef class Friction(Small):
             self.most_factored = SHORT * float(size[0] @ size[0]**2)
 
     cdef solve(self, own, double tol, bint follow, bint capped):
-        cdef double most = self.most_factored if capped else PATIENT * self.most_factored if self.count > 1 else 1.0 / 0.0
+        cdef double most = self.most_factored if capped else INFINITY
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
                              self.most, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
         cdef room_t r = room_t(0, 0, NULL, NULL)

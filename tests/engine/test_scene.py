@@ -137,6 +137,8 @@ def test_contacts_of_one_scene_may_have_different_rows():
         (lambda s: s.add_body(position=("0", "0", "1")), "position .* real numbers"),
         (lambda s: s.add_body(velocity=(0, 0, 1j)), "velocity .* complex"),
         (lambda s: s.add_body(inertia=np.ma.array([1.0, 1.0, 1.0], mask=[0, 0, 1])), "inertia .* no value"),
+        (lambda s: s.add_body(position=[[0.0], [0.0, 1.0]]), "position .* not an array of numbers"),
+        (lambda s: s.add_body(inertia=[[1.0], [1.0, 1.0]]), "inertia .* not an array of numbers"),
         (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
         (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
         (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),

@@ -208,6 +208,7 @@ BAD_PROBLEMS = {
     "a judge without a problem": (lambda: lv.residual(None, [1.0]), "a lavender.Problem is needed"),
     "dates": (lambda: lv.Problem.lcp(I2, np.array([1, 2], "m8[s]")), "real numbers"),
     "mu of text": (lambda: lv.Cones.contacts("0.5"), "real numbers"),
+    "ragged mu": (lambda: lv.Cones.contacts([[0.5], [0.5, 0.5]]), "mu is not an array of numbers"),
     "complex mu": (lambda: lv.Cones.contacts([0.5j]), "real numbers"),
     "one bound": (lambda: lv.Cones.bounded(0.0, 1.0), r"lower \[N s\] has shape \(\); \(any,\) is needed"),
     "free rows": (lambda: lv.Cones.free(2.5), "m is 2.5; a whole number"),

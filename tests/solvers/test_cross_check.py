@@ -139,6 +139,8 @@ def test_unknown_names():
         cross_check(problem, ["pgs"], reference="osq")
     with pytest.raises(lv.InputError, match="no solver 'direct' in this check"):
         cross_check(problem, ["pgs"])["direct"]
+    with pytest.raises(lv.InputError, match=r"a lavender\.Problem is needed"):
+        lv.cross_check(None)
     with pytest.raises(lv.InputError, match="tol"):
         cross_check(problem, ["pgs"], tol=-1.0)
 
