@@ -41,7 +41,7 @@ METHODS = {
     for name, spec in registry.specs().items()
     if spec.own and not spec.external
 }
-#: Those whose factor is LAPACK's in the package, or whose turns are chosen there: others bits, the same judge.
+#: Those whose factor is another in the package, or whose turns are chosen there: other bits, the same judge.
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}

@@ -306,7 +306,7 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
 
 
 def engine_table(found: Sequence[Contestant]) -> Table:
-    """Engines' own answers beside the fastest solver here that reaches its tolerance in every step."""
+    """Engines' own answers beside the solver here that is the fastest to a level as good in every step."""
     rows: Rows = []
     for c in found:
         own = [

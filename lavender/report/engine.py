@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lavender.bench.record import Record
 from lavender.bench.store import Records
 from lavender.io.recording import ENGINE
 from lavender.io.stored import whole_file
@@ -41,7 +42,7 @@ class Contestant:
     early: (
         int | None
     )  # answers of a float32 engine that stopped early or are wrong; None in float64, where tol ends all
-    ours: str  # the fastest solver that reached its tolerance in every step, carrying impulses; empty if none did
+    ours: str  # the fastest solver that reached the level in every step, its start, the level; empty if none did
     our_seconds: float  # median
     our_worst: float
 
@@ -65,7 +66,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
         if not found:
             continue
         rows, seconds, relative, early, solvers = zip(*found, strict=True)
-        name, ours, worst = _fastest(Path(word).name, records)
+        name, ours, worst = _fastest(Path(word).name, records, max(relative))
         out.append(
             Contestant(
                 folder=Path(word).name,
@@ -84,23 +85,28 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
     return out
 
 
-def _fastest(sequence: str, records: Records) -> tuple[str, float, float]:
+def _fastest(sequence: str, records: Records, engine: float) -> tuple[str, float, float]:
+    """The fastest at the loosest level that is no worse than the engine's worst residual, else at the closest."""
     # Steps of a folder are cases named "folder[step]".
-    by_solver: dict[tuple[str, str], list[tuple[float, float, bool]]] = {}
-    for r in records:
-        if (
-            r.mode == "tol"
-            and not r.turns
-            and r.case.partition("[")[0] == sequence
-            and records.success(r) is not None
-        ):
-            by_solver.setdefault((r.solver, r.start), []).append((r.time_min, r.relative, r.success))
+    runs = [
+        r
+        for r in records
+        if r.mode == "tol"
+        and not r.turns
+        and r.case.partition("[")[0] == sequence
+        and records.success(r) is not None
+    ]
+    levels = {r.tol for r in runs}
+    level = max((tol for tol in levels if tol <= engine), default=min(levels, default=math.nan))
+    by_solver: dict[tuple[str, str], list[Record]] = {}
+    for r in runs:
+        if r.tol == level:
+            by_solver.setdefault((r.solver, r.start), []).append(r)
     most = max((len(runs) for runs in by_solver.values()), default=0)
     best = ("", math.nan, math.nan)
-    for (solver, start), runs in by_solver.items():
-        times, errors, reached = zip(*runs, strict=True)
-        if len(runs) == most and all(reached):
-            time = float(np.median(times))
+    for (solver, start), steps in by_solver.items():
+        if len(steps) == most and all(r.success for r in steps):
+            time = float(np.median([r.time_min for r in steps]))
             if not time >= best[1]:
-                best = (f"{solver}, {start}", time, max(errors))
+                best = (f"{solver}, {start}, to {level:g}", time, max(r.relative for r in steps))
     return best

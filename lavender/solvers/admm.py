@@ -6,8 +6,8 @@ in the metric of d: B = D^-1/2 A D^-1/2, c = D^-1/2 b, K the bounds and cones of
 Saxce's shift of Coulomb's law (`lavender_ext/accelerate/admm.pyx`). An iteration is one triangular solve instead of
 a sweep. So large mass ratios and long chains need more factorisations (rho is adapted, ever more rarely), not more
 iterations. Coulomb friction starts from the solution of the convex relaxation.
-The factorisation is Cholesky for a dense A; L L^T by panels for a sparse A, or for the body form if that has fewer
-unknowns than rows; L U by panels if A is not symmetric, or belongs to a linear system and is not definite.
+The factorisation is L L^T by panels of A, or of the body form if that has fewer unknowns than rows; L U by panels if A
+is not symmetric, or belongs to a linear system and is not definite.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
-from lavender.solvers.newton_systems.systems import DENSE_FILL, factor_cost
+from lavender.solvers.newton_systems.systems import factor_cost
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
@@ -40,7 +40,7 @@ from lavender_ext.factor.graph import body_pattern
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import scaled_entries
 
-_DENSE, _PANELS, _BODIES = 0, 1, 2  # as the kernel names them
+_PANELS, _BODIES = 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
@@ -50,8 +50,8 @@ AT_ONCE = (
     5e-3  # s, that scaling, analysis and the first factor may be expected to take for `prepare` to do them
 )
 _ENTRY = 4e-8  # s, of the first two, for each entry of A
-# s for each multiply-add of a factor by panels, of L U in one panel, and of a dense one.
-_PANELS_WORK, _ONE_PANEL, _FULL = 1e-9 * PANELS_WORK, 4e-10, 1.5e-10
+# s for each multiply-add of a factor by panels, and of L U in one panel.
+_PANELS_WORK, _ONE_PANEL = 1e-9 * PANELS_WORK, 4e-10
 
 
 class _Failed(Exception):
@@ -65,13 +65,11 @@ class _TooLate(Exception):
 class AdmmState:
     """Scaled problem, factorisation for the current rho, and the vectors of the run, which `open` makes."""
 
-    def __init__(self, problem: Problem, memory: int) -> None:
+    def __init__(self, problem: Problem, memory: int, relaxation: float) -> None:
         reference(problem)
-        self.problem, self.memory = problem, memory
+        self.problem, self.memory, self.relaxation = problem, memory, relaxation
         self.deadline = Deadline()  # nothing is begun that is expected to end later
-        self.factorisations = self.reported = self.undone = (
-            0  # factors: all, and those that an earlier run has told
-        )
+        self.factorisations = self.reported = 0  # factors: all, and those that an earlier run has told
         self.watch: Any = None
         self.factor: Any = None
         self.is_scaled = False
@@ -95,10 +93,7 @@ class AdmmState:
         problem = self.problem
         self.data = problem.data
         self.watch = watch_over(problem, problem.data, _PATIENCE)
-        self.root = np.sqrt(problem.d)
-        self.c = problem.b / self.root
-        self.space = admm.allocate(self.data, self.memory)
-        self.rho = _START_RHO
+        self.splitting = admm.Splitting(self.data, self.memory, _START_RHO, self.relaxation)
         self.matrix: Any = None
         self.panels: Any = None  # analysed, of the matrix
         self.lu = self.full = False  # L U, and of a matrix with an entry everywhere
@@ -108,12 +103,9 @@ class AdmmState:
             self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
             return
         a = problem.csr
-        values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / self.root)
+        values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
         self.matrix = sp.csr_array((values, a.indices, a.indptr), shape=a.shape)
         self.lu = not problem.is_symmetric
-        if not self.lu and self.matrix.nnz > DENSE_FILL * problem.m**2 and problem.m > 1:
-            self.kind, self.matrix = _DENSE, self.matrix.toarray()
-            return
         self.kind = _PANELS
         if problem.m:
             self.matrix = _mirrored(self.matrix)
@@ -122,8 +114,6 @@ class AdmmState:
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
         problem, m = self.problem, self.problem.m
-        if self.kind == _DENSE:
-            return _FULL * m**3 / 3.0
         if self.kind == _BODIES:
             assert problem.rows is not None
             nptr, nind = body_pattern(problem.rows.block_bodies, problem.rows.n_bodies)[:2]
@@ -153,23 +143,14 @@ class AdmmState:
         return made
 
     def _make_factor(self, most: float) -> tuple[int, int, tuple[Any, ...]]:
-        m = self.problem.m
+        m, rho = self.problem.m, self.splitting.rho
         if m == 0:
             return self.kind, 0, ()
-        if self.kind == _DENSE:
-            shifted = self.matrix.copy()
-            shifted[np.diag_indices(m)] += self.rho
-            try:
-                return _DENSE, m, (np.ascontiguousarray(np.linalg.cholesky(shifted)),)
-            except np.linalg.LinAlgError as error:
-                raise _Failed(
-                    f"A + rho D is not positive definite at rho = {self.rho:.1e}: {error}"
-                ) from None
-        panels, matrix, shift = self.panels, self.matrix, self.rho
+        panels, matrix, shift = self.panels, self.matrix, rho
         extra: tuple[Any, ...] = ()
         if self.kind == _BODIES:
             k = self.jacobian
-            e = 1.0 / (self.theta + self.rho)
+            e = 1.0 / (self.theta + rho)
             matrix, shift = _mirrored(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # Analysed each time: an entry may cancel at one rho and not at another, or alone of a pair.
             panels = _analysed(matrix, False)
@@ -189,7 +170,7 @@ class AdmmState:
             self.panels = panels = _analysed(matrix, True)
             done = _factored(panels, matrix, shift, True)
         if not done:
-            raise _Failed(f"the factor of A + rho D broke down at rho = {self.rho:.1e}")
+            raise _Failed(f"the factor of A + rho D broke down at rho = {rho:.1e}")
         return self.kind, matrix.shape[0], (panels, *extra)
 
 
@@ -278,7 +259,7 @@ class ADMM:
         """Scale and factor; a text where the factorisation broke down."""
         load()
         try:
-            return AdmmState(problem, self.memory)
+            return AdmmState(problem, self.memory, self.relaxation)
         except _Failed as failure:
             return str(failure)
 
@@ -309,21 +290,17 @@ class ADMM:
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
         except _TooLate:
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE)
-        data = state.data
-        if state.watch.total == 0 and len(impulse):
+        splitting = state.splitting
+        if state.watch.total == 0:
             # y of the start: minus its slack, shifted; at a solution the first iteration stays there.
-            admm.start(data, impulse, state.problem.slack(impulse), state.root, state.rho, state.space)
-        undone, message, total = state.undone, "", state.watch.total
+            splitting.start(impulse, state.problem.slack(impulse))
+        undone, message, total = splitting.undone, "", state.watch.total
 
         def iterate(count: int, first: bool) -> None:
             while count:
-                done, rho, state.undone = admm.run(
-                    data, impulse, count, state.rho, self.relaxation, self.memory, state.space, state.root,
-                    state.c, state.factor,
-                )  # fmt: skip
-                count -= done
-                if rho > 0.0:
-                    state.rho = rho
+                rho = splitting.rho
+                count -= splitting.run(impulse, count, state.factor)
+                if splitting.rho != rho:
                     state.factor = state._factor()
 
         try:
@@ -335,11 +312,10 @@ class ADMM:
         work = {
             "solves": result.iterations,
             "factorisations": state.factorisations - state.reported,
-            "undone": state.undone - undone,
+            "undone": splitting.undone - undone,
         }
         state.reported = state.factorisations
-        sparse = "sparse LU" if state.lu else "sparse Cholesky"
-        form = ("dense Cholesky", sparse, "Cholesky over bodies")[state.kind]
+        form = "Cholesky over bodies" if state.kind == _BODIES else "LU" if state.lu else "Cholesky"
         return replace(result, work=work, form=form, message=message)
 
 

@@ -27,8 +27,9 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_tangents, norm2,
-                                      rolling_section, round_group, round_section, round_share)
+from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_apart, n_tangents,
+                                      norm2, rolling_section, round_group, round_section, round_share)
+from lavender_ext.core.contact_map cimport section
 from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.blocks cimport sparse_t
@@ -59,8 +60,8 @@ cdef struct factor_t:           # of B + rho, or of the body form
 
 cdef struct admm_t:
     const blocks_t* blocks
-    const double* root          # (m) sqrt d
-    const double* c             # (m)
+    double* root                # (m) sqrt d
+    double* c                   # (m)
     double rho
     double alpha
     double* u                   # (m)
@@ -70,7 +71,11 @@ cdef struct admm_t:
     double* g                   # (m)
     double* before              # (m) z of the iteration before
     double* work                # (n) of BODIES
-    double* turn                # (4) iterations done; u was mixed; iterations at the next weighing; the shift is on
+    double done                 # iterations
+    double next                 # of them at the next weighing
+    int32_t mixed               # u was
+    int32_t shifted             # the shift is on
+    mixing_t mixing
 
 
 cdef inline void solve_dense(const factor_t* f, double* x) noexcept nogil:
@@ -116,7 +121,7 @@ cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* 
 
 
 cdef inline void project_round(int32_t n, const double* root, double mu, const double* u, double* z) noexcept nogil:
-    """The same of a round cone of n rows; core/block.pxd (8)."""
+    """Pi_K(u) of a round cone of n rows; core/block.pxd (8)."""
     cdef double t[3]
     cdef double a[3]
     cdef double r = 0.0, size = 0.0
@@ -133,82 +138,52 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
         z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
-cdef inline void project_rolling(const blocks_t* p, const double* root, int32_t i, const double* u, double* z) noexcept nogil:
-    # the same of a contact that resists rolling: parts g of one or two rows
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, g, k, q
-    cdef double a[3]
-    cdef double t[3]
-    cdef double bound[3]
-    cdef double f
-    openings(p, root, i, a)
-    for g in range(3):
-        q = 1 if g == 0 else 3 if g == 1 else n - 2
-        t[g] = norm2(u[j + q], u[j + q + 1]) if g != 1 else fabs(u[j + q]) if n == 6 else 0.0
-    z[j] = rolling_section(a, t, u[j], bound)
-    for g in range(3):
-        f = bound[g] / t[g] if t[g] > bound[g] else 1.0
-        q = 1 if g == 0 else 3 if g == 1 else n - 2
-        for k in range(j + q, j + q + (2 if g != 1 else n - 5)):
-            z[k] = f * u[k]
-
-
-cdef inline void openings(const blocks_t* p, const double* root, int32_t i, double* a) noexcept nogil:
-    # a_g of the tangents, of the spin (0 without), of what rolls
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j
-    a[0] = p.mu[i] * root[j + 1] / root[j]
-    a[1] = p.mu[i] * p.patch_radius[i] * root[j + 3] / root[j] if n == 6 else 0.0
-    a[2] = p.rolling[i] * root[j + n - 2] / root[j]
+cdef inline void parts(const blocks_t* p, const double* root, int32_t i, const double* x, double* a, double* t) noexcept nogil:
+    """a_g and |x_g| of the parts of a contact that each have a bound: tangents, spin or second side of a box, what rolls."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p.kind[i], n), apart = n_apart(p.kind[i], n), k
+    a[0] = a[1] = a[2] = t[0] = t[1] = t[2] = 0.0
+    if nt > 0:
+        a[0] = p.mu[i] * root[j + 1] / root[j]
+        t[0] = norm2(x[j + 1], x[j + 2]) if nt == 2 else fabs(x[j + 1])
+    if apart & 1:
+        k = j + 1 + nt
+        a[1] = p.mu[i] * p.patch_radius[i] * root[k] / root[j]
+        t[1] = fabs(x[k])
+    if apart & 2:
+        k = j + n - 2
+        a[2] = p.rolling[i] * root[k] / root[j]
+        t[2] = norm2(x[k], x[k + 1])
 
 
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
-    cdef double at, as_, t, s, c
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g, nt
+    cdef bint rolls = p.kind[i] == CONTACT_ROLLING
+    cdef double a[3]
+    cdef double t[3]
+    cdef double bound[3]
     if p.kind[i] == ROW:
-        for k in range(j, j + n):
+        for k in range(j, end):
             z[k] = clip(u[k], p.lower[k] * root[k], p.upper[k] * root[k])
         return
     if p.kind[i] == ROUND:
-        project_round(n, root + j, p.mu[i], u + j, z + j)
+        project_round(end - j, root + j, p.mu[i], u + j, z + j)
         return
-    if p.kind[i] == CONTACT_ROLLING:
-        project_rolling(p, root, i, u, z)
-        return
-    nt = n_tangents(p.kind[i], n)
-    at = p.mu[i] * root[j + 1] / root[j] if nt > 0 else 0.0
-    as_ = p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] if ends_apart(p.kind[i]) else 0.0
-    t = norm2(u[j + 1], u[j + 2]) if nt == 2 else (fabs(u[j + 1]) if nt == 1 else 0.0)
-    c = fabs(u[j + n - 1]) if ends_apart(p.kind[i]) else 0.0
-    s = u[j] if u[j] > 0.0 else 0.0
-    if (u[j] + at * t) / (1.0 + at * at) > s:
-        s = (u[j] + at * t) / (1.0 + at * at)
-    if ends_apart(p.kind[i]):
-        if (u[j] + as_ * c) / (1.0 + as_ * as_) > s:
-            s = (u[j] + as_ * c) / (1.0 + as_ * as_)
-        if (u[j] + at * t + as_ * c) / (1.0 + at * at + as_ * as_) > s:
-            s = (u[j] + at * t + as_ * c) / (1.0 + at * at + as_ * as_)
-        z[j + n - 1] = clip(u[j + n - 1], -as_ * s, as_ * s)
-    z[j] = s
-    c = at * s / t if t > at * s else 1.0
-    for k in range(j + 1, j + 1 + nt):
-        z[k] = c * u[k]
+    nt = n_tangents(p.kind[i], end - j)
+    parts(p, root, i, u, a, t)
+    z[j] = rolling_section(a, t, u[j], bound) if rolls else section(a, t, u[j], ends_apart(p.kind[i]), bound)
+    for k in range(j + 1, end):
+        g = 0 if k <= j + nt else 2 if rolls and k >= end - 2 else 1
+        z[k] = bound[g] / t[g] * u[k] if t[g] > bound[g] else u[k]
 
 
 cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
     # s of the normal of contact i
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p.kind[i], n)
-    cdef double s = 0.0
     cdef double a[3]
-    if p.kind[i] == CONTACT_ROLLING:
-        openings(p, root, i, a)
-        s = a[0] * norm2(y[j + 1], y[j + 2]) + a[2] * norm2(y[j + n - 2], y[j + n - 1])
-        return s + a[1] * fabs(y[j + 3]) if n == 6 else s
-    if nt > 0:
-        s = p.mu[i] * root[j + 1] / root[j] * (norm2(y[j + 1], y[j + 2]) if nt == 2 else fabs(y[j + 1]))
-    if ends_apart(p.kind[i]):
-        s += p.mu[i] * p.patch_radius[i] * root[j + n - 1] / root[j] * fabs(y[j + n - 1])
-    return s
+    cdef double t[3]
+    parts(p, root, i, y, a, t)
+    return a[0] * t[0] + a[1] * t[1] + a[2] * t[2]
 
 
 cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
@@ -243,127 +218,158 @@ cdef inline double weighed(const admm_t* c) noexcept nogil:
     return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
 
 
-cdef public double lav_admm(admm_t* c, const factor_t* f, const mixing_t* mixing, double* lam,
-                            int32_t* n) noexcept nogil:
+cdef public int64_t lav_admm_room(int64_t m, int32_t memory) noexcept nogil:
+    """Numbers of a run."""
+    return (10 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
+
+
+cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha, double* room) noexcept nogil:
+    """A run over p before its first iteration, in room (`lav_admm_room`, zeroed)."""
+    cdef int64_t m = p.n_rows
+    cdef int32_t i
+    c.blocks = p
+    c.rho, c.alpha = rho, alpha
+    c.done = c.next = 0.0
+    c.mixed = c.shifted = 0
+    c.root, c.c, c.u, c.z, c.y = room, room + m, room + 2 * m, room + 3 * m, room + 4 * m
+    c.x, c.g, c.before = room + 5 * m, room + 6 * m, room + 7 * m
+    c.work = NULL
+    c.mixing.m, c.mixing.memory = <int32_t>m, memory
+    c.mixing.v, c.mixing.g, c.mixing.dv = room + 8 * m, room + 9 * m, room + 10 * m
+    c.mixing.dg = c.mixing.dv + memory * m
+    c.mixing.control = c.mixing.dg + memory * m
+    c.mixing.gram = c.mixing.control + CONTROL
+    for i in range(p.n_rows):
+        c.root[i] = sqrt(p.d[i])
+        c.c[i] = p.b[i] / c.root[i]
+
+
+cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* n) noexcept nogil:
     """At most n iterations; n is what is left on return. Returns 0, or the rho that should be factored next."""
     cdef const blocks_t* p = c.blocks
     cdef int32_t m = p.n_rows, i, mixed
     cdef double rho = c.rho, primal, dual
     while n[0] > 0:
         n[0] -= 1
-        mixed = c.turn[1] > 0.0
+        mixed = c.mixed
         for i in range(p.n_blocks):
             project_block(p, c.root, i, c.u, c.z)
         for i in range(m):
             c.y[i] = rho * (c.u[i] - c.z[i])
             c.x[i] = c.c[i] + rho * c.z[i] - c.y[i]
-        if p.law != CONE and c.turn[3] > 0.0:
+        if p.law != CONE and c.shifted:
             for i in range(p.n_blocks):
                 if p.kind[i] != ROW:
                     c.x[p.ptr[i]] -= shift(p, c.root, i, c.y)
         solve_shifted(f, m, c.x, c.work)
-        c.turn[0] += 1.0
+        c.done += 1.0
         for i in range(m):
             c.g[i] = c.alpha * (c.x[i] - c.z[i])
             c.u[i] += c.g[i]
-        if not take(mixing, mixed, c.u, c.g):
-            c.turn[1] = 0.0
+        if not take(&c.mixing, mixed, c.u, c.g):
+            c.mixed = 0
             continue
-        if c.turn[3] == 0.0 and (c.turn[0] >= CONVEX_AT_MOST or imbalance(c, &primal, &dual) <= 1e-3):
-            c.turn[3] = 1.0
-            forget(mixing)
-        if c.turn[0] >= c.turn[2]:
-            if c.turn[2] > 0.0:
+        if not c.shifted and (c.done >= CONVEX_AT_MOST or imbalance(c, &primal, &dual) <= 1e-3):
+            c.shifted = 1
+            forget(&c.mixing)
+        if c.done >= c.next:
+            if c.next > 0.0:
                 rho = weighed(c)
-            c.turn[2] = c.turn[0] + (0.25 * c.turn[0] if c.turn[0] > 4.0 * RHO_EVERY else RHO_EVERY)
+            c.next = c.done + (0.25 * c.done if c.done > 4.0 * RHO_EVERY else RHO_EVERY)
         for i in range(m):
             c.before[i] = c.z[i]
             lam[i] = c.z[i] / c.root[i]
         if rho != c.rho:
             for i in range(m):
                 c.u[i] = c.z[i] + c.y[i] / rho
-            forget(mixing)
-            c.turn[1] = 0.0
+            forget(&c.mixing)
+            c.mixed = 0
             return rho
-        c.turn[1] = mix(mixing, c.u)
+        c.mixed = mix(&c.mixing, c.u)
     return 0.0
 
 
-cdef public void lav_admm_start(const blocks_t* p, const double* lam, const double* w, const double* root, double rho,
-                                double* u, double* y) noexcept nogil:
-    """u (m) of a start: lam, its slack w; y (m) is scratch."""
+cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) noexcept nogil:
+    """u of a start lam and its slack w (m): z + y / rho with y = -(w + s) in the scale of u."""
+    cdef const blocks_t* p = c.blocks
     cdef int32_t i
     for i in range(p.n_rows):
-        y[i] = -w[i] / root[i]
+        c.y[i] = -w[i] / c.root[i]
     for i in range(p.n_rows):
-        u[i] = y[i]
+        c.u[i] = c.y[i]
     if p.law != CONE:
         for i in range(p.n_blocks):
             if p.kind[i] != ROW:
-                u[p.ptr[i]] -= shift(p, root, i, y)
+                c.u[p.ptr[i]] -= shift(p, c.root, i, c.y)
     for i in range(p.n_rows):
-        u[i] = root[i] * lam[i] + u[i] / rho
+        c.u[i] = c.root[i] * lam[i] + c.u[i] / c.rho
 
 
-def allocate(Data p, int memory):
-    """Zeroed vectors of a run: (control, gram, turn, work)."""
-    if not 0 <= memory <= MAX_MEMORY:
-        raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(4),
-            np.zeros((8 + 2 * memory) * p.blocks.n_rows + 1))
+cdef class Splitting:
+    """A run over a problem, whose factorisations the caller makes.
 
-
-def start(Data p, const double[::1] lam, const double[::1] w, const double[::1] root, double rho, space):
-    """u of an impulse and its slack: z + y / rho with y = -(w + s) in the scale of u."""
-    cdef double[::1] v = space[3]
-    cdef Py_ssize_t m = p.blocks.n_rows
-    lav_admm_start(&p.blocks, &lam[0], &w[0], &root[0], rho, &v[0], &v[m])
-
-
-def run(Data p, double[::1] lam, int n, double rho, double alpha, int memory, space, const double[::1] root,
-        const double[::1] c, factor):
-    """At most `n` iterations in place, GIL released: (iterations done, 0 or the rho to factor next, undone so far).
-
-    factor: (kind, order, arrays) with the arrays that `factor_t` names, in its order; None where a kind has none.
+    Parameters
+    ----------
+    p : Data
+    memory : int
+        Iterations that are mixed, 0 to MAX_MEMORY.
+    rho, alpha : float
+        The first penalty; the relaxation.
     """
-    cdef admm_t run
-    cdef factor_t f
-    cdef mixing_t mixing
-    cdef Py_ssize_t m = p.blocks.n_rows
-    cdef int32_t left = n
-    cdef double wanted
-    cdef double[::1] control = space[0], gram = space[1], turn = space[2], v = space[3]
-    cdef double[::1] work
-    cdef const double[:, ::1] dense
-    cdef const double[::1] k_val, e
-    cdef const int32_t[::1] k_ptr, k_col
-    cdef SparsePanels panels
-    f.kind = factor[0]
-    f.n = factor[1]
-    if f.kind == DENSE:
-        dense = factor[2][0]
-        f.dense = &dense[0, 0]
-    else:
-        panels = factor[2][0]
-        f.panels = &panels.f
-        if f.kind == BODIES:
-            k_ptr, k_col, k_val, e = factor[2][1:]
-            f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
-    work = np.empty(f.n + 1)
-    run.blocks = &p.blocks
-    run.root = &root[0]
-    run.c = &c[0]
-    run.rho = rho
-    run.alpha = alpha
-    run.u, run.z, run.y, run.x, run.g, run.before = &v[0], &v[m], &v[2 * m], &v[3 * m], &v[4 * m], &v[5 * m]
-    run.work = &work[0]
-    run.turn = &turn[0]
-    mixing.m = <int32_t>m
-    mixing.memory = memory
-    mixing.control = &control[0]
-    mixing.gram = &gram[0]
-    mixing.v, mixing.g, mixing.dv = &v[6 * m], &v[7 * m], &v[8 * m]
-    mixing.dg = mixing.dv + memory * m
-    with nogil:
-        wanted = lav_admm(&run, &f, &mixing, &lam[0], &left)
-    return n - left, wanted, int(control[UNDONE])
+    cdef admm_t c
+    cdef object keep
+
+    def __init__(self, Data p, int memory, double rho, double alpha):
+        cdef double[::1] room
+        if not 0 <= memory <= MAX_MEMORY:
+            raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
+        room = np.zeros(lav_admm_room(p.blocks.n_rows, memory))
+        self.keep = p, room
+        lav_admm_lay(&self.c, &p.blocks, memory, rho, alpha, &room[0])
+
+    @property
+    def rho(self):
+        """The penalty that the factor must have."""
+        return self.c.rho
+
+    @property
+    def undone(self):
+        """Mixed steps that were undone."""
+        return int(self.c.mixing.control[UNDONE])
+
+    def start(self, const double[::1] lam, const double[::1] w):
+        """From an impulse and its slack (m,)."""
+        if lam.shape[0]:
+            lav_admm_start(&self.c, &lam[0], &w[0])
+
+    def run(self, double[::1] lam, int n, factor):
+        """At most `n` iterations in place, GIL released: how many. `rho` may be another then, and asks for a factor.
+
+        factor: (kind, order, arrays) with the arrays that `factor_t` names, in its order; None where a kind has none.
+        """
+        cdef factor_t f
+        cdef int32_t left = n
+        cdef double wanted
+        cdef double[::1] work
+        cdef const double[:, ::1] dense
+        cdef const double[::1] k_val, e
+        cdef const int32_t[::1] k_ptr, k_col
+        cdef SparsePanels panels
+        f.kind = factor[0]
+        f.n = factor[1]
+        if f.kind == DENSE:
+            dense = factor[2][0]
+            f.dense = &dense[0, 0]
+        else:
+            panels = factor[2][0]
+            f.panels = &panels.f
+            if f.kind == BODIES:
+                k_ptr, k_col, k_val, e = factor[2][1:]
+                f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
+        work = np.empty(f.n + 1)
+        self.c.work = &work[0]
+        with nogil:
+            wanted = lav_admm(&self.c, &f, &lam[0], &left)
+        if wanted > 0.0:
+            self.c.rho = wanted
+        return n - left

@@ -23,12 +23,12 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
-from lavender_ext.core.rows cimport cross, joint_velocity
+from lavender_ext.core.rows cimport cross, dot3, joint_velocity
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_ITERATIONS, H_WARM_START, N_DYNAMIC, N_FRAME, N_JOINT,
                                          N_JOINT_ROW, S_H, S_HERTZ, S_RATIO, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport world_tensor
 from lavender_ext.engine.projection cimport rigid_row
-from lavender_ext.engine.xpbd cimport tangent_speed
+from lavender_ext.engine.vectors cimport scale3
 
 cdef enum:
     STIFFEST = 100              # times kappa0
@@ -42,20 +42,37 @@ cdef inline double normal_error(const engine_t* e, int32_t c) noexcept nogil:
     return e.gap[c] if e.gap[c] > 0.0 else (1.0 - e.setting[S_HERTZ]) * e.gap[c]
 
 
-cdef inline int32_t contact_impulse(const engine_t* e, int32_t c, const double* z, double* p) noexcept nogil:
-    """(1) of a contact: p (1 or 3); 1 where it bears and does not slide."""
+cdef inline double displacement(const engine_t* e, int32_t c, const double* z, const double* axis, double* turn) noexcept nogil:
+    """J z of a contact along an axis; turn (2, 3): arm x axis on a, then on b."""
+    cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
+    cdef double s = 0.0
+    cross(e.arm_a + 3 * c, axis, turn)
+    cross(e.arm_b + 3 * c, axis, turn + 3)
+    if b >= 0:
+        s = dot3(z + 6 * b, axis) + dot3(z + 6 * b + 3, turn + 3)
+    if a >= 0:
+        s -= dot3(z + 6 * a, axis) + dot3(z + 6 * a + 3, turn)
+    return s
+
+
+cdef inline int32_t contact_impulse(const engine_t* e, int32_t c, const double* z, double* p, double* t2, double* turn,
+                                    double* error) noexcept nogil:
+    """(1) of a contact: p (1 or 3); 1 where it bears and does not slide.
+
+    And its second tangent, turn (rows, 6) of its axes, and C' + J z of its normal.
+    """
     cdef int32_t block = e.size[N_JOINT] + c, row = e.ptr[block]
     cdef const double* n = e.normal + 3 * c
     cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], r, s
-    cdef double t2[3]
-    p[0] = e.impulse[row] - kappa * (normal_error(e, c) + tangent_speed(e, z, c, n))
+    error[0] = normal_error(e, c) + displacement(e, c, z, n, turn)
+    p[0] = e.impulse[row] - kappa * error[0]
     if p[0] < 0.0:
         p[0] = 0.0
     if e.mu[block] == 0.0:
         return p[0] > 0.0
     cross(n, e.tangent + 3 * c, t2)
-    p[1] = e.impulse[row + 1] - kappa * tangent_speed(e, z, c, e.tangent + 3 * c)
-    p[2] = e.impulse[row + 2] - kappa * tangent_speed(e, z, c, t2)
+    p[1] = e.impulse[row + 1] - kappa * displacement(e, c, z, e.tangent + 3 * c, turn + 6)
+    p[2] = e.impulse[row + 2] - kappa * displacement(e, c, z, t2, turn + 12)
     r = e.mu[block] * p[0]
     s = sqrt(p[1] * p[1] + p[2] * p[2])
     if s > r:
@@ -85,34 +102,28 @@ cdef inline void add_row(const double* j, double p, double kappa, double* m, dou
             m[6 * k + l] += kappa * j[k] * j[l]
 
 
-cdef inline void contact_row(const double* axis, const double* arm, double sign, double* j) noexcept nogil:
-    cdef double l[3]
-    cdef int32_t k
-    cross(arm, axis, l)
-    for k in range(3):
-        j[k] = sign * axis[k]
-        j[3 + k] = sign * l[k]
+cdef inline void contact_row(const double* axis, const double* turn, double sign, double* j) noexcept nogil:
+    scale3(sign, axis, j)
+    scale3(sign, turn, j + 3)
 
 
 cdef inline void add_contact(const engine_t* e, int32_t c, int32_t side, const double* z, double* m,
                              double* g) noexcept nogil:
-    cdef const double* n = e.normal + 3 * c
-    cdef const double* arm = e.arm_b + 3 * c if side else e.arm_a + 3 * c
-    cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], sign = 1.0 if side else -1.0
+    cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], sign = 1.0 if side else -1.0, error
     cdef double p[3]
     cdef double j[6]
     cdef double t2[3]
-    contact_impulse(e, c, z, p)
+    cdef double turn[18]
+    contact_impulse(e, c, z, p, t2, turn, &error)
     if p[0] == 0.0:
         return
-    contact_row(n, arm, sign, j)
+    contact_row(e.normal + 3 * c, turn + 3 * side, sign, j)
     add_row(j, p[0], kappa, m, g)
     if e.mu[e.size[N_JOINT] + c] == 0.0:
         return
-    contact_row(e.tangent + 3 * c, arm, sign, j)
+    contact_row(e.tangent + 3 * c, turn + 6 + 3 * side, sign, j)
     add_row(j, p[1], kappa, m, g)
-    cross(n, e.tangent + 3 * c, t2)
-    contact_row(t2, arm, sign, j)
+    contact_row(t2, turn + 12 + 3 * side, sign, j)
     add_row(j, p[2], kappa, m, g)
 
 
@@ -200,6 +211,8 @@ cdef inline void take_multipliers(engine_t* e) noexcept nogil:
     cdef int32_t i, c, row, k, sticks
     cdef double h = e.setting[S_H], beta = e.setting[S_RATIO], slop = e.setting[S_SLOP], x
     cdef double p[3]
+    cdef double t2[3]
+    cdef double turn[18]
     cdef const double* z = e.shift
     if slop < 1e-6:
         slop = 1e-6
@@ -213,11 +226,10 @@ cdef inline void take_multipliers(engine_t* e) noexcept nogil:
                 stiffen(e.push + row, 1.0 / (h * e.d[row]), x, beta, slop)
     for c in range(e.head[H_CONTACTS]):
         row = e.ptr[e.size[N_JOINT] + c]
-        sticks = contact_impulse(e, c, z, p)
+        sticks = contact_impulse(e, c, z, p, t2, turn, &x)
         for k in range(e.ptr[e.size[N_JOINT] + c + 1] - row):
             e.impulse[row + k] = p[k]
         if sticks:
-            x = normal_error(e, c) + tangent_speed(e, z, c, e.normal + 3 * c)
             stiffen(e.push + e.size[N_JOINT_ROW] + c, 1.0 / (h * e.d[row]), x, beta, slop)
 
 

@@ -98,6 +98,17 @@ cdef inline int32_t cell_of(double x, double size) noexcept nogil:
     return <int32_t>(-1e9 if not c > -1e9 else (1e9 if c > 1e9 else c))
 
 
+cdef inline double extent_of(const engine_t* e, int32_t i) noexcept nogil:
+    # m, the longest side of a body's box
+    cdef const double* f = e.fat + 6 * i
+    cdef double extent = 0.0
+    cdef int32_t k
+    for k in range(3):
+        if f[3 + k] - f[k] > extent:
+            extent = f[3 + k] - f[k]
+    return extent
+
+
 cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     cdef int32_t n = e.size[N_BODY], mask = e.size[N_BUCKET] - 1, i, j, k, level, x, y, z
     cdef uint32_t used = 0, slot
@@ -110,11 +121,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     for i in range(n):
         if e.kind_of_shape[i] < SPHERE:
             continue
-        f = e.fat + 6 * i
-        extent = 0.0
-        for k in range(3):
-            if f[3 + k] - f[k] > extent:
-                extent = f[3 + k] - f[k]
+        extent = extent_of(e, i)
         if extent > most:
             most = extent
         if least == 0.0 or extent < least:
@@ -129,10 +136,7 @@ cdef inline void grid_pairs(engine_t* e, int32_t* n_pairs) noexcept nogil:
     while i >= 0:
         if e.kind_of_shape[i] >= SPHERE:
             f = e.fat + 6 * i
-            extent = 0.0
-            for k in range(3):
-                if f[3 + k] - f[k] > extent:
-                    extent = f[3 + k] - f[k]
+            extent = extent_of(e, i)
             size = base
             level = 0
             while size < extent and level < 31:

@@ -23,7 +23,7 @@ cdef enum:
 
 
 cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Whole numbers that `lay_pattern` hands out, as if every row were an element; 0 where a walk does not apply."""
+    """Whole numbers that `lay_pattern` hands out, as if every row were an element; 0 where the method does not apply."""
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
         return 0

@@ -23,8 +23,8 @@ from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.natural_map cimport z_end
 from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
                                       N_AUGMENTED_INTERIOR, N_DE_SAXCE, N_EXCHANGES, N_INTERIOR, N_ROUNDS, POLISH,
-                                      PROXIMAL, PURSUIT, WALKS, at_floor, begin_apart, done, end_apart, enter, exchange_t,
-                                      leave, look_t, newton_t, polish_t, proximal_t, pursuit_t, relative_at, score,
+                                      PROXIMAL, PURSUIT, SECOND, at_floor, begin_apart, done, end_apart, enter, exchange_t,
+                                      leave, progress_t, newton_t, polish_t, proximal_t, pursuit_t, relative_at, score,
                                       spent, take, with_products)
 from lavender_ext.newton.steps cimport interior_step
 from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, largest, solve_natural, solve_refined, system_factor,
@@ -41,8 +41,8 @@ cdef enum:
     MEMORY = 6                  # steps that the non-monotone line search looks back
     HALVINGS = 7                # of one step
     FREE = 20                   # rounds in a row that cost no factorisation, and so change nothing but the weight
-    STRETCH = 12                # factorisations between two looks at whether a walk gets anywhere
-    STRETCHES = 1000            # of one walk at most, whatever its budget
+    STRETCH = 12                # factorisations between two checks of what rounds gain
+    STRETCHES = 1000            # of one pursuit at most, whatever its budget
     APPROACH_STEPS = 60         # of one interior point of De Saxce's or of the augmented system at most
     SHORT_STEPS = 4             # steps in a row that get nowhere before that is given up
     APPROACH_IDLE = 15          # steps in a row that do not halve the residual, likewise
@@ -170,8 +170,8 @@ cdef inline void go_exchange(newton_t* n) noexcept nogil:
 # -- interior points of the convex law ---------------------------------------------------------------------------
 
 
-cdef inline void begin_looks(newton_t* n, double near) noexcept nogil:
-    cdef look_t* k = &n.look
+cdef inline void begin_progress(newton_t* n, double near) noexcept nogil:
+    cdef progress_t* k = &n.progress
     k.lowest = 1.0 / 0.0
     k.near = near
     k.idle = k.still = k.steps = k.at = k.augmented = 0
@@ -180,14 +180,14 @@ cdef inline void begin_looks(newton_t* n, double near) noexcept nogil:
 
 cdef inline void begin_steps(newton_t* n, bint rows) noexcept nogil:
     """Steps from where the interior point stands."""
-    begin_looks(n, 1e-2)
-    n.look.rows = rows
+    begin_progress(n, 1e-2)
+    n.progress.rows = rows
     enter(n, INTERIOR)
 
 
 cdef inline void end_steps(newton_t* n, bint rounds) noexcept nogil:
     """Its best point is judged; cones close to their end are ended by rounds."""
-    cdef look_t* k = &n.look
+    cdef progress_t* k = &n.progress
     leave(n)
     if k.lowest < n.best:
         score(n, k.kept)
@@ -198,7 +198,7 @@ cdef inline void end_steps(newton_t* n, bint rounds) noexcept nogil:
 
 cdef inline void go_interior(newton_t* n) noexcept nogil:
     """A step; bounded rows are exchanged at each new decade."""
-    cdef look_t* k = &n.look
+    cdef progress_t* k = &n.progress
     cdef double found
     cdef bint gains
     if k.at == 0:
@@ -239,7 +239,7 @@ cdef inline void go_interior(newton_t* n) noexcept nogil:
 
 cdef inline void begin_rounds(newton_t* n, int32_t which, const double* z, int32_t law, double alpha,
                               int32_t inner) noexcept nogil:
-    cdef proximal_t* x = &n.walk[which]
+    cdef proximal_t* x = &n.rounds[which]
     take(n, x.z, z)
     x.law, x.alpha, x.inner = law, alpha, inner
     x.slowest = 0.1
@@ -248,11 +248,11 @@ cdef inline void begin_rounds(newton_t* n, int32_t which, const double* z, int32
 
 cdef inline void enter_rounds(newton_t* n, int32_t which, int32_t limit) noexcept nogil:
     """On from where they stand, for `limit` factorisations."""
-    cdef proximal_t* x = &n.walk[which]
+    cdef proximal_t* x = &n.rounds[which]
     x.last = n.s.factorisations + limit if limit < LIMITLESS - n.s.factorisations else LIMITLESS
     x.free = x.at = 0
     score(n, x.z)
-    enter(n, PROXIMAL + WALKS * which)
+    enter(n, PROXIMAL + SECOND * which)
 
 
 cdef inline double size_at(newton_t* n, const proximal_t* x, double t) noexcept nogil:
@@ -338,7 +338,7 @@ cdef inline bint ask(newton_t* n, const proximal_t* x) noexcept nogil:
 
 cdef inline void go_rounds(newton_t* n, int32_t which) noexcept nogil:
     """A Newton step of a round, until the judge is content, its factorisations are spent, or nothing moves."""
-    cdef proximal_t* x = &n.walk[which]
+    cdef proximal_t* x = &n.rounds[which]
     cdef int32_t used
     cdef bint idle
     if x.at == 0:
@@ -386,7 +386,7 @@ cdef inline void go_pursuit(newton_t* n) noexcept nogil:
     cdef pursuit_t* x = &n.pursuit
     cdef double best
     if x.at == 0:
-        if done(n) or n.walk[x.which].stuck or x.stretches == STRETCHES:
+        if done(n) or n.rounds[x.which].stuck or x.stretches == STRETCHES:
             leave(n)
             return
         x.at = 1
@@ -406,14 +406,14 @@ cdef inline void go_pursuit(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_approach(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
-    begin_looks(n, 1e-5)
-    n.look.law, n.look.augmented = law, augmented
+    begin_progress(n, 1e-5)
+    n.progress.law, n.progress.augmented = law, augmented
     enter(n, APPROACH)
 
 
 cdef inline void go_approach(newton_t* n) noexcept nogil:
     """A step, and Newton steps of `law` through the augmented system, until the judge is content or they get nowhere."""
-    cdef look_t* k = &n.look
+    cdef progress_t* k = &n.progress
     cdef double found
     cdef bint went
     if k.at == 0:
@@ -469,7 +469,7 @@ cdef inline void go_polish(newton_t* n) noexcept nogil:
     x.left -= 1
     n.s.augmented = 1
     with_products(n, x.z, n.rest)
-    system_natural(&n.s, x.z, n.rest, n.look.law, shift_of(), n.f)
+    system_natural(&n.s, x.z, n.rest, n.progress.law, shift_of(), n.f)
     system_factor(&n.s, OF_NATURAL, shift_of())
     n.counts[N_AUGMENTED] += 1
     for j in range(n.s.e.m):

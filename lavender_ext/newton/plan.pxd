@@ -5,7 +5,7 @@ decades. Cones: interior points with two weights. What these leave: the augmente
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
 interior point, ended by rounds; closed loops of joints through the augmented system, with two shares of phi's derivative;
-rounds from the answer of the convex relaxation; the first walk for what is left of the budget.
+rounds from the answer of the convex relaxation; the first rounds for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -19,7 +19,7 @@ from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchan
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
-                                      PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, WALKS, at_floor,
+                                      PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
                                       take_back, tries_t, unknown_of, with_products)
 from lavender_ext.newton.steps cimport begin_interior, delta_of, interior_step
@@ -37,7 +37,7 @@ cdef enum:                      # outcomes of a turn
 cdef enum:
     REFINEMENTS = 3             # of a first point,
     MORE_REFINEMENTS = 20       # and with another factor of rows that all hold
-    RELAXED_STEPS = 30          # of the convex problem that a walk starts from, at most
+    RELAXED_STEPS = 30          # of the convex problem that rounds start from, at most
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
 
 
@@ -210,7 +210,7 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
         n.s.augmented = 0
         begin_approach(n, COULOMB, x.augmented)
         return
-    best = n.look.lowest if x.at == 1 else end_apart(n, n.look.kept)
+    best = n.progress.lowest if x.at == 1 else end_apart(n, n.progress.kept)
     if x.augmented and not x.second and not over(n):
         x.at = 0
         x.second = 1
@@ -218,7 +218,7 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
     if over(n) or x.augmented or x.at == 3:
         leave(n)
         return
-    begin_rounds(n, 1, n.look.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
+    begin_rounds(n, 1, n.progress.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
                  (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
     begin_apart(n)
     enter_rounds(n, 1, 15 if x.at == 1 else 12)
@@ -302,7 +302,7 @@ cdef inline void go(newton_t* n) noexcept nogil:
     elif phase == RELAXED:
         go_relaxed(n)
     else:
-        go_rounds(n, phase // WALKS)
+        go_rounds(n, phase // SECOND)
 
 
 cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:

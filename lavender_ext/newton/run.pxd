@@ -30,7 +30,7 @@ cdef enum:                      # phases
     POLISH = 7
     DE_SAXCE = 8
     RELAXED = 9
-    WALKS = 16                  # PROXIMAL + WALKS of the second walk
+    SECOND = 16                  # PROXIMAL + SECOND of the second rounds
 
 cdef enum:                      # what is counted
     N_EXCHANGES = 0
@@ -92,7 +92,7 @@ cdef struct exchange_t:
     int32_t still
 
 
-cdef struct look_t:             # of the steps of an interior point
+cdef struct progress_t:             # of the steps of an interior point
     double* kept                # its best z
     double lowest
     double near                 # relative residual from which Newton steps are asked
@@ -167,7 +167,7 @@ cdef struct newton_t:           # may not move once it is furnished
     int32_t depth
     double best                 # relative residual of best_z
     double aside                # a best point that is no start for what comes
-    double before               # the best point apart from a walk's own
+    double before               # the best point apart from that of a phase of its own
     double floor
     double relaxed              # residual at which the convex problem is given up
     double* best_z
@@ -191,9 +191,9 @@ cdef struct newton_t:           # may not move once it is furnished
     double* rest
     interior_t ip
     exchange_t exchange
-    look_t look
+    progress_t progress
     polish_t polish
-    proximal_t walk[2]          # the first walk, which goes on in the end; any other
+    proximal_t rounds[2]        # the first, which go on in the end; any other
     pursuit_t pursuit
     tries_t tries
 
@@ -248,8 +248,8 @@ cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogi
     at[12], at[13], at[14], at[15] = &n.c, &n.hz, &n.hdz, &n.trial
     at[16], at[17], at[18], at[19] = &n.rest, &n.ip.z, &n.ip.u1, &n.ip.u2
     at[20], at[21], at[22], at[23] = &n.ip.hz, &n.ip.everything, &n.exchange.z, &n.exchange.hz
-    at[24], at[25], at[26], at[27] = &n.exchange.kept, &n.look.kept, &n.polish.z, &n.walk[0].z
-    at[28], at[29], at[30] = &n.walk[1].z, &n.s.t, &n.s.q
+    at[24], at[25], at[26], at[27] = &n.exchange.kept, &n.progress.kept, &n.polish.z, &n.rounds[0].z
+    at[28], at[29], at[30] = &n.rounds[1].z, &n.s.t, &n.s.q
     for i in range(VECTORS):
         at[i][0] = room + i * m
 
@@ -288,7 +288,7 @@ cdef inline void take(newton_t* n, double* to, const double* x) noexcept nogil:
 
 cdef inline void enter(newton_t* n, int32_t phase) noexcept nogil:
     """The phase goes on top; one that is left out has ended."""
-    if n.without >> (phase % WALKS) & 1:
+    if n.without >> (phase % SECOND) & 1:
         return
     n.stack[n.depth] = phase
     n.depth += 1
@@ -386,7 +386,7 @@ cdef inline void take_back(newton_t* n) noexcept nogil:
 
 
 cdef inline void begin_apart(newton_t* n) noexcept nogil:
-    """A walk judged by its own progress begins."""
+    """A phase judged by its own progress begins."""
     n.before = n.best
     take(n, n.before_z, n.best_z)
     n.best = 1.0 / 0.0

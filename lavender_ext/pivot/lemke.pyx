@@ -244,26 +244,21 @@ cdef inline void standard_form(lemke_t* l) noexcept nogil:
     every_w_basic(d)
 
 
-cdef inline void swap_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
-    cdef double* x = d.t + i * d.width
-    cdef double* y = d.t + j * d.width
-    cdef double old
+cdef inline void swap(double* x, double* y, int32_t n, int64_t stride) noexcept nogil:
     cdef int32_t k
-    for k in range(d.n + 2):
-        old = x[k]
-        x[k] = y[k]
-        y[k] = old
+    cdef double old
+    for k in range(n):
+        old = x[k * stride]
+        x[k * stride] = y[k * stride]
+        y[k * stride] = old
+
+
+cdef inline void swap_rows(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
+    swap(d.t + i * d.width, d.t + j * d.width, d.n + 2, 1)
 
 
 cdef inline void swap_columns(dictionary_t* d, int32_t i, int32_t j) noexcept nogil:
-    cdef double* x
-    cdef double old
-    cdef int32_t k
-    for k in range(d.rows):
-        x = d.t + k * d.width
-        old = x[i]
-        x[i] = x[j]
-        x[j] = old
+    swap(d.t + i, d.t + j, d.rows, d.width)
 
 
 cdef inline double largest(const dictionary_t* d, int32_t i) noexcept nogil:

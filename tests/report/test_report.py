@@ -4,6 +4,7 @@ import dataclasses
 import html
 import html.parser
 import io
+import json
 import math
 import random
 import re
@@ -18,6 +19,7 @@ from lavender import bench, report
 from lavender.bench.record import CaseInfo, Record, Run
 from lavender.report import curves, tables
 from lavender.report.curves import overall_figure
+from lavender.report.engine import contestants
 from lavender.report.findings import Report
 from lavender.report.paper import write_paper
 from lavender.report.terminal import print_report
@@ -563,3 +565,27 @@ def test_a_full_disk_leaves_the_page_of_the_last_time(tmp_path, monkeypatch):
         report.write(records_of(record("b", "pgs", 2.0, 1e-7)), tmp_path, figures=False)
     assert index.read_text() == before
     assert not list(tmp_path.glob(".*"))  # nor is a half of a page left
+
+
+@pytest.mark.parametrize(
+    "worst, level, name", [(1e-2, 1e-3, "pgs"), (1e-5, 1e-6, "newton"), (1e-9, 1e-6, "newton")]
+)
+def test_an_engine_stands_beside_the_fastest_to_a_level_as_good_as_its_own(tmp_path, worst, level, name):
+    lines = [
+        {"rows": 3, "seconds": 1e-4, "relative": e, "solver": "newton", "verdict": ""}
+        for e in (worst, worst / 2)
+    ]
+    (tmp_path / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    times = {"pgs": {1e-3: 1e-6, 1e-6: 5e-3}, "newton": {1e-3: 1e-3, 1e-6: 2e-3}}
+    found = records_of(
+        *(
+            record(f"{tmp_path.name}[{step}]", solver, time, tol / 2, tol=tol)
+            for step in (0, 1)
+            for solver, levels in times.items()
+            for tol, time in levels.items()
+        )
+    )
+    (engine,) = contestants([str(tmp_path)], found)
+    assert engine.ours == f"{name}, cold, to {level:g}"
+    assert engine.our_seconds == times[name][level]
+    assert engine.our_worst == level / 2

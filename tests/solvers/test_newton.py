@@ -252,6 +252,29 @@ def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, m
     assert solution.work["factorisations"] <= most  # interior points: 23 to 35
 
 
+def test_the_first_interior_point_keeps_what_the_linear_system_says_of_each_row():
+    """Inside every bound; duals differ by H z0 - g where a row has two bounds, else all by one shift, as z does."""
+    rng = np.random.default_rng(8)
+    m = 24
+    j = rng.normal(size=(m, 2 * m))
+    lower, upper = np.full(m, -0.4), np.full(m, 0.3)
+    low, high = slice(0, 8), slice(8, 16)
+    upper[low], lower[high] = np.inf, -np.inf
+    problem = lv.Problem.lcp(j @ j.T, 30.0 * rng.normal(size=m), lower, upper)
+    solve = make_system(problem, "impulse").solve
+    solve.begin(1e-10)
+    z, u1, u2 = solve.point
+    z0 = np.linalg.solve(dense_h(problem) + 1e-6 * np.eye(m), solve.g)
+    slack = -1e-6 * z0  # H z0 - g
+    assert (z > solve.lower).all() and (z < solve.upper).all()
+    assert (u1[np.isfinite(solve.lower)] > 0.0).all() and (u2[np.isfinite(solve.upper)] > 0.0).all()
+    np.testing.assert_allclose((u1 - u2)[16:], slack[16:], rtol=1e-6, atol=1e-15)
+    shifts = np.concatenate([u1[low] - slack[low], u2[high] + slack[high]])
+    np.testing.assert_allclose(shifts, shifts[0], rtol=1e-12)
+    moves = np.concatenate([(z - z0)[low], (z0 - z)[high]])
+    np.testing.assert_allclose(moves, moves[0], rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("n", [3, 30, 150])
 def test_a_circle_of_exchanges_ends_by_count(n):
     """Newton's method on min(z, H z - g) goes round among single rows here (Ben Gharbia, Gilbert 2012)."""

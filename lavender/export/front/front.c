@@ -63,7 +63,6 @@ struct lav_solver {
   double *table;               /* Lemke's dictionary, or the factor of admm */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
-  struct accelerate_mixing_mixing_t mixing;
   int32_t factors, is_broken;
   int32_t turns[2 * MOST_TURNS], given_turns[2 * MOST_TURNS], n_turns, at_turn; /* of auto */
   uint64_t common;             /* where the memory of a turn begins */

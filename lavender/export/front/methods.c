@@ -204,10 +204,10 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
   int32_t i;
   if (first) { /* at a solution the first iteration stays there */
     for (i = 0; i < s->p.n_rows; i++) c->x[i] = core_csr_csr_dot(&s->a, i, lam) - s->p.b[i];
-    k_admm_start(&s->p, lam, c->x, c->root, c->rho, c->u, c->y);
+    k_admm_start(c, lam, c->x);
   }
   while (n > 0 && !s->is_broken) {
-    const double rho = k_admm(c, &s->factor, &s->mixing, lam, &n);
+    const double rho = k_admm(c, &s->factor, lam, &n);
     if (rho > 0.0) {
       c->rho = rho;
       s->is_broken = !factor_shifted(s);
@@ -216,45 +216,17 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
 }
 
 static int32_t prepare_admm(lav_solver *s) {
-  const int64_t m = s->p.n_rows;
-  struct accelerate_admm_admm_t *c = &s->splitting;
-  const int32_t memory = s->options.memory;
-  double *x, *root, *shift, size[2] = {0.0, 0.0};
-  int32_t i, bands[2];
+  const int64_t m = s->p.n_rows, numbers = k_admm_room(m, s->options.memory);
+  double *x, size[2] = {0.0, 0.0};
+  int32_t bands[2];
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
   if (size[1] > 0.0 && size[0] / size[1] > 1e-14) return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
   s->table = TAKE(s, double, m * m);
-  x = TAKE(s, double, (10 + 2 * (int64_t)memory) * m + CONTROL + GRAM + 4);
+  x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_ROOM;
-  memset(x, 0, (size_t)((10 + 2 * (int64_t)memory) * m + CONTROL + GRAM + 4) * sizeof(double));
-  c->blocks = &s->p;
-  c->turn = x;
-  s->mixing.control = x + 4;
-  s->mixing.gram = s->mixing.control + CONTROL;
-  root = s->mixing.gram + GRAM;
-  shift = root + m;
-  c->u = shift + m;
-  c->z = c->u + m;
-  c->y = c->z + m;
-  c->x = c->y + m;
-  c->g = c->x + m;
-  c->before = c->g + m;
-  c->work = NULL;
-  s->mixing.v = c->before + m;
-  s->mixing.g = s->mixing.v + m;
-  s->mixing.dv = s->mixing.g + m;
-  s->mixing.dg = s->mixing.dv + memory * m;
-  s->mixing.m = (int32_t)m;
-  s->mixing.memory = memory;
-  for (i = 0; i < m; i++) {
-    root[i] = sqrt(s->p.d[i]);
-    shift[i] = s->p.b[i] / root[i];
-  }
-  c->root = root;
-  c->c = shift;
-  c->rho = FIRST_RHO;
-  c->alpha = RELAXATION;
+  memset(x, 0, (size_t)numbers * sizeof(double));
+  k_admm_lay(&s->splitting, &s->p, s->options.memory, FIRST_RHO, RELAXATION, x);
   memset(&s->factor, 0, sizeof s->factor);
   s->factor.kind = accelerate_admm_DENSE;
   s->factor.n = (int32_t)m;

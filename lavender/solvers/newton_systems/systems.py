@@ -6,7 +6,6 @@ or sparse panels). The equations, and all that is solved with them, are in `lave
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from lavender._arrays import IntArray
 from lavender._later import sparse as sp
 from lavender.problem import Problem
 from lavender.residuals import reference
+from lavender.solvers._factor import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender_ext.factor import symbolic
@@ -27,14 +27,9 @@ DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
 # multiply-adds cost a quarter there; and of bounded rows, of which dense factors take the free ones, and under
 # Coulomb's law, whose factors lack symmetry and lose pivots by panels.
 DENSE_FILL, EARLY_FILL = 0.4, 0.25
-DENSE_LIMIT = 6000  # rows; 288 MB of A
 # Multiply-adds of a factor over bodies from which dense panels beat block rows; a panel's columns up to which, and
 # share up to which (four times it for so few columns), zeros are held as numbers.
 PANELS, FEW_COLUMNS, ZEROS = 2e6, 6, 0.1
-WIDE = os.environ.get("LAVENDER_BASELINE", "0") in (
-    "",
-    "0",
-)  # four lanes where the machine has them: the same bits
 
 
 def is_full(nnz: int, m: int, cones: bool) -> bool:
