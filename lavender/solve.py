@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from threading import Lock
 from time import perf_counter
 from types import MappingProxyType
@@ -298,6 +299,10 @@ class Prepared:
             self.setup_time = perf_counter() - start
             self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
         self._fresh = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is prepared anew: a state is for one solve at a time."""
+        return partial(prepare, **self.options), (self._given, self.spec.name)
 
     def _set_up(self, problem: Problem, anew: bool) -> None:
         """Prepare, or update the state of a problem of the same structure."""

@@ -28,6 +28,12 @@ COMMANDS = {
 class Commands(click.Group):
     """Commands by name, each imported when it is asked for."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """An empty word would be read as the present folder."""
+        if any(word == "" or (word.startswith("--") and word.endswith("=")) for word in args):
+            raise click.UsageError("an empty argument: is a variable of the shell not set?", ctx)
+        return super().parse_args(ctx, args)
+
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Every name."""
         return sorted(COMMANDS)

@@ -18,6 +18,7 @@ from lavender.engine.stepping import HALF, SOLVER_FIELDS, Stepping, alone, make_
 from lavender.errors import InputError, LavenderError, UnknownName
 from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
+from lavender.scene import Scene
 from lavender_ext.engine.arrays import NEED_ROOM, lengths
 
 if TYPE_CHECKING:
@@ -325,3 +326,13 @@ class Simulation(Stepping):
     def load(self, path: str | PathLike[str]) -> None:
         """Continue from a file written by `save`."""
         self.restore(Snapshot.load(path))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is one of its own that goes on from the same state; films stay with this one."""
+        return _gone_on, (self.scene, self.report_residual, self.report_motion, self.snapshot())
+
+
+def _gone_on(scene: Scene, report_residual: bool, report_motion: bool, snapshot: Snapshot) -> Simulation:
+    sim = Simulation(scene, report_residual=report_residual, report_motion=report_motion)
+    sim.restore(snapshot)
+    return sim

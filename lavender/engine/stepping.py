@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
@@ -101,7 +102,7 @@ class Stepping:
             raise InputError("the scene has no bodies; add some (add_box, add_sphere, add_plane)")
         if stepper is not None and stepper != scene.parameters.stepper:
             scene = scene.with_parameters(stepper=stepper, stepper_options={})
-        self.scene = scene
+        self.scene = scene = copy(scene)  # what is added to it later is not in this simulation
         self.report_residual = report_residual
         self.report_motion = report_motion
         self._lock, self._inside = RLock(), False

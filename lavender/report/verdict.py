@@ -133,14 +133,19 @@ def _head(first: Choice, reached: str, what: str) -> str:
     return f"{said}."
 
 
+def _percent(share: float) -> int:
+    """Rounded down: 100 is all."""
+    return int(100.0 * share + 1e-9)
+
+
 def _sure(race: Race) -> list[str]:
     """How often the choice wins, and which solvers are as good."""
     if len(race.ranking) < 2:
         return []
-    share = f"It wins in {100 * race.shares[0]:.0f} % of resamplings"
+    share = f"It wins in {_percent(race.shares[0])} % of resamplings"
     if race.loss > 1.0:
         share += f" and takes {times_of(race.loss)} the best's time in the others"
-    others = [f"{name} ({100 * s:.0f} %)" for (_, c), s in zip(race.ranking, race.shares, strict=True)
+    others = [f"{name} ({_percent(s)} %)" for (_, c), s in zip(race.ranking, race.shares, strict=True)
               if (name := c.solver) in race.named[1:]]  # fmt: skip
     return [f"{share}; as good: {', '.join(others)}." if others else f"{share}."]
 

@@ -265,6 +265,7 @@ class Scene:
         self.joints: list[Joint] = []
         if name is not None:
             SCENES[name](self, **self.own)
+        self._built = self.n_bodies, self.n_joints  # by the gallery; what follows was added by hand
 
     @property
     def n_bodies(self) -> int:
@@ -277,7 +278,7 @@ class Scene:
         return len(self.joints)
 
     def with_parameters(self, **changes: Any) -> Scene:
-        """The same scene with other parameters; one of the gallery is built anew.
+        """The same scene with other parameters; one of the gallery is built anew, and what was added to it added again.
 
         What was left to its default follows the others: `substeps` the new `dt`, `order` the new `solver`.
 
@@ -285,15 +286,25 @@ class Scene:
         ------
         UnknownName
             No such parameter; of a scene built by hand only those of `Parameters` can change.
+        InputError
+            The gallery's own part would have another number of bodies, and joints were added by their numbers.
         """
-        if self.name:
-            return Scene(self.name, **{**self._given, **self.own, **changes})
-        for key in changes:
-            if key not in COMMON:
-                raise UnknownName("scene parameter", key, COMMON)
-        scene = Scene(**{**self._given, **changes})
-        scene.bodies, scene.joints = list(self.bodies), list(self.joints)
+        scene = Scene(self.name or None, **{**self._given, **self.own, **changes})
+        bodies, joints = self._built
+        if scene._built != self._built and self.n_joints > joints:
+            raise InputError(
+                f"scene {self.name!r} would have {scene.n_bodies} bodies for {bodies}, and the joints added to it name "
+                "bodies by number; build it with these parameters, then add"
+            )
+        scene.bodies += self.bodies[bodies:]
+        scene.joints += self.joints[joints:]
         return scene
+
+    def __copy__(self) -> Scene:
+        """One with lists of its own."""
+        twin = object.__new__(Scene)
+        vars(twin).update(vars(self), bodies=list(self.bodies), joints=list(self.joints))
+        return twin
 
     # -- bodies ---------------------------------------------------------------------------------
 

@@ -252,7 +252,9 @@ def test_infinite_and_undefined_numbers_survive_json():
     [
         ({"levels": (0.0,)}, "level 0.0"),
         ({"levels": (float("nan"),)}, "level nan"),
-        ({"budgets": (-4,)}, "budget -4"),
+        ({"budgets": (-4,)}, "budget is -4"),
+        ({"budgets": (4.7,)}, "budget is 4.7"),
+        ({"repeats": 2.5}, "repeats is 2.5"),
         ({"levels": (), "budgets": ()}, "nothing to run"),
         ({"repeats": 0}, "repeats is 0"),
         ({"time_limit": 0.0}, "time limit is 0.0"),
@@ -262,6 +264,14 @@ def test_infinite_and_undefined_numbers_survive_json():
 def test_a_senseless_plan_is_refused(change, sign):
     with pytest.raises(lv.InputError, match=sign):
         bench.Plan(**change)
+
+
+def test_what_a_plan_names_twice_is_run_once_and_moves_no_middle():
+    plan = bench.Plan(
+        levels=(1e-3, 1e-9, 1e-3, 1e-6), budgets=(8, 4, 4), sweeps=(4, 4), orders=("reverse",) * 2
+    )
+    assert plan.levels == (1e-3, 1e-6, 1e-9)
+    assert (plan.budgets, plan.sweeps, plan.orders) == ((4, 8), (4,), ("reverse",))
 
 
 def test_unknown_and_missing_names_are_refused_before_loading(tmp_path):

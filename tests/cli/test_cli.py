@@ -160,7 +160,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
         (("report", "--levels", "0"), "level 0.0 must be"),
-        (("report", "--budgets", "-4"), "budget -4"),
+        (("report", "--budgets", "-4"), "budget is -4"),
         (("report", "--repeats", "0"), "repeats is 0"),
         (("report", "--time-limit", "-1"), "time limit is -1.0"),
         (("report", "--orders", "sideways"), "sideways"),
@@ -185,6 +185,8 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--skip", "3"), "--skip has no effect without --record"),
         (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
+        (("check", ""), "an empty argument"),
+        (("report", "stack(n=4)", "--out", ""), "an empty argument"),
         (("nonsense",), "No such command"),
         (("report", "random_spd", "--campaign", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
         (("solve", "random_spd(n=10000000)"), "not enough memory"),  # 8e14 bytes

@@ -1,7 +1,9 @@
 """The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
 
+import copy
 import dataclasses
 import itertools
+import pickle
 
 import numpy as np
 import pytest
@@ -164,6 +166,15 @@ def test_a_problem_that_replaced_the_prepared_one_stays(form, name, budget):
     assert prepared.problem is second
     solution = prepared.solve(tol=1e-8, **budget)
     assert solution.residual.relative == lv.residual(second, solution.impulse).relative
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
+    prepared = lv.prepare(TINY, "jacobi", omega=0.6)
+    right = prepared.solve(tol=1e-9)
+    other = copied(prepared)
+    assert other.state is not prepared.state and other.options == prepared.options
+    np.testing.assert_array_equal(other.solve(tol=1e-9).impulse, right.impulse)
 
 
 def test_a_set_up_that_was_stopped_begins_again(monkeypatch):

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
+from lavender._arrays import whole_number
 from lavender.bench.record import CaseInfo, Record
 from lavender.bench.running.timing import Ask, Task
 from lavender.errors import InputError, UnknownName
@@ -69,18 +70,15 @@ class Plan:
     def __post_init__(self) -> None:
         for name, values in (
             ("level", self.levels),
-            ("budget", self.budgets),
             ("speed level", self.speed_levels),
             ("time budget", self.times),
-            ("budget", self.sweeps),
         ):
             for value in values:
                 if not (math.isfinite(value) and value > 0):
                     raise InputError(f"{name} {value} must be a positive number")
         if not self.levels and not self.budgets:
             raise InputError("nothing to run: give levels, budgets or both")
-        if self.repeats < 1:
-            raise InputError(f"repeats is {self.repeats}; at least 1 is needed")
+        whole_number("repeats", self.repeats, 1)
         if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
             raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
         if not self.pass_limit > 0.0:
@@ -91,12 +89,16 @@ class Plan:
                 raise UnknownName("order", name, ORDERS)
             if seed and not (name == "random" and seed.isdecimal()):
                 raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
-        object.__setattr__(self, "levels", tuple(sorted(map(float, self.levels), reverse=True)))
-        object.__setattr__(self, "budgets", tuple(sorted(map(int, self.budgets))))
-        object.__setattr__(self, "orders", tuple(self.orders))
-        object.__setattr__(self, "speed_levels", tuple(sorted(map(float, self.speed_levels), reverse=True)))
-        object.__setattr__(self, "times", tuple(sorted(map(float, self.times))))
-        object.__setattr__(self, "sweeps", tuple(sorted(map(int, self.sweeps))))
+        # each once: what stands twice would be run twice, and move the middle
+        for name in ("levels", "speed_levels"):
+            object.__setattr__(
+                self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
+            )
+        for name in ("budgets", "sweeps"):
+            counts = {whole_number("budget", n, 1) for n in getattr(self, name)}
+            object.__setattr__(self, name, tuple(sorted(counts)))
+        object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
+        object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
         object.__setattr__(self, "motion", self.motion or bool(self.speed_levels))
 
     way = "call"  # what of a single problem is timed, as `Record.way`
