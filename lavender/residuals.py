@@ -10,8 +10,8 @@ block (an inactive row: w / d, the step that is missing; formulas in `lavender_e
               float64; no solver can guarantee less than about twice that
     success   relative <= tol
 
-Where rounding A lambda alone costs more than doing nothing and as much as all of b, float64 cannot tell A lambda - b
-from A lambda: the floor is then the relative residual, unless that is more. An impulse that ran away is no solution.
+Where the floor is 1e-3 or more, rounding hides a thousandth of what doing nothing leaves: the floor is then the
+relative residual, unless that is more. An impulse that ran away is no solution.
 
 If doing nothing already solves the problem to rounding (E0 <= 2^-48 of the energy norm of b), the norms of b replace E0
 and V0. E shows errors of heavy bodies, V those of light ones.

@@ -393,8 +393,8 @@ class Problem:
         floor = self._ratio(*self._floor(f), energy0, velocity0)
         allowed = self._ratio(*self._floor(more), energy0, velocity0)
         relative = self._ratio(energy, velocity, energy0, velocity0)
-        if floor > max(relative, 1) and 0 < rhs_energy <= self._floor(f)[0]:
-            relative = floor  # A lambda - b is A lambda
+        if floor > max(relative, 1e-3) and np.isfinite(floor):
+            relative = floor  # rounding hides a thousandth of doing nothing
         seen = np.abs(np.concatenate([lam, w, self.d, self.b, [energy, velocity, energy0, velocity0]]))
         seen = seen[(seen > 0) & np.isfinite(seen)]
         span = float(np.abs(np.log10(seen)).max(initial=0.0))

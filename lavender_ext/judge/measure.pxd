@@ -368,12 +368,19 @@ cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e,
 
 cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,
                                double start_velocity) noexcept nogil:
-    """Relative residual of a pass, slack w (m); inf where a number of it is not finite."""
+    """Relative residual of a pass, slack w (m); inf where a number of it is not finite.
+
+    No less than a floor of 1e-3 and more, where the pass made one: the impulse is so large that rounding hides a thousandth
+    of what doing nothing leaves, and a slack that comes out as 0 says nothing.
+    """
+    cdef double found, floor
     if m > 0 and not are_numbers(w, m):
         return 1.0 / 0.0
     if not s.finite:
         return relative(1.0 / 0.0, 1.0 / 0.0, start_energy, start_velocity)
-    return relative(s.energy, s.velocity, start_energy, start_velocity)
+    found = relative(s.energy, s.velocity, start_energy, start_velocity)
+    floor = relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
+    return floor if 1e-3 <= floor < 1.0 / 0.0 and floor > found else found
 
 
 cdef class Judged:

@@ -11,9 +11,6 @@ from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing
                                          scratch_of)
 from lavender_ext.judge.score cimport are_numbers, is_at_floor, norms_of_rhs, relative, score_rows, score_t
 
-cdef enum:
-    DROWNED = 1                 # floor from which it is asked whether b is lost beside A lambda
-
 
 def slack(Data p, const double[::1] lam, double[::1] w):
     """w = A lam - b [m/s] into w (m,)."""
@@ -44,7 +41,6 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef view_t v = p.view()
     cdef double[::1] scratch
-    cdef double found, least
     if p.blocks.n_rows == 0:
         return 0.0, 0.0, 0.0, 0.0
     scratch = np.empty(scratch_of(&v) + 1)
@@ -52,21 +48,8 @@ def judge(Data p, const double[::1] lam, double[::1] w, double[::1] e, bint floo
         judge_view(&v, &lam[0], &w[0], &e[0], &scratch[0], floor, &s)
     if not s.finite or not are_numbers(&w[0], p.blocks.n_rows):
         return np.inf, np.inf, np.inf, 0.0
-    least = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
-    found = relative(s.energy, s.velocity, p.start_energy, p.start_velocity)
-    return s.energy, s.velocity, told_apart(p, &s, found, least), least
-
-
-cdef double told_apart(Data p, const score_t* s, double relative_, double floor) noexcept:
-    """The relative residual, or its floor where that is more and rounding A lambda alone costs as much as all of b.
-
-    A lambda - b is then A lambda: of an impulse that ran away it may be 0, and says nothing.
-    """
-    cdef double energy, velocity
-    if not floor > relative_ or not floor > DROWNED:
-        return relative_
-    norms_of_rhs(&p.blocks, &energy, &velocity)
-    return floor if 0.0 < energy <= s.floor_energy else relative_
+    return (s.energy, s.velocity, relative_of(&s, &w[0], p.blocks.n_rows, p.start_energy, p.start_velocity),
+            relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity))
 
 
 cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative_, double floor):
@@ -76,7 +59,7 @@ cdef Judged judged_from(Data p, impulse, both, const score_t* s, double relative
     made.energy = s.energy if s.finite else 1.0 / 0.0
     made.velocity = s.velocity if s.finite else 1.0 / 0.0
     made.worst = s.worst
-    made.relative, made.floor = told_apart(p, s, relative_, floor), floor
+    made.relative, made.floor = relative_, floor
     return made
 
 
@@ -108,8 +91,7 @@ cdef class Judged:
         self.velocity = s.velocity if s.finite else 1.0 / 0.0
         self.worst = s.worst
         self.floor = relative(s.floor_energy, s.floor_velocity, p.start_energy, p.start_velocity)
-        self.relative = told_apart(
-            p, &s, relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity), self.floor)
+        self.relative = relative_of(&s, w, p.blocks.n_rows, p.start_energy, p.start_velocity)
 
     @property
     def slack(self):

@@ -18,9 +18,9 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.measure cimport judge_view
+from lavender_ext.judge.measure cimport judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see
-from lavender_ext.judge.score cimport are_numbers, is_at_floor, relative, score_t
+from lavender_ext.judge.score cimport is_at_floor, relative, score_t
 
 
 cpdef enum:
@@ -102,8 +102,9 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     cdef double now, floor, inf = 1.0 / 0.0
     judge_view(v, lam, s.w, s.e, s.v, False, &x)
     now = against_start(s, x.energy, x.velocity) if x.finite else inf
-    if now <= tol and not are_numbers(s.w, p.n_rows):
-        now = inf
+    if now <= tol:                                      # once more, beside what rounding hides
+        judge_view(v, lam, s.w, s.e, s.v, True, &x)
+        now = relative_of(&x, s.w, p.n_rows, s.start_energy, s.start_velocity)
     if s.total == 0:
         s.start = now
     see(&s.progress, s.total, now)

@@ -1,5 +1,7 @@
 """What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -21,7 +23,7 @@ def says(status, **more):
 # Worked out anew at each call, and the caller's own.
 ANEW = {
     "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "apart_rows", "spin_rows",
-    "rolling_rows", "reach", "coefficients", "stretch", "parents",
+    "rolling_rows", "reach", "coefficients", "stretch", "parents", "block_bodies",
 }  # fmt: skip
 
 
@@ -304,6 +306,26 @@ def test_an_impulse_that_ran_away_is_at_no_floor(name):
             solution.raise_for_status()
     assert lv.cross_check(NO_MOTION, [name])[name].verdict in ("not solved", "no solution, as proved")
     assert not lv.motion.reference(NO_MOTION).accepted
+    if name == "auto":
+        assert solution.status is lv.Status.INFEASIBLE
+
+
+HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range
+
+
+def test_a_slack_that_rounding_hides_is_no_solution():
+    runaway = np.array([7881299347898371.0, 2627099782632790.0])
+    A, b = HIDDEN.dense(), HIDDEN.b
+    exact = [sum(Fraction(a) * Fraction(x) for a, x in zip(A[i], runaway, strict=True)) for i in range(2)]
+    assert exact[1] - Fraction(b[1]) == -3  # m/s, as much as doing nothing leaves of energy
+    found = lv.residual(HIDDEN, runaway)
+    assert found.slack[1] == 0.0 and found.relative == found.floor > 1.0
+
+
+@pytest.mark.parametrize("name", lv.available(HIDDEN, external=False))
+def test_nobody_solves_what_has_no_solution_by_running_away(name):
+    solution = lv.solve(HIDDEN, name, tol=1e-9)
+    assert not solution.success and not solution.contradicted
     if name == "auto":
         assert solution.status is lv.Status.INFEASIBLE
 

@@ -29,10 +29,12 @@ def test_a_prepared_solver_refuses_a_second_thread():
 
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(solver.solve, tol=1e-12, callback=callback)
-        assert inside.wait(600)
-        with pytest.raises(InUse, match="make another one for every thread"):
-            solver.solve()
-        leave.set()
+        try:
+            assert inside.wait(600)
+            with pytest.raises(InUse, match="make one for each thread"):
+                solver.solve()
+        finally:
+            leave.set()
         assert first.result().status is lv.Status.INTERRUPTED
     assert solver.solve(tol=1e-6, max_iter=10_000).success  # free again
 

@@ -312,7 +312,6 @@ def test_an_impulse_beside_which_float64_loses_b_is_no_solution():
     row = np.array([-0.1, 2.6, 0.7, 1.4])
     problem = lv.Problem.contact(np.outer(row, row), [1.5, 0.0, -1.6, -0.1], [0.8, 0.5])
     swept = lv.solve(problem, "anderson")
-    assert swept.residual.relative == swept.residual.floor > 1.0  # was 0.0
     assert not swept.success and not swept.contradicted
     found = lv.solve(problem)
     assert found.status is lv.Status.INFEASIBLE and not found.contradicted

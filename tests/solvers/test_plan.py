@@ -156,14 +156,17 @@ def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypat
     assert [turn.solver for turn in log.turns] == ["anderson"]
 
 
-@pytest.mark.parametrize("pace", [0.1, 1.0, 2.0])
-def test_sweeps_that_cost_more_than_counted_end_in_time(pace, monkeypatch):
-    """The clock stands but for them; past the limit is half of one, for what is more than half over is not begun."""
+@pytest.mark.parametrize(("pace", "least"), [(0.1, np.inf), (1.0, np.inf), (2.0, np.inf), (4.0, 0.4)])
+def test_sweeps_that_cost_more_than_counted_end_in_time(pace, least, monkeypatch):
+    """The clock stands but for them; past the limit is half of one, for what is more than half over is not begun.
+
+    `least`: share of the limit that another takes at least; it would end in half of it, were it not for that pace.
+    """
     problem = suite.case("granularF(n=4)").problem
     reference(problem)
     state, now = Auto().prepare(problem), [0.0]
     Auto().ready(state, 1e-3)
-    state.sweeps.least = 1e9  # nothing else ends in time
+    state.sweeps.least = least * 1e6 / state.sweeps.costs.sure  # ns
     monkeypatch.setattr("lavender.deadline.perf_counter", lambda: now[0])
     original, each = checked_sweeps.run, 1e-9 * pace * state.sweeps.cost.each
 
@@ -209,6 +212,14 @@ def test_sweeps_are_set_up_before_the_clock_where_little_else_ends_in_time(limit
         state = Auto().prepare(problem)
         Auto().ready(state, limit)
         assert (state.sweeps is not None) == swept
+
+
+def test_velocities_are_analysed_before_the_clock_where_they_may_follow_sweeps():
+    problem = random_general(5, contacts=60)
+    for limit, analysed in ((1e-7, False), (10.0, True)):
+        state = Auto().prepare(problem)
+        Auto().ready(state, limit)
+        assert ("kernel" in vars(state.structure)) == analysed
 
 
 def test_the_compiled_call_is_set_up_before_the_clock():
