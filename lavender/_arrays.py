@@ -114,7 +114,9 @@ def number(
     what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
 ) -> float:
     """`value` as a finite float in [low, high], or above `above`."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(
+        value, (int, float, np.integer, np.floating)
+    ):
         raise InputError(f"{what} is {value!r}; a number is needed")
     x = float(value)
     if not np.isfinite(x):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, equal, whole_number
+from lavender._arrays import ArrayLike, FloatArray, equal, number, whole_number
 from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
@@ -571,12 +571,6 @@ def _check_problem(problem: Problem, spec: SolverSpec) -> None:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(
-        value, (bool, np.timedelta64)
-    )
-
-
 def check_budget(
     spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None
 ) -> tuple[float, int, float | None]:
@@ -587,12 +581,11 @@ def check_budget(
     InputError
         A wrong one.
     """
-    if not _is_number(tol) or not 0.0 <= tol < math.inf:
-        raise InputError(f"tol is {tol!r}; a number >= 0 is needed (0 runs the whole budget)")
+    tol = number("tol", tol, low=0.0)
     max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
-    if time_limit is not None and (not _is_number(time_limit) or not time_limit > 0.0):
-        raise InputError(f"time_limit is {time_limit!r}; a number of seconds above 0, or None, is needed")
-    return float(tol), max_iter, None if time_limit == np.inf else time_limit
+    if time_limit is None or (isinstance(time_limit, (float, np.floating)) and time_limit == np.inf):
+        return tol, max_iter, None
+    return tol, max_iter, number("time_limit [s]", time_limit, above=0.0)
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:

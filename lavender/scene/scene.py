@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, flag, number, shape_of, whole_number
+from lavender._arrays import FloatArray, flag, number, shape_of, whole_number
 from lavender.cones import check_shape
 from lavender.errors import InputError, UnknownName
 from lavender.ordering import ENGINE_ORDERS
@@ -27,6 +27,7 @@ from lavender.scene.parts import (
     Joint,
     Plane,
     Sphere,
+    inertia_of,
     normalised,
     numbers,
     unit,
@@ -373,7 +374,7 @@ class Scene:
             name=label,
             shape=shape,
             mass=mass,
-            inertia=np.zeros((3, 3)) if static else _inertia(label, inertia, shape, mass),
+            inertia=np.zeros((3, 3)) if static else inertia_of(label, inertia, shape, mass),
             position=numbers(f"position of {label} [m]", position, 3),
             quaternion=unit_q,
             velocity=v,
@@ -561,44 +562,3 @@ def _common_point(
         raise InputError(f"{label} takes anchor=, one world point, and no length")
     point = numbers(f"anchor of {label} [m]", anchor, 3)
     return point, point, 0.0
-
-
-def _inertia(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
-    if given is None:
-        with np.errstate(all="ignore"):
-            x = np.asarray((shape if shape is not None else Sphere(0.1)).inertia(mass))
-        what = f"inertia of {label}, of mass {mass:g} kg and {shape or 'radius 0.1 m'},"
-    else:
-        x, what = _tensor(label, given), f"inertia of {label}"
-    if not np.isfinite(x).all() or not _has_reciprocal(mass, x):
-        raise InputError(
-            f"{what} is {np.diag(x).tolist()} kg m^2; it and the mass must have a finite reciprocal: use other "
-            "units of mass or length"
-        )
-    return x
-
-
-def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
-    # the engine works with 1/m and I^-1
-    inverse = arithmetic.inverse(inertia)
-    with np.errstate(all="ignore"):
-        return bool(inverse is not None and np.isfinite(np.divide(1.0, mass)) and np.isfinite(inverse).all())
-
-
-def _tensor(label: str, given: Any) -> FloatArray:
-    shape = shape_of(f"inertia of {label}", given)
-    if shape not in ((3,), (3, 3)):
-        raise InputError(f"inertia of {label} is {given!r}; 3 moments or a (3, 3) tensor is needed")
-    x = as_array(f"inertia of {label} [kg m^2]", given, shape)
-    if x.ndim == 1:
-        x = np.diag(x)
-    scale = np.abs(x).max()
-    with np.errstate(over="ignore"):  # NumPy 1.26 warns of 5e-324 / 5e-324
-        uneven = scale > 0.0 and np.abs(x / scale - x.T / scale).max() > 1e-12
-    if uneven:
-        raise InputError(f"inertia of {label} is not symmetric")
-    x = 0.5 * x + 0.5 * x.T
-    value = np.linalg.eigvalsh(x)
-    if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
-        raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")
-    return x
