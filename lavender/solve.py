@@ -585,7 +585,7 @@ def check_budget(
     max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
     if time_limit is None or (isinstance(time_limit, (float, np.floating)) and time_limit == np.inf):
         return tol, max_iter, None
-    return tol, max_iter, number("time_limit [s]", time_limit, above=0.0)
+    return tol, max_iter, number("time_limit", time_limit, above=0.0)
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:

@@ -203,16 +203,16 @@ class Sweeps(Resumed):
 
     def end(self) -> None:
         """Offer and note the result of these sweeps."""
-        log, looks = self.log, self.state
-        done = looks.done - self.begun
-        if looks.best is not None:
-            log.take(looks.best)
+        log, sweeps = self.log, self.state
+        done = sweeps.done - self.begun
+        if sweeps.best is not None:
+            log.take(sweeps.best)
         if self.alone:
             log.by = log.problem.metric
             log.offer(self.impulse)
             log.timed_out = done < log.left
-        self.relative = log.best if looks.now is None else looks.now.relative
-        self.status = STATUS[looks.status]
+        self.relative = log.best if sweeps.now is None else sweeps.now.relative
+        self.status = STATUS[sweeps.status]
         self.close()
         self.claim = Claim(self.status, done, self.work)
         log.note(self.name, self.claim, self.before)
@@ -226,28 +226,28 @@ class Sweeps(Resumed):
 
     def iterate(self, n: int) -> int:
         """Run at most n sweeps; stop early if they predict a larger remaining cost than that of the others."""
-        looks = self.state
-        done, step = looks.done, min(max(looks.done // 2, FIRST), n)
-        looks.run(self.impulse, self.relative, n, self.log.tol, step, FIRST, self.others / self.cost.each)
-        self.relative, self.status = self.log.take(looks.now), STATUS[looks.status]
-        return int(looks.done) - done
+        sweeps = self.state
+        done, step = sweeps.done, min(max(sweeps.done // 2, FIRST), n)
+        sweeps.run(self.impulse, self.relative, n, self.log.tol, step, FIRST, self.others / self.cost.each)
+        self.relative, self.status = self.log.take(sweeps.now), STATUS[sweeps.status]
+        return int(sweeps.done) - done
 
     def close(self) -> None:
-        looks, told = self.state, self.told
-        self.told = looks.sweeps, looks.restarts
-        self.work = {"sweeps": looks.sweeps - told[0], "restarts": looks.restarts - told[1]}
-        if looks.watch.best_relative < self.log.best:
-            self.log.offer(looks.watch.best[1])
+        sweeps, told = self.state, self.told
+        self.told = sweeps.sweeps, sweeps.restarts
+        self.work = {"sweeps": sweeps.sweeps - told[0], "restarts": sweeps.restarts - told[1]}
+        if sweeps.watch.best_relative < self.log.best:
+            self.log.offer(sweeps.watch.best[1])
 
     def promise(self) -> float:
-        looks = self.state
-        return sweeps_left(looks.last, looks.before, self.relative, self.log.tol) * self.cost.each
+        sweeps = self.state
+        return sweeps_left(sweeps.last, sweeps.before, self.relative, self.log.tol) * self.cost.each
 
 
 class Relaxation(Resumed):
     """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law; then `nncg` from their result."""
 
-    relative = 1.0  # by Coulomb's law, at the last look
+    relative = 1.0  # by Coulomb's law, at the last check
     left = np.inf  # sweeps, by (1)
     slow = False  # the relaxation does not solve the problem, or not soon
     done = 0  # iterations of all turns

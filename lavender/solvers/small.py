@@ -196,7 +196,7 @@ def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
 
 
 def _turns(problem: Problem, ran: Ran, start: FloatArray | None, after: float) -> tuple[Turn, ...]:
-    """Turns of one compiled call; nobody looked between two."""
+    """Turns of one compiled call; nothing was measured between two."""
     if start is None or np.array_equal(start, problem._start):
         before = float(problem.metric.start_relative)
     else:

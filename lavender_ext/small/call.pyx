@@ -1,4 +1,4 @@
-"""Problems of few rows by bodies or by A, and islands of few rows: look, solve and judge in one call.
+"""Problems of few rows by bodies or by A, and islands of few rows: check the start, solve and judge in one call.
 
     bounded rows   the factor of A, linear or boxed, one shift where it is singular, refinement (pivot/direct.pyx);
                    where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
@@ -42,7 +42,7 @@ cdef enum:
     ROUNDS = 32                 # of exchanges
     PATH = 8                    # pivots of Lemke's for each row
     FEW = 12                    # rows of an island that has all of its sweeps before its factors
-    LISTEN = 5000000            # multiply-adds between two looks for Ctrl-C, a few milliseconds
+    LISTEN = 5000000            # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
 cdef class Small:
@@ -66,17 +66,17 @@ cdef class Small:
     def __init__(self, Data data, start, Data matrix):
         self.data, self.start, self.matrix = data, start, matrix
 
-    def run(self, impulse, double tol, bint look, double warm, bint capped=False):
+    def run(self, impulse, double tol, bint follows, double warm, bint capped=False):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
-        look: something else comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
+        follows: another method comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
         nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
         with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
         None where `impulse` is the solution. capped: no more factors than `most_factored` counts.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
-        if look:
+        if follows:
             if impulse is None or same_bits(impulse, self.start):
                 impulse = None
                 if before <= tol:
@@ -89,7 +89,7 @@ cdef class Small:
             if not before <= (warm if self.pivots else 1.0):
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
-        counts = self.solve(own, tol, look, capped)
+        counts = self.solve(own, tol, follows, capped)
         if counts is None:
             return None
         found = Judged(self.data, own)

@@ -1,9 +1,9 @@
-"""Accelerated sweeps with looks at what they promise: `auto`'s first glance in one call.
+"""Accelerated sweeps with residual checks that predict their remaining cost: the first turn of `auto` in one call.
 
     rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
 
 They go on while rest is no more than `least`; each time half as many as were done, `first` at least. Where A was formed
-of J and M looks are at A, which cost a sweep and not ten; what is below tol there is the judge's.
+of J and M the checks read A, which costs a sweep and not ten; a residual below tol there is checked by J and M.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, log
@@ -30,7 +30,7 @@ cpdef double sweeps_left(double done, double before, double now, double tol) noe
 
 
 cdef class CheckedSweeps:
-    """Sweeps of `anderson` in the order given, from the first one on, and what the last look at them found.
+    """Sweeps of `anderson` in the order given, from the first one on, and what their last check found.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ cdef class CheckedSweeps:
     cdef readonly int split, memory
     cdef readonly Watch watch
     cdef readonly object space, prepared, order, rng     # as `accelerated.run` takes them
-    cdef readonly Judged now, best      # of the last look, and of all
+    cdef readonly Judged now, best      # of the last check, and of all
     cdef readonly double before         # relative residual before the last sweeps,
     cdef readonly int last, done        # how many these were, and all of them
     cdef readonly int status            # of the watch
@@ -85,7 +85,7 @@ cdef class CheckedSweeps:
         self.sweeps += swept
         return last
 
-    cdef double look(self, lam, double before, int last, double tol) except *:
+    cdef double check(self, lam, double before, int last, double tol) except *:
         """The relative residual after `last` sweeps from `before`: by what is swept, and below tol by the judge."""
         self.now = Judged(self.data, lam.copy())
         if self.now.relative <= tol and self.data is not self.metric:
@@ -96,7 +96,7 @@ cdef class CheckedSweeps:
         return self.now.relative
 
     def run(self, lam, double before, int n, double tol, int sweeps, int first, double least):
-        """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first look.
+        """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first check.
 
         `least`: sweeps left that they promise at most, to go on.
         """
@@ -106,39 +106,39 @@ cdef class CheckedSweeps:
         self.begin(lam)
         while True:
             last = self.sweep(lam, sweeps, tol)
-            now = self.look(lam, before, last, tol)
+            now = self.check(lam, before, last, tol)
             if now <= tol or self.status != RUNNING or self.done >= end or sweeps_left(last, before, now, tol) > least:
                 return
             before = now
             sweeps = min(max(self.done // 2, first), end - self.done)
 
     def within(self, lam, double before, int n, double tol, int first, left, double each, double share, double chunk,
-               bint looked):
+               bint checked):
         """The same for as long as `left()` [s] says, a sweep counted for `each` [s]; returns what one has taken [s].
 
         For `share` of the time before the clock is asked, then as many as fit at the pace of the last, none longer than
-        `chunk` [s]. Looks are the only checks; `looked`: the last sweeps end with one.
+        `chunk` [s]. `checked`: the last sweeps end with a check.
         """
         cdef double time = left(), was, pace = each
         cdef int32_t at = self.done, end = at + n, due = at + first, step
         cdef double fit = min(share * time, chunk) / each
-        cdef bint look
+        cdef bint is_due
         self.begin(lam)
         while True:
             step = max(1, min(<int32_t>min(fit, 1e9), min(due, end) - self.done))
             self.sweep(lam, step, 0.0)
-            look = self.done == due
-            if look:
-                before = self.look(lam, before, self.done - at, tol)
+            is_due = self.done == due
+            if is_due:
+                before = self.check(lam, before, self.done - at, tol)
                 if before <= tol:
                     break
                 at, due = self.done, self.done + max(self.done // 2, first)
             PyErr_CheckSignals()
             was, time = time, left()
-            pace = max(was - time, 1e-9) / (step + look)
+            pace = max(was - time, 1e-9) / (step + is_due)
             if self.done >= end or 2.0 * time <= pace:
                 break
             fit = min(time, chunk) / pace
-        if looked and self.done > at:
-            self.look(lam, before, self.done - at, tol)
+        if checked and self.done > at:
+            self.check(lam, before, self.done - at, tol)
         return pace

@@ -21,7 +21,7 @@ from lavender_ext.newton.plan cimport CERTIFICATE, MORE
 
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
-    FIRST = 4                   # before the first look
+    FIRST = 4                   # before the first check
     SHORT = 12                  # factorisations before sweeps have AGAIN times as many as before them; of each in the mean,
     AGAIN = 8
     STEPS = 120                 # and in all

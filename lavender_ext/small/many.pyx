@@ -28,7 +28,7 @@ from lavender_ext.judge.score cimport relative, score_t
 cdef enum:
     STEPS = 128                 # of newton for each island, and in all as many as `newton` has by default
     MOST = 1500
-    AT_A_TIME = 256             # problems between two looks for Ctrl-C
+    AT_A_TIME = 256             # problems between two checks for Ctrl-C
 
 
 cdef struct limits_t:           # as `velocities_cost` of lavender/solvers/small.py, ns
@@ -159,7 +159,7 @@ cdef class Limits:
 
 
 def solve_first(Data p, start, double tol, Limits limits):
-    """A problem of at least one row that nobody has looked at: what is worked out of its data, solved, judged, at once.
+    """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
 
     What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, has empty rows or costs
     more than the limits (`limits_t`) let in. d, Y and the error of doing nothing stay with the data.

@@ -184,8 +184,8 @@ def test_sweeps_that_cost_more_than_counted_end_in_time(pace, least, monkeypatch
     assert log.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR)
 
 
-def test_looks_are_at_what_is_swept_and_what_is_below_tol_is_the_judges():
-    """Of J and M where A is swept a look at A costs a sweep, one at J and M ten."""
+def test_checks_read_what_is_swept_and_below_tol_the_judge_has_the_last_word():
+    """Of J and M where A is swept a check by A costs a sweep, one by J and M ten."""
     problem = random_general(5, contacts=6)
     reference(problem)
     made = checked_sweeps.CheckedSweeps(problem.metric, problem.data, problem.law == "cone", 0)
