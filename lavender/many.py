@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -17,8 +18,8 @@ import numpy as np
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.solution import Solution, uninterrupted
-from lavender.solve import check_budget, of_batch, solve
+from lavender.solution import Solution, Status, uninterrupted
+from lavender.solve import check_budget, rest_of, solve
 from lavender_ext.small.many import Batch
 
 __all__ = ["solve_many"]
@@ -122,4 +123,25 @@ def _batch(
     assert spec.small is not None
     work = Batch(views, given, tol, spec.small.limits)
     seconds = (perf_counter() - begin) / max(1, len(at))
-    work.hand_out(Solution, of_batch, (work, [problems[i] for i in at], spec, tol, seconds, given), at, made)
+    common = _Solved(work, [problems[i] for i in at], spec, tol, seconds, given)
+    work.hand_out(Solution, _solution, common, at, made)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """What the solutions of a batch are made of."""
+
+    batch: Batch
+    problems: list[Problem]
+    spec: SolverSpec
+    tol: float
+    seconds: float  # share of each
+    given: list[Any]  # starts
+
+
+def _solution(common: _Solved, i: int) -> dict[str, Any]:
+    """All fields of the solution of problem i, which converged."""
+    judged, counts = common.batch.judged(i)
+    made = {"impulse": judged.impulse, "status": Status.CONVERGED, "tol": common.tol, "setup_time": 0.0}
+    rest = rest_of(common.problems[i], common.spec, judged, counts, common.given[i])
+    return made | {"solve_time": common.seconds} | rest

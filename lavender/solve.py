@@ -529,24 +529,18 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
     judged.impulse.setflags(write=False)
     return Solution.late(
-        judged.impulse, CONVERGED, tol, perf_counter() - start, (_rest, (problem, spec, judged, counts, kept))
+        judged.impulse,
+        CONVERGED,
+        tol,
+        perf_counter() - start,
+        (rest_of, (problem, spec, judged, counts, kept)),
     )
 
 
-def of_batch(
-    common: tuple[Any, list[Problem], SolverSpec, float, float, list[Any]], i: int
-) -> dict[str, Any]:
-    """All fields of the solution of a `Batch`'s problem i, which converged."""
-    batch, problems, spec, tol, seconds, given = common
-    problem = problems[i]
-    judged, counts = batch.judged(i)
-    made = {"impulse": judged.impulse, "status": CONVERGED, "tol": tol, "setup_time": 0.0}
-    return made | {"solve_time": seconds} | _rest(problem, spec, judged, counts, given[i])
-
-
-def _rest(
+def rest_of(
     problem: Problem, spec: SolverSpec, judged: Any, counts: Any, given: FloatArray | None
 ) -> dict[str, Any]:
+    """The fields of a solution of a compiled call that `Solution.late` leaves for later."""
     assert spec.small is not None
     claim = spec.small.claim(problem, counts, given, judged.relative)
     return {

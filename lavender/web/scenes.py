@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -87,9 +87,21 @@ PAGE: tuple[tuple[str, str, str, str], ...] = (
     ),
 )
 
-#: Buttons of the page: name in its address, title, scene, settings of A and of B, what to see. The first opens it.
-PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] = (
-    (
+
+class Preset(NamedTuple):
+    """A button of the page: two settings of one scene side by side."""
+
+    name: str  # in the page's address
+    title: str
+    scene: str
+    a: dict[str, Any]
+    b: dict[str, Any]
+    note: str  # what to see
+
+
+#: The first opens the page.
+PRESETS = (
+    Preset(
         "chain-cold",
         "a chain, 16 sweeps: warm against cold",
         "chain",
@@ -97,7 +109,7 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         {"iterations": 16, "warm_start": False},
         "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links part.",
     ),
-    (
+    Preset(
         "4-warm-64-cold",
         "4 warm against 64 cold",
         "stack",
@@ -105,7 +117,7 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         {"iterations": 64, "warm_start": False},
         "B works sixteen times as hard as A and still creeps: each step starts from nothing.",
     ),
-    (
+    Preset(
         "bottom-up-top-down",
         "bottom-up against top-down, cold",
         "stack",
@@ -113,7 +125,7 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         {"iterations": 16, "warm_start": False, "order": "top_down"},
         "The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
     ),
-    (
+    Preset(
         "heavy-on-light",
         "heavy on light",
         "heavy_on_light",
@@ -121,7 +133,7 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         {"iterations": 16, "warm_start": False},
         "The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
     ),
-    (
+    Preset(
         "newton-against-sweeps",
         "newton against sweeps, cold",
         "heavy_on_light",
@@ -129,7 +141,7 @@ PRESETS: tuple[tuple[str, str, str, dict[str, Any], dict[str, Any], str], ...] =
         {"iterations": 64, "warm_start": False},
         "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box slips.",
     ),
-    (
+    Preset(
         "cards",
         "a house of cards",
         "card_house",
