@@ -123,7 +123,9 @@ def _batch(
     assert spec.small is not None
     work = Batch(views, given, tol, spec.small.limits)
     seconds = (perf_counter() - begin) / max(1, len(at))
-    common = _Solved(work, [problems[i] for i in at], spec, tol, seconds, given)
+    common = _Solved(
+        batch=work, problems=[problems[i] for i in at], spec=spec, tol=tol, seconds=seconds, given=given
+    )
     work.hand_out(Solution, _solution, common, at, made)
 
 

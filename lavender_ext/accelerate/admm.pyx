@@ -218,9 +218,9 @@ cdef inline double weighed(const admm_t* c) noexcept nogil:
     return s if s > 3.0 * c.rho or 3.0 * s < c.rho else c.rho
 
 
-cdef public int64_t lav_admm_room(int64_t m, int32_t memory) noexcept nogil:
-    """Numbers of a run."""
-    return (10 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
+cdef public double lav_admm_room(int32_t m, int32_t memory) noexcept nogil:
+    """Numbers of a run, a whole number (no 64-bit integer by value)."""
+    return (10.0 + 2.0 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
 cdef public void lav_admm_lay(admm_t* c, const blocks_t* p, int32_t memory, double rho, double alpha, double* room) noexcept nogil:
@@ -323,7 +323,7 @@ cdef class Splitting:
         cdef double[::1] room
         if not 0 <= memory <= MAX_MEMORY:
             raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-        room = np.zeros(lav_admm_room(p.blocks.n_rows, memory))
+        room = np.zeros(<Py_ssize_t>lav_admm_room(p.blocks.n_rows, memory))
         self.keep = p, room
         lav_admm_lay(&self.c, &p.blocks, memory, rho, alpha, &room[0])
 

@@ -216,7 +216,7 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
 }
 
 static int32_t prepare_admm(lav_solver *s) {
-  const int64_t m = s->p.n_rows, numbers = k_admm_room(m, s->options.memory);
+  const int64_t m = s->p.n_rows, numbers = (int64_t)k_admm_room(s->p.n_rows, s->options.memory);
   double *x, size[2] = {0.0, 0.0};
   int32_t bands[2];
   GIVE_BACK(form_matrix(s));
