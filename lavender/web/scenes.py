@@ -107,7 +107,10 @@ PRESETS = (
         scene="chain",
         a={"iterations": 16, "warm_start": True},
         b={"iterations": 16, "warm_start": False},
-        note="16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links part.",
+        note=(
+            "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links "
+            "part."
+        ),
     ),
     Preset(
         name="4-warm-64-cold",
@@ -139,7 +142,10 @@ PRESETS = (
         scene="heavy_on_light",
         a={"iterations": 16, "warm_start": False, "solver": "newton"},
         b={"iterations": 64, "warm_start": False},
-        note="Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box slips.",
+        note=(
+            "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box "
+            "slips."
+        ),
     ),
     Preset(
         name="cards",
