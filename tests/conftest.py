@@ -31,6 +31,11 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
+def pytest_collection_modifyitems(items):
+    """The longest test begins first: at the end all cores but one would wait for it."""
+    items.sort(key=lambda item: "parity" not in item.path.parts)
+
+
 @pytest.fixture(scope="session")
 def problem_dir() -> Path:
     """Folder of the reference problems, named by LAVENDER_PROBLEMS."""
