@@ -30,7 +30,8 @@ cdef inline void order_graph(int32_t n, const int32_t* ptr, const int32_t* near,
     for i in range(n):
         size[i] = 1
     memcpy(whole, ptr, (n + 1) * sizeof(int32_t))
-    memcpy(lists, near, ptr[n] * sizeof(int32_t))
+    if ptr[n]:                                          # of no neighbours there is no array
+        memcpy(lists, near, ptr[n] * sizeof(int32_t))
     degree_order(n, size, ptr[n] + ptr[n] // 4 + n, lists, whole, left, head, order)
     postordered(n, ptr, near, order, rank, nptr, nind, parent, whole)
 
