@@ -41,8 +41,10 @@ cdef enum:
     MEMORY = 6                  # steps that the non-monotone line search looks back
     HALVINGS = 7                # of one step
     FREE = 20                   # rounds in a row that cost no factorisation, and so change nothing but the weight
+    FIRST = 8                   # factorisations of the first stretch from the start
     STRETCH = 12                # factorisations between two checks of what rounds gain
     STRETCHES = 1000            # of one pursuit at most, whatever its budget
+    TRIAL = 2                   # Newton steps of rounds that try to end an interior point of De Saxce's
     APPROACH_STEPS = 60         # of one interior point of De Saxce's or of the augmented system at most
     SHORT_STEPS = 4             # steps in a row that get nowhere before that is given up
     APPROACH_IDLE = 15          # steps in a row that do not halve the residual, likewise
@@ -374,8 +376,9 @@ cdef inline void go_rounds(newton_t* n, int32_t which) noexcept nogil:
     x.stuck = x.stuck or x.free > FREE
 
 
-cdef inline void pursue(newton_t* n, int32_t which) noexcept nogil:
-    n.pursuit.last = 1.0 / 0.0
+cdef inline void pursue(newton_t* n, int32_t which, int32_t length, double last) noexcept nogil:
+    """Rounds, first for `length` factorisations, after which half of `last` is to be reached."""
+    n.pursuit.last, n.pursuit.length = last, length
     n.pursuit.which = which
     n.pursuit.at = n.pursuit.stretches = 0
     enter(n, PURSUIT)
@@ -392,27 +395,28 @@ cdef inline void go_pursuit(newton_t* n) noexcept nogil:
         x.at = 1
         x.stretches += 1
         begin_apart(n)
-        enter_rounds(n, x.which, STRETCH)
+        enter_rounds(n, x.which, x.length)
         return
     x.at = 0
     best = end_apart(n, NULL)
     if best > 0.5 * x.last or best == 1.0 / 0.0 or at_floor(n):
         leave(n)
         return
-    x.last = best
+    x.last, x.length = best, STRETCH
+    n.rounds[x.which].inner = INNER
 
 
 # -- interior points that Newton steps end -------------------------------------------------------------------------
 
 
 cdef inline void begin_approach(newton_t* n, int32_t law, int32_t augmented) noexcept nogil:
-    begin_progress(n, 1e-5)
+    begin_progress(n, 1e-5 if augmented else 1e-3)
     n.progress.law, n.progress.augmented = law, augmented
     enter(n, APPROACH)
 
 
 cdef inline void go_approach(newton_t* n) noexcept nogil:
-    """A step, and Newton steps of `law` through the augmented system, until the judge is content or they get nowhere."""
+    """A step, and Newton steps of `law`, until the judge is content or they get nowhere."""
     cdef progress_t* k = &n.progress
     cdef double found
     cdef bint went
@@ -438,7 +442,10 @@ cdef inline void go_approach(newton_t* n) noexcept nogil:
             k.at = 1
             if k.augmented:
                 begin_polish(n, n.ip.z, 2, 4)
-                return
+            else:
+                begin_rounds(n, 1, n.ip.z, k.law, found, TRIAL)
+                enter_rounds(n, 1, 1)
+            return
     if k.at == 1:
         k.at = 0
         if at_floor(n):

@@ -4,7 +4,7 @@ Bounded rows: exchanges from the warm start and from the solution of H z = g, an
 decades. Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
-interior point, ended by rounds; closed loops of joints through the augmented system, with two shares of phi's derivative;
+interior point with two shares of phi's derivative, ended by rounds; closed loops of joints through the augmented system;
 rounds from the answer of the convex relaxation; the first rounds for what is left of the budget.
 """
 from libc.math cimport sqrt
@@ -15,7 +15,7 @@ from lavender_ext.core.block cimport CONE, COULOMB, ROW
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.phases cimport (LIMITLESS, begin_approach, begin_exchanges, begin_rounds, begin_steps,
+from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
@@ -41,9 +41,17 @@ cdef enum:
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
 
 
-cdef inline double share_of(int32_t second) noexcept nogil:
-    """Of phi's derivative. The second is for closed loops alone, whose augmented system no rounds follow."""
-    return 0.95 if second else 0.7
+cdef inline double share_of(const tries_t* x) noexcept nogil:
+    """Of phi's derivative: the nearer to 1, the faster an interior point ends; further below it passes more folds.
+
+    Closed loops begin below: no rounds follow their augmented system.
+    """
+    return 0.95 if x.augmented == x.second else 0.7
+
+
+cdef inline double first_gain() noexcept nogil:
+    """Residual over that of the start after FIRST factorisations, above which rounds give way to an interior point."""
+    return 0.9
 
 
 cdef inline double cone_delta() noexcept nogil:
@@ -206,17 +214,19 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
     if x.at == 0:
         x.at = 1
         n.s.augmented = x.augmented
-        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x.second))
+        begin_interior(n, shift_of() if x.augmented else delta_of(), share_of(x))
         n.s.augmented = 0
         begin_approach(n, COULOMB, x.augmented)
         return
     best = n.progress.lowest if x.at == 1 else end_apart(n, n.progress.kept)
-    if x.augmented and not x.second and not over(n):
+    if over(n):
+        leave(n)
+        return
+    if x.augmented or x.at == 3 or (not x.second and x.at == 1 and best > 1e-2):    # far from an end: no rounds
+        if x.second:
+            leave(n)
         x.at = 0
         x.second = 1
-        return
-    if over(n) or x.augmented or x.at == 3:
-        leave(n)
         return
     begin_rounds(n, 1, n.progress.kept, COULOMB, best if best < (1e-3 if x.at == 1 else 1e-7) else
                  (1e-3 if x.at == 1 else 1e-7), 10 if x.at == 1 else 12)
@@ -245,7 +255,7 @@ cdef inline void go_relaxed(newton_t* n) noexcept nogil:
     leave(n)
     if not done(n):
         begin_rounds(n, 1, n.ip.z, COULOMB, 1e-3, INNER)
-        pursue(n, 1)
+        pursue(n, 1, STRETCH, 1.0 / 0.0)
 
 
 cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
@@ -262,8 +272,9 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     if at > 0 and over(n):
         at = 5
     if at == 0:
-        begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, INNER)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
-        pursue(n, 0)
+        take(n, n.aside_z, n.best_z)
+        begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
+        pursue(n, 0, FIRST, 2.0 * first_gain() * n.best)
     elif at == 1:
         begin_de_saxce(n, 0)
     elif at == 2:                                       # closed loops of joints: their rows nearly depend on each other
@@ -272,6 +283,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     elif at == 3:
         begin_relaxed(n)
     elif at == 4:
+        begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
         enter_rounds(n, 0, LIMITLESS)
     else:
         leave(n)

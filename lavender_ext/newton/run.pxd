@@ -136,6 +136,7 @@ cdef struct pursuit_t:
     double last
     int32_t at
     int32_t which
+    int32_t length              # factorisations of a stretch
     int32_t stretches
 
 
