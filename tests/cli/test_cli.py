@@ -162,7 +162,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--levels", "0"), "level 0.0 must be"),
         (("report", "--budgets", "-4"), "budget is -4"),
         (("report", "--repeats", "0"), "repeats is 0"),
-        (("report", "--time-limit", "-1"), "time limit is -1.0"),
+        (("report", "--time-limit", "-1"), "time_limit is -1"),
         (("report", "--orders", "sideways"), "sideways"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
