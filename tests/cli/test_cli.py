@@ -169,7 +169,7 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--solvers", "pgs", "stak(n=8)"), "unknown case 'stak'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--levels", "0"), "level 0.0 must be"),
+        (("report", "--levels", "0"), "level is 0;"),
         (("report", "--budgets", "-4"), "budget is -4"),
         (("report", "--repeats", "0"), "repeats is 0"),
         (("report", "--time-limit", "-1"), "time_limit is -1"),
