@@ -64,6 +64,8 @@ def solve_many(
     KeyboardInterrupt
         Ctrl-C.
     """
+    if isinstance(problems, Problem):
+        raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     given = list(problems)
     threads = whole_number("threads", threads, 1, None)
     if "impulse" in options:
