@@ -64,6 +64,8 @@ def solve(
     (item, *more) = bench.resolve([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
+    if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
+        raise InputError(f"--output {output} is the problem itself, which would be lost: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
     solution = solve_problem(
         item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options

@@ -78,6 +78,16 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     assert "claim contradicted" in out
 
 
+def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(lavender, path):
+    (path.parent / "[bold]x.npz").write_bytes(b"PK")
+    for command in ("check", "doctor", "explain"):
+        code, out, err = lavender(command, path.parent, *(["--solvers", "direct"] * (command == "check")))
+        assert (command, code) == (command, cli.EXIT_UNMET)
+        assert "[bold]x: " in out + err and "stack8" in out + f"stack8 {command}" * (command == "doctor")
+        assert lavender(command, path.parent / "[bold]x.npz")[0] == cli.EXIT_BAD_INPUT
+    assert lavender("explain", path.parent, "--tol", -1)[0] == cli.EXIT_BAD_INPUT
+
+
 def test_check_fails_on_a_file_it_cannot_read(lavender, path):
     broken = path.parent / "broken.npz"
     broken.write_bytes(path.read_bytes()[:100])
@@ -394,6 +404,15 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
         assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
+def test_an_answer_is_not_written_over_its_problem(lavender, path):
+    before = path.read_bytes()
+    link = path.with_name("link.npz")
+    link.symlink_to(path)
+    for output in (path, link):
+        assert lavender("solve", path, "--output", output)[0] == cli.EXIT_BAD_INPUT
+        assert path.read_bytes() == before
+
+
 def test_the_nearest_name_is_found_whatever_its_case(lavender):
     assert "did you mean 'pgs'" in lavender("solve", "stack(n=4)", "--solver", "PGS")[2]
     with pytest.raises(lv.UnknownName, match="did you mean 'max_iter'"):
@@ -535,6 +554,51 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
     assert lavender("report", *models, *words)[0] == 0
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
+
+
+def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
+    mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
+    if not hasattr(mujoco, "mju_getXMLDependencies"):
+        pytest.skip("this MuJoCo does not tell what a model includes")
+    model, part, played = (tmp_path / name for name in ("scene.xml", "part.xml", "played.npy"))
+    body = MODEL.format(height=0.1, kind="box")
+    part.write_text(
+        f"<mujocoinclude>{body[body.index('<worldbody>') : body.index('</mujoco>')]}</mujocoinclude>"
+    )
+    model.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    np.save(played, np.zeros((1, 0)))
+    calls, kept = [], recording.record_file
+    words = [
+        "report",
+        model,
+        "--controls",
+        played,
+        "--steps",
+        10,
+        "--every",
+        5,
+        "--solvers",
+        "auto",
+        "--no-figures",
+    ]
+
+    def recorded(*given, **more):
+        calls.append(given)
+        return kept(*given, **more)
+
+    def stopped(*given, **more):
+        recorded(*given, **more)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recording, "record_file", recorded)
+    assert (lavender(*words)[0], lavender(*words)[0], len(calls)) == (0, 0, 1)
+    for count, changed in ((2, part), (3, played)):
+        os.utime(changed, (1e9, 1e9 + count))
+        assert (lavender(*words)[0], len(calls)) == (0, count)
+    monkeypatch.setattr(recording, "record_file", stopped)  # on the way, for all that anybody knows
+    assert lavender(*words, "--fresh")[0] == cli.EXIT_INTERRUPTED
+    monkeypatch.setattr(recording, "record_file", recorded)
+    assert (lavender(*words)[0], len(calls)) == (0, 5)
 
 
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
