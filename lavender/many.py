@@ -63,6 +63,8 @@ def solve_many(
     KeyboardInterrupt
         Ctrl-C.
     """
+    if isinstance(problems, Problem):
+        raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     given = list(problems)
     if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
         raise InputError(f"threads is {threads!r}; a whole number from 1 is needed")

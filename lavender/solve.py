@@ -123,7 +123,7 @@ def solve(
     )
 
 
-def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
+def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
     """Do once the part of a solve that many solves can share: factorisation, colouring, allocation.
 
     Parameters

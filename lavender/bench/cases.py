@@ -121,7 +121,9 @@ def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
             if not paths:
-                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)})")
+                kept = Path(word) / "records.jsonl"
+                shown = f": {kept} shows its report again" if kept.is_file() else ""
+                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
             items += [_from_file(path) for path in paths]
         elif Path(word).exists():
             items.append(replace(_from_file(Path(word)), named=True))

@@ -34,7 +34,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
-from lavender.solution import Claim, Status
+from lavender.solution import Claim, Status, counted
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.small import NEWTON
@@ -204,7 +204,7 @@ class Newton:
         solve = system.solve
         factorisations = worked + solve.factorisations - before
         message = ", ".join(
-            f"{count} {what}" for count, what in zip(solve.counts, COUNTED, strict=True) if count
+            counted(count, what) for count, what in zip(solve.counts, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)

@@ -272,6 +272,8 @@ def test_many_start_where_they_are_told():
     warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
     assert warm[0].iterations == 0
     assert warm[1].iterations > 0
+    with pytest.raises(lv.InputError, match="one Problem; a list"):
+        lv.solve_many(problem)
     with pytest.raises(lv.InputError, match="1 impulses for 2"):
         lv.solve_many([problem, problem], impulses=[None])
     with pytest.raises(lv.InputError, match="threads is 0"):

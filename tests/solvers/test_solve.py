@@ -133,6 +133,13 @@ def test_ctrl_c_is_a_result(register):
         solution.raise_for_status()
 
 
+def test_what_was_done_is_printed_in_words():
+    problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+    assert ", 1 sweep, " in str(lv.solve(problem, "pgs"))
+    assert ", 3 sweeps, " in str(lv.prepare(problem, "pgs").solve(tol=0.0, max_iter=3))
+    assert lv.prepare(problem).solve().solver.name == "auto"
+
+
 def test_zero_iterations_judge_the_start():
     solution = lv.solve(TINY, "pgs", max_iter=0)
     assert solution.iterations == 0
