@@ -94,7 +94,10 @@ def commands_of(page):
         if not set("[…") & set(found[1]) and not found[1].endswith("..."):
             lines.append((0, found[1]))
     for line, command in lines:
-        yield f"{page.name}, block at line {line}: {command}", shlex.split(command.removeprefix("$ "), comments=True)
+        yield (
+            f"{page.name}, block at line {line}: {command}",
+            shlex.split(command.removeprefix("$ "), comments=True),
+        )
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -110,9 +113,9 @@ def test_command_lines_of_a_page_are_understood(page):
         except (click.exceptions.Exit, click.exceptions.MissingParameter):
             pass  # --help, or named without what it is for
         except click.ClickException as error:
-            named = words[-1].startswith("--")  # an option that is spoken of, without its value
-            absent = "does not exist" in error.format_message()  # a file of the reader's own
-            assert named or absent, f"{where}: {error.format_message()}"
+            # An option that is spoken of without its value, and a file of the reader's own, are well.
+            if not (words[-1].startswith("--") or "does not exist" in error.format_message()):
+                pytest.fail(f"{where}: {error.format_message()}")
 
 
 def test_pages_link_to_pages_that_exist():
