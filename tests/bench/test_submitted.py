@@ -112,5 +112,5 @@ def test_what_cannot_be_verified_is_an_error_or_a_note(submitted, tmp_path):
     assert {v.note for v in found.lines} == {"of_another_world: not registered here"}
     run = next(iter(records.runs.values()))
     records.runs[run.run] = replace(run, plan={"levels": [-1.0]})
-    with pytest.raises(lv.InputError, match=r"level -1\.0"):
+    with pytest.raises(lv.InputError, match="level is -1"):
         bench.verify(records)

@@ -102,6 +102,20 @@ def test_a_bound_from_below_is_counted_before_it_has_a_turn():
     assert dear.counted and dear.spent == 0.0 and cheap.over
 
 
+def test_a_turn_is_told_the_least_that_is_left_of_the_others():
+    told = []
+
+    class Told(Fake):
+        def run(self, work, others):
+            told.append((self.expected, others))
+            return super().run(work, others) and len(told) > 1
+
+    race([Told(cost, inf, [inf] * 9) for cost in (4.0, 9.0, 1.0)], lambda: len(told) == 2)
+    assert told == [(1.0, 4.0), (4.0, 9.0)]
+    race([Told(2.0, 1.0, [])], lambda: len(told) == 3)
+    assert told[2] == (2.0, inf)
+
+
 def test_nobody_left_is_an_end():
     class Stuck(Fake):
         def run(self, work, others):
