@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray, IntArray
+from lavender._arrays import FloatArray, IntArray, number
 from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import Cones
@@ -171,7 +171,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     check_problem(problem)
-    if not 0.0 <= tol < 1.0:
+    if not number("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     m = problem.m
     unique = np.ones(m, bool)

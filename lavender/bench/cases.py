@@ -21,8 +21,7 @@ from lavender._arrays import FloatArray
 from lavender.bench.record import CaseInfo, file_name, printable
 from lavender.cones import ROW
 from lavender.errors import InputError
-from lavender.io.recording import ENGINE
-from lavender.io.stored import SUFFIXES
+from lavender.io.stored import ENGINE, SUFFIXES
 from lavender.problem import Problem
 from lavender.residuals import Residual, nothing_to_do, residual
 from lavender.suite import Case
@@ -122,7 +121,9 @@ def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
             if not paths:
-                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)})")
+                kept = Path(word) / "records.jsonl"
+                shown = f": {kept} shows its report again" if kept.is_file() else ""
+                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
             items += [_from_file(path) for path in paths]
         elif Path(word).exists():
             items.append(replace(_from_file(Path(word)), named=True))
@@ -222,13 +223,14 @@ def _holds_steps(folder: Path) -> bool:
 
 
 def _another(steps: list[Item], items: list[Item]) -> list[Item]:
-    # Two folders of one name are two sequences, told apart by the folder around them where that is another.
-    names = {item.sequence for item in items}
+    # Two folders of one name are two sequences, told apart by the folder around them where that is another. Figures
+    # are named after them: names are other ones as names of files, too.
+    names = {file_name(item.sequence).lower() for item in items if item.sequence}
     name, n = steps[0].sequence, 1
-    if name in names:
+    if file_name(name).lower() in names:
         around = f"{Path(steps[0].source).resolve().parent.parent.name}/{name}"
-        name = name if around in names else around
-    while (unique := f"{name} #{n}" if n > 1 else name) in names:
+        name = name if file_name(around).lower() in names else around
+    while file_name(unique := f"{name} #{n}" if n > 1 else name).lower() in names:
         n += 1
     return [replace(item, name=f"{unique}[{item.step}]", sequence=unique) for item in steps]
 

@@ -66,7 +66,7 @@ def check(
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
             stored = item.judged(precision)
         except LavenderError as error:
-            out.print(f"{item.name}: {plain(str(error))}", style="yellow", highlight=False)
+            out.print(plain(f"{item.name}: {error}"), style="yellow", highlight=False)
             unread += isinstance(error, InputError) and not item.named
             missing += isinstance(error, InputError) and item.named
             continue

@@ -23,7 +23,8 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
     Without arguments, exit code 1: the self-test gives other bits than on other machines.
 
     With problems, print what looks like a mistake in their data (flipped normals, masses in place of their
-    inverses, rows out of order, ...). Exit code 1: there is a suspicion.
+    inverses, rows out of order, ...). Exit code 1: there is a suspicion, or a file in a folder cannot be read.
+    Exit code 2: a named file cannot be read.
     """
     if files:
         _suspect(files, as_json)
@@ -50,13 +51,14 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
     from lavender import bench
     from lavender.suspicions import diagnose
 
-    found, missing = {}, False
+    found, missing, unread = {}, False, False
     for item in bench.resolve(files):
         try:
             found[item.name] = diagnose(item.problem)
         except LavenderError as error:
             click.echo(f"{item.name}: {error}", err=True)
-            missing |= isinstance(error, InputError)
+            unread = True
+            missing |= isinstance(error, InputError) and item.named
         finally:
             item.forget()
         for suspicion in () if as_json else found.get(item.name, ()):
@@ -66,5 +68,5 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
         click.echo(json.dumps({name: list(map(asdict, told)) for name, told in found.items()}, indent=2))
     else:
         click.echo(f"{len(found)} looked at, {suspect or 'none'} suspicious")
-    if missing or suspect:
+    if missing or suspect or unread:
         raise SystemExit(EXIT_BAD_INPUT if missing else EXIT_UNMET)

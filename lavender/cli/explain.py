@@ -6,6 +6,9 @@ import json
 
 import click
 
+from lavender.cli.options import EXIT_UNMET
+from lavender.errors import InputError
+
 __all__ = ["explain"]
 
 
@@ -22,14 +25,27 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
     """Print what `auto` would do with problems (files, folders or cases of the suite), and the expected costs.
 
     Nothing is solved. Costs are counted from the structure of a problem, with the same rates on every machine.
+
+    Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
     from lavender.bench.cases import resolve
     from lavender.plan import explain as plan_of
 
+    unread = False
     for item in resolve(list(files)):
-        plan = plan_of(item.problem, tol)
+        try:
+            problem = item.problem
+        except InputError as error:
+            if item.named:
+                raise
+            click.echo(f"{item.name}: {error}", err=True)
+            unread = True
+            continue
+        item.forget()
+        plan = plan_of(problem, tol)
         if as_data:
             click.echo(json.dumps(plan.data()))
         else:
             click.echo(f"{item.name}: {plan}\n")
-        item.forget()
+    if unread:
+        raise click.exceptions.Exit(EXIT_UNMET)

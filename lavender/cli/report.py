@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from collections.abc import Mapping
@@ -203,8 +204,9 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
         folder = first.with_name(f"{first.name}-{n}")
     taken.add(folder)
     kept = folder / "how.json"
-    asked = json.dumps({"model": model, "changed": _age(path), **how})
+    asked = json.dumps({"model": model, "changed": _ages(path, how["controls"]), **how})
     if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
+        kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
         more = {"steps": how["steps"], "every": how["every"], "control": how["controls"]}
         told = str(record_file(path, folder, **more, replace=True))
         console().print(told, highlight=False, markup=False)
@@ -220,8 +222,17 @@ def _model_of(folder: Path) -> str:
         return ""
 
 
-def _age(path: Path) -> float:
+def _ages(path: Path, controls: str) -> list[float]:
+    """When the model, the files that it includes and its controls were changed."""
     try:
-        return path.stat().st_mtime
+        found = [path.stat().st_mtime]
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
+    with contextlib.suppress(
+        ImportError, AttributeError, ValueError, RuntimeError
+    ):  # an earlier MuJoCo, no model
+        import mujoco
+
+        others = (*sorted(mujoco.mju_getXMLDependencies(str(path))), controls)
+        found += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
+    return found

@@ -22,6 +22,7 @@ from lavender.errors import InputError
 from lavender.export.library import HERE
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.io.stored import write_bytes
+from lavender.report.moved import working
 from lavender.report.verdict import verdict
 from lavender.solvers.costs import METHODS as METHODS_OF_PLANS
 
@@ -36,7 +37,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     Parameters
     ----------
     path : Path
-        records.jsonl of a report.
+        records.jsonl of a report, or its folder.
     solver : str, optional
         One of its records; default: the one that it recommends.
     most : int
@@ -47,7 +48,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     InputError
         No such solver, or one that the library does not have, or no problem that can be had again.
     """
-    records = read(path)
+    records = working(read(path).latest())  # what the report itself recommends by
     record = chosen(records, solver)
     packed: list[bytes] = []
     left: list[str] = []

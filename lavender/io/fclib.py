@@ -500,6 +500,8 @@ def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str
         reasons.append(f"the precision {problem.precision!r} (drop=('precision',) leaves it out)")
     if any("\ud800" <= letter <= "\udfff" for letter in problem.name):
         reasons.append("half a surrogate pair in its name (give it another)")
+    if "\0" in problem.name:
+        reasons.append("a NUL character in its name, which ends a text there (give it another)")
     if form == "global":
         reasons += _no_global_form(problem)
     return reasons

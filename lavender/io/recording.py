@@ -18,13 +18,12 @@ from lavender._arrays import FloatArray, as_array, whole_number
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
-from lavender.io.stored import as_path, first_bytes, folder_for_steps, write_text
+from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
 from lavender.problem import PRECISIONS, Problem
 from lavender.residuals import residual
 
 __all__ = ["Recording", "record", "record_file"]
 
-ENGINE = "engine.jsonl"  # beside the problems: what the engine itself said of each
 CONTROLS = ("zero", "random")
 Control = str | Callable[[Any, Any, int], Any] | Any
 

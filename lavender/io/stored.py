@@ -21,8 +21,10 @@ __all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]
 
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # of problem files
+ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said of each
 
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
+PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
 
 
@@ -45,7 +47,7 @@ class Stored:
 def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Path:
     """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
 
-    `replace` takes the problem files out that it holds.
+    `replace` takes the problem files out that it holds. What an engine said of others goes in either case.
     """
     folder, replace = as_path(path), flag("replace", replace)
     try:
@@ -56,8 +58,8 @@ def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Pat
                 f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one sequence: "
                 "give another folder, or have them replaced (replace=True, --replace)"
             )
-        for file in old:
-            file.unlink()
+        for file in (*old, folder / ENGINE):
+            file.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"cannot make or clear the folder {str(folder)!r}: {error.strerror}") from None
     return folder
@@ -89,12 +91,15 @@ def destination(path: str | os.PathLike[str]) -> Path:
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
     """Call `write` with a path beside `path`, then rename: readers see the old file or the new one.
 
-    Symbolic links are followed: the file behind them is replaced, they stay.
+    Symbolic links are followed: the file behind them is replaced, they stay. Who may read a file stays, too.
     """
     target = destination(path)
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{get_native_id()}.part")
+    short = target.name[:PART_OF_NAME]  # the whole could leave no room for the rest
+    temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
     try:
         write(temporary)
+        with contextlib.suppress(OSError):  # of no file yet, or where modes mean nothing
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
         reason = error.strerror or error

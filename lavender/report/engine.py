@@ -14,10 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from lavender.bench.record import Record
+from lavender.bench.record import Record, printable
 from lavender.bench.store import Records
-from lavender.io.recording import ENGINE
-from lavender.io.stored import whole_file
+from lavender.io.stored import ENGINE, whole_file
 from lavender.residuals import AT_FLOOR
 
 __all__ = ["ENGINES", "Contestant", "contestants"]
@@ -66,7 +65,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
         if not found:
             continue
         rows, seconds, relative, early, solvers = zip(*found, strict=True)
-        name, ours, worst = _fastest(Path(word).name, records, max(relative))
+        name, ours, worst = _fastest(Path(word), records, float(np.max(relative)))
         out.append(
             Contestant(
                 folder=Path(word).name,
@@ -85,27 +84,23 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
     return out
 
 
-def _fastest(sequence: str, records: Records, engine: float) -> tuple[str, float, float]:
+def _fastest(folder: Path, records: Records, engine: float) -> tuple[str, float, float]:
     """The fastest at the loosest level that is no worse than the engine's worst residual, else at the closest."""
-    # Steps of a folder are cases named "folder[step]".
-    runs = [
-        r
-        for r in records
-        if r.mode == "tol"
-        and not r.turns
-        and r.case.partition("[")[0] == sequence
-        and records.success(r) is not None
-    ]
+    inside = printable(str(folder))  # as the records have it
+    working = {
+        name for name, info in records.cases.items()
+        if not info.nothing_to_do and str(Path(info.source).parent) == inside
+    }  # fmt: skip
+    runs = [r for r in records if r.mode == "tol" and not r.turns and r.case in working]
     levels = {r.tol for r in runs}
     level = max((tol for tol in levels if tol <= engine), default=min(levels, default=math.nan))
     by_solver: dict[tuple[str, str], list[Record]] = {}
     for r in runs:
         if r.tol == level:
             by_solver.setdefault((r.solver, r.start), []).append(r)
-    most = max((len(runs) for runs in by_solver.values()), default=0)
     best = ("", math.nan, math.nan)
     for (solver, start), steps in by_solver.items():
-        if len(steps) == most and all(r.success for r in steps):
+        if len(steps) == len(working) and all(r.success for r in steps):  # none was left to a limit of time
             time = float(np.median([r.time_min for r in steps]))
             if not time >= best[1]:
                 best = (f"{solver}, {start}, to {level:g}", time, max(r.relative for r in steps))

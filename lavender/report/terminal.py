@@ -75,7 +75,7 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
         console.print(said, highlight=False, markup=False, style="bold")
         if changed.rows:
             print_table(console, changed)
-    wrong = [r for r in records if r.contradicted]
+    wrong = [r for r in tables.failures(records) if r.contradicted]
     if wrong:
         console.print(f"\n[bold red]{len(wrong)} claims are contradicted by the judge:[/]")
         for r in wrong[:SHORT]:

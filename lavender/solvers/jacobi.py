@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender._arrays import FloatArray, number
 from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
@@ -44,10 +43,8 @@ class Jacobi:
     omega: float | None = None
 
     def __post_init__(self) -> None:
-        if self.omega is not None and not 0.0 < self.omega < np.inf:
-            raise InputError(
-                f"omega is {self.omega}; a number above 0 is needed, or None for the safe damping"
-            )
+        if self.omega is not None:
+            number("omega", self.omega, above=0.0)
 
     def prepare(self, problem: Problem) -> JacobiState:
         return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)

@@ -71,7 +71,7 @@ def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
     from lavender import io
 
     p = lv.Problem.contact(np.eye(4), np.ones(4), np.full(2, 0.5), key=np.array([7, 9], np.uint64))
-    for folder in ("a/steps", "b/steps", "mixed"):
+    for folder in ("a/steps", "b/steps", "mixed", "a/my steps", "a/My_steps"):
         (tmp_path / folder).mkdir(parents=True)
         for i in (1, 2):
             io.save(p, tmp_path / folder / f"scene-{i:06d}.npz")
@@ -82,6 +82,9 @@ def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
     ]  # fmt: skip
     assert len({i.name for i in items}) == len(items)
     assert all(i.sequence == "" for i in bench.resolve([tmp_path / "a" / "steps"], sequences=False))
+    # Figures and parts of the page are named after sequences: one name of a file for each.
+    alike = bench.resolve([tmp_path / "a" / name for name in ("my steps", "My_steps")])
+    assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}
 
 
 def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):

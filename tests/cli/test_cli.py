@@ -78,6 +78,16 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     assert "claim contradicted" in out
 
 
+def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(lavender, path):
+    (path.parent / "[bold]x.npz").write_bytes(b"PK")
+    for command in ("check", "doctor", "explain"):
+        code, out, err = lavender(command, path.parent, *(["--solvers", "direct"] * (command == "check")))
+        assert (command, code) == (command, cli.EXIT_UNMET)
+        assert "[bold]x: " in out + err and "stack8" in out + f"stack8 {command}" * (command == "doctor")
+        assert lavender(command, path.parent / "[bold]x.npz")[0] == cli.EXIT_BAD_INPUT
+    assert lavender("explain", path.parent, "--tol", -1)[0] == cli.EXIT_BAD_INPUT
+
+
 def test_check_fails_on_a_file_it_cannot_read(lavender, path):
     broken = path.parent / "broken.npz"
     broken.write_bytes(path.read_bytes()[:100])
@@ -159,10 +169,10 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--solvers", "pgs", "stak(n=8)"), "unknown case 'stak'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--levels", "0"), "level 0.0 must be"),
+        (("report", "--levels", "0"), "level is 0;"),
         (("report", "--budgets", "-4"), "budget is -4"),
         (("report", "--repeats", "0"), "repeats is 0"),
-        (("report", "--time-limit", "-1"), "time limit is -1.0"),
+        (("report", "--time-limit", "-1"), "time_limit is -1"),
         (("report", "--orders", "sideways"), "sideways"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
@@ -187,7 +197,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
-        (("nonsense",), "No such command"),
+        (("nonsense",), "unknown command 'nonsense'"),
+        (("slove", "stack(n=4)"), "did you mean 'solve'"),
+        (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
         (("report", "random_spd", "--campaign", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
         (("solve", "random_spd(n=10000000)"), "not enough memory"),  # 8e14 bytes
         *(
@@ -201,6 +213,27 @@ def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
     assert code == 2
     assert sign in err
     assert "Traceback" not in err + out
+
+
+def test_the_time_of_a_solve_holds_no_loading_of_modules():
+    code = (
+        "import sys, lavender; s = sys.modules['lavender.solve']; real = s.solve\n"
+        "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
+        "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("True\n")
+
+
+def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_told(lavender, tmp_path):
+    model, folder = tmp_path / "model.xml", tmp_path / "reported"
+    model.write_text("<mujoco/>")
+    folder.mkdir()
+    (folder / "records.jsonl").write_text("")
+    code, _, err = lavender("solve", model)
+    assert (code, err.count("\n")) == (2, 1) and "`lavender record` writes such files" in err
+    code, _, err = lavender("report", folder)
+    assert code == 2 and f"{folder / 'records.jsonl'} shows its report again" in err
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 broken", b"\x89HDF broken"])
@@ -394,6 +427,15 @@ def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
         assert lavender("solve", tmp_path / "wrong.npz", "--solver", "pgs", *more)[0] == cli.EXIT_UNMET
 
 
+def test_an_answer_is_not_written_over_its_problem(lavender, path):
+    before = path.read_bytes()
+    link = path.with_name("link.npz")
+    link.symlink_to(path)
+    for output in (path, link):
+        assert lavender("solve", path, "--output", output)[0] == cli.EXIT_BAD_INPUT
+        assert path.read_bytes() == before
+
+
 def test_the_nearest_name_is_found_whatever_its_case(lavender):
     assert "did you mean 'pgs'" in lavender("solve", "stack(n=4)", "--solver", "PGS")[2]
     with pytest.raises(lv.UnknownName, match="did you mean 'max_iter'"):
@@ -535,6 +577,51 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
     assert lavender("report", *models, *words)[0] == 0
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
+
+
+def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
+    mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
+    if not hasattr(mujoco, "mju_getXMLDependencies"):
+        pytest.skip("this MuJoCo does not tell what a model includes")
+    model, part, played = (tmp_path / name for name in ("scene.xml", "part.xml", "played.npy"))
+    body = MODEL.format(height=0.1, kind="box")
+    part.write_text(
+        f"<mujocoinclude>{body[body.index('<worldbody>') : body.index('</mujoco>')]}</mujocoinclude>"
+    )
+    model.write_text('<mujoco><include file="part.xml"/></mujoco>')
+    np.save(played, np.zeros((1, 0)))
+    calls, kept = [], recording.record_file
+    words = [
+        "report",
+        model,
+        "--controls",
+        played,
+        "--steps",
+        10,
+        "--every",
+        5,
+        "--solvers",
+        "auto",
+        "--no-figures",
+    ]
+
+    def recorded(*given, **more):
+        calls.append(given)
+        return kept(*given, **more)
+
+    def stopped(*given, **more):
+        recorded(*given, **more)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(recording, "record_file", recorded)
+    assert (lavender(*words)[0], lavender(*words)[0], len(calls)) == (0, 0, 1)
+    for count, changed in ((2, part), (3, played)):
+        os.utime(changed, (1e9, 1e9 + count))
+        assert (lavender(*words)[0], len(calls)) == (0, count)
+    monkeypatch.setattr(recording, "record_file", stopped)  # on the way, for all that anybody knows
+    assert lavender(*words, "--fresh")[0] == cli.EXIT_INTERRUPTED
+    monkeypatch.setattr(recording, "record_file", recorded)
+    assert (lavender(*words)[0], len(calls)) == (0, 5)
 
 
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):

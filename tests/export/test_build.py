@@ -216,6 +216,16 @@ def test_test_vectors_are_met_and_a_changed_bit_is_seen(folder, shared, compiler
     assert done.returncode == 1 and "DIFFERS" in done.stdout
 
 
+def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
+    records, problem = tmp_path / "records.jsonl", tmp_path / "mine.npz"
+    lv.Problem.lcp(np.array([[2.0, 0.5], [0.5, 1.0]]), np.ones(2)).save(problem)
+    for repeats, solver in ((1, "direct"), (2, "nncg")):  # two runs: the page is of the newest
+        bench.run([problem], [solver], bench.Plan(levels=(1e-6,), budgets=(), repeats=repeats), records)
+    assert "LAV_NNCG" in vectors.made(records, None, 1)["chosen.h"]
+    with pytest.raises(lv.InputError, match="of these records are: nncg"):
+        vectors.made(records, "direct", 1)
+
+
 def test_vectors_are_of_the_problems_that_the_report_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(export.library, "source", lambda: "of another test")
     rng = np.random.default_rng(0)

@@ -297,6 +297,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (named, {}, ["names of blocks", "keys of blocks"]),
         (named, {"drop": ["names"]}, ["keys of blocks"]),
         (moved, {}, ["names of velocities", "precision 'float32'", "surrogate"]),
+        (dataclasses.replace(named, name="whole\0"), {}, ["NUL character in its name"]),
         (soft(rows, 0.5), {}, ["compliance"]),
         (heavy, {}, ["infinite mass"]),
         (pinned, {}, ["infinite inertia"]),

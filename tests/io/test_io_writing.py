@@ -13,7 +13,7 @@ from lavender import bench, io
 from lavender.bench.store import Records, Store
 from lavender.engine import run
 from lavender.engine.picture import save_picture
-from lavender.io.stored import write_atomically, write_text
+from lavender.io.stored import folder_for_steps, write_atomically, write_text
 
 resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
@@ -126,6 +126,22 @@ def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_p
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == BEFORE
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_name_as_long_as_any_may_be_is_written_and_who_may_read_a_file_stays(made, tmp_path):
+    for name in ("n" * 251 + ".npz", "\N{GREEK SMALL LETTER LAMDA}" * 125 + ".npz"):
+        io.save(made["problem"], tmp_path / name)
+        (tmp_path / name).chmod(0o640)
+        io.save(made["problem"], tmp_path / name)
+        assert io.load(tmp_path / name) == made["problem"]
+        assert stat.S_IMODE((tmp_path / name).stat().st_mode) == 0o640
+
+
+def test_what_an_engine_said_of_a_recording_goes_with_it(tmp_path):
+    for name in ("engine.jsonl", "step_1.npz"):
+        (tmp_path / name).write_text("of before")
+    assert folder_for_steps(tmp_path, replace=True) == tmp_path
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_path_of_an_open_descriptor_is_no_name(tmp_path):

@@ -231,7 +231,7 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert said.code == (  # records of old: of prepare and solve
         'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call',
         (
-            "# in C (lavender export c --for RECORD, which writes the turns that options are to name): "
+            "# in C (lavender export c --for records.jsonl, which writes the turns that options are to name): "
             "lav_default_options(LAV_AUTO, &options), lav_default_budget(&budget), budget.tol = 1e-06, "
             "budget.iterations = 1000000, lav_run(solver, &budget, &result);"
         ),
@@ -340,6 +340,16 @@ def test_claims_failures_and_spreads():
     assert (by["x"].claims, by["x"].wrong, by["x"].rate) == (2, 1, 0.5)
     assert (by["y"].crashed, by["y"].asked, by["y"].reached) == (1, 1, 0)
     assert math.isnan(by["y"].rate)
+    # Of what was run again in turns the first run counts; a run to a limit of time is in turns alone.
+    for mode, wrong in (("tol", 1), ("time", 2)):
+        more = records_of(
+            *found, record("a", "x", 1.0, 1e-2, mode=mode, turns="one", contradicted="says CONVERGED")
+        )
+        assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
+        assert sum(bool(f.contradicted) for f in report.failures(more)) == wrong
+        console = Console(file=io.StringIO(), width=200)
+        print_report(Report(more), console)
+        assert f"{wrong} claims are contradicted" in console.file.getvalue()
     assert [(f.solver, f.status) for f in report.failures(found)] == [
         ("x", "CONVERGED"),
         ("y", "CRASHED (SIGSEGV)"),
@@ -577,15 +587,27 @@ def test_an_engine_stands_beside_the_fastest_to_a_level_as_good_as_its_own(tmp_p
     ]
     (tmp_path / "engine.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     times = {"pgs": {1e-3: 1e-6, 1e-6: 5e-3}, "newton": {1e-3: 1e-3, 1e-6: 2e-3}}
-    found = records_of(
-        *(
-            record(f"{tmp_path.name}[{step}]", solver, time, tol / 2, tol=tol)
-            for step in (0, 1)
+
+    def steps(sequence, first, times=times):
+        return [
+            record(f"{sequence}[{step}]", solver, time, tol / 2, tol=tol)
+            for step in range(first, 2)
             for solver, levels in times.items()
             for tol, time in levels.items()
-        )
-    )
-    (engine,) = contestants([str(tmp_path)], found)
+        ]
+
+    def answers(*made):
+        found, place = records_of(*made), {"near": tmp_path, "other/near": tmp_path / "other" / "near"}
+        for case in found.cases.values():
+            sequence, _, step = case.case.partition("[")
+            found.add(dataclasses.replace(case, source=str(place[sequence] / f"step_{step[:-1]}.npz")))
+        return contestants([str(tmp_path)], found)[0]
+
+    # A folder of the same name elsewhere, and a solver that a limit of time ended after one step, are not it.
+    quick = {solver: dict.fromkeys(levels, 1e-9) for solver, levels in times.items()}
+    ended = {"quickest": dict.fromkeys((1e-3, 1e-6), 1e-9)}
+    engine = answers(*steps("other/near", 0, quick), *steps("near", 0), *steps("near", 1, ended))
     assert engine.ours == f"{name}, cold, to {level:g}"
     assert engine.our_seconds == times[name][level]
     assert engine.our_worst == level / 2
+    assert answers(*steps("near", 0, ended)[:2], *steps("near", 1)).ours == ""

@@ -1,5 +1,6 @@
 """How sure a recommendation is: resamplings, misses that count, drift, and what others take by their own interface."""
 
+import math
 import random
 
 import pytest
@@ -80,6 +81,31 @@ def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():
     found = race(records_of(*made))
     assert found.ranking[0][1].solver == "sure"
     assert [c.solved for _, c in found.ranking] == [6, 5]
+
+
+def test_lines_that_were_refused_different_cases_are_compared_on_all_of_them():
+    size = {"easy": 1e-3, "both": 1e-2, "hard": 1e-1}
+    made = [
+        record(case, solver, t, 1e-7, turns="one", way="call", times=(t,) * 7, **more)
+        for case in size
+        for solver, factor, refused in (("slow", 2.0, "hard"), ("quick", 1.0, "easy"))
+        for t in (factor * size[case],)
+        for more in ({}, {"mode": "time", "time_limit": 0.5})
+        if case != refused
+    ]
+    records = records_of(*made)
+    found = race(records)
+    charged = {"slow": (2e-3, 2e-2, 2.0), "quick": (2.0, 1e-2, 1e-1)}  # a miss costs the limit of 2 s
+    for _, choice in found.ranking:
+        assert (choice.solved, choice.cases) == (2, 3)
+        each = [t + tables.SHIFT for t in charged[choice.solver]]
+        assert choice.score == pytest.approx(math.prod(each) ** (1.0 / 3.0) - tables.SHIFT)
+    assert max(found.shares) < 1.0
+    quick = in_time(records, lines(records, "call"), 1.0)
+    assert {(c.solver, c.solved, c.cases, c.worst) for _, c in quick.ranking} == {
+        ("slow", 2, 3, 1.0),
+        ("quick", 2, 3, 1.0),
+    }
 
 
 def test_in_a_time_misses_count_and_the_sentence_says_how_many():

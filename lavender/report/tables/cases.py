@@ -112,12 +112,17 @@ def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Rea
     return out
 
 
+def _is_again(r: Record) -> bool:
+    """A run that was made before, again in turns with others; only those to a limit of time are run in turns alone."""
+    return bool(r.turns) and r.mode != "time"
+
+
 def failures(records: Records) -> list[Record]:
     """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
     out = []
     for r in records:
-        if r.turns:
-            continue  # the same runs again, in turns
+        if _is_again(r):
+            continue
         missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
         proven = r.status == "INFEASIBLE" and not r.contradicted
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
@@ -130,7 +135,7 @@ def claims(records: Records) -> list[Claims]:
     """By solver: how often its claim holds."""
     out = []
     for solver in sorted({r.solver for r in records}):
-        mine = [r for r in records if r.solver == solver and not r.turns]
+        mine = [r for r in records if r.solver == solver and not _is_again(r)]
         asked = [r for r in mine if r.mode == "tol"]
         out.append(
             Claims(

@@ -28,6 +28,7 @@ SOMETIMES = 0.2  # share from which another is as good a choice
 NOISE = 1.05  # at least: what nobody notices
 BLOCKS = 10  # that the steps of a sequence are cut into
 QUIET = 0.25  # quantile of the repetitions that is a line's time: what else the machine does only ever adds
+TICK = 1e-12  # s, less than any clock tells
 LATE = 0.95  # of the repeats, that have to be in time
 
 
@@ -73,7 +74,7 @@ class Race:
 
 
 def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
-    """Every line of that way ("call", "steps", "batch"), on the cases that all of them were run on.
+    """Every line of that way ("call", "steps", "batch") that was run on as many cases as any.
 
     Parameters
     ----------
@@ -122,21 +123,22 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
     some = _best_of_each([f for f in some if f.line.mode == "tol" and f.line.tol <= level], level)
     if not some:
         return None
-    limit = limit_of(records)
-    missed = np.array([[not r.relative <= level for r in f.runs.values()] for f in some])
-    times = _repeats(some, lambda r: r.times or (r.time_min,))
+    limit, names = limit_of(records), _names(some)
+    missed = np.array([[c not in f.runs or not f.runs[c].relative <= level for c in names] for f in some])
+    times = _repeats(some, names, lambda r: r.times or (r.time_min,))
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
     def score(values: FloatArray) -> FloatArray:
-        return np.asarray(np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=1)) - SHIFT)
+        found = np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=1)) - SHIFT
+        return np.asarray(np.maximum(found, TICK))
 
     def choice(i: int, value: float) -> Choice:
         each = np.where(missed[i], math.inf, np.quantile(times[i], QUIET, axis=1))
-        found = dict(zip(some[i].runs, each.tolist(), strict=True))
+        found = dict(zip(names, each.tolist(), strict=True))
         solved = int((~missed[i]).sum())
         return Choice.of(some[i].line.solver, found, solved, value, cases=max(cases, len(found)))
 
-    return _race(records, some, charged, missed, score, choice)
+    return _race(records, some, names, charged, missed, score, choice)
 
 
 def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 0) -> Race | None:
@@ -149,8 +151,9 @@ def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 
     ]
     if not some:
         return None
-    times = _repeats(some, lambda r: r.times or (r.time_min,))
-    left = np.minimum(_repeats(some, lambda r: r.reached or (r.relative,)), 1.0)
+    names = _names(some)
+    times = _repeats(some, names, lambda r: r.times or (r.time_min,))
+    left = np.minimum(_repeats(some, names, lambda r: r.reached or (r.relative,)), 1.0)
     got = np.where(times <= limit, np.nan_to_num(left, nan=1.0), 1.0)
     served = np.quantile(got, LATE, axis=2, method="lower") <= HALF
 
@@ -162,22 +165,31 @@ def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 
         line, each = some[i].line, np.quantile(got[i], LATE, axis=1, method="lower")
         return Choice.of(
             line.solver,
-            dict(zip(some[i].runs, each.tolist(), strict=True)),
+            dict(zip(names, each.tolist(), strict=True)),
             int(served[i].sum()),
             value,
             cases=max(cases, len(each)),
             how=f"{line.max_iter} sweeps" if line.mode == "budget" else "",
             iterations=line.max_iter,
-            overrun=float(np.quantile(times[i], LATE, method="lower")) / limit,
+            overrun=float(np.nanquantile(times[i], LATE, method="lower")) / limit,
         )
 
-    return _race(records, some, got, ~served, score, choice)
+    return _race(records, some, names, got, ~served, score, choice)
 
 
-def _repeats(some: Sequence[Final], what: Callable[[Record], Sequence[float]]) -> FloatArray:
-    """(lines, cases, repetitions); what was repeated less often again from its start."""
+def _names(some: Sequence[Final]) -> list[str]:
+    """The cases of all lines; what a line was not run on, for it was refused, it misses."""
+    return list(dict.fromkeys(name for f in some for name in f.runs))
+
+
+def _repeats(
+    some: Sequence[Final], names: Sequence[str], what: Callable[[Record], Sequence[float]]
+) -> FloatArray:
+    """(lines, cases, repetitions), nan where not run; what was repeated less often again from its start."""
     most = max(len(what(r)) for f in some for r in f.runs.values())
-    return np.array([[np.resize(what(r), most) for r in f.runs.values()] for f in some], float)
+    return np.array(
+        [[np.resize(what(f.runs[c]) if c in f.runs else np.nan, most) for c in names] for f in some], float
+    )
 
 
 def _quantile(values: FloatArray, q: float) -> FloatArray:
@@ -214,13 +226,14 @@ def _blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
 def _race(
     records: Records,
     some: Sequence[Final],
+    names: Sequence[str],
     values: FloatArray,
     missed: np.ndarray,
     score: Callable[[FloatArray], FloatArray],
     choice: Callable[[int, float], Choice],
 ) -> Race:
     n, _, repeats = values.shape
-    blocks = _blocks(records, list(some[0].runs))
+    blocks = _blocks(records, names)
     draw = np.random.default_rng(0)
     single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, lines)
     # Two standard errors of the difference of two scores; that of a quartile is 1.36 times a mean's.
