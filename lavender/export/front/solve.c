@@ -88,13 +88,14 @@ static int32_t prepare_blocks(lav_solver *s) {
 static int32_t prepare_accelerated(lav_solver *s);
 #endif
 
-/* max_i sum_j |A_ij| / d_i, of which a damping that is safe follows. */
+/* max_i sum_j |A_ij| sqrt(s_i s_j), s the steps, of which a damping that is safe follows. */
 static double largest_row(const lav_solver *s) {
   double most = 0.0, sum;
   int32_t i, q;
   for (i = 0; i < s->p.n_rows; i++) {
-    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++) sum += fabs(s->a.data[q]);
-    sum *= s->p.step[i];
+    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
+      sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
+    sum *= sqrt(s->p.step[i]);
     if (sum > most) most = sum;
   }
   return most;
