@@ -13,6 +13,7 @@ from lavender.engine import check
 from lavender.engine.layout import HEAD
 from lavender.engine.state import KEPT, State
 from lavender.registry import specs
+from lavender_ext.engine.arrays import lengths
 
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
 
@@ -388,3 +389,11 @@ def test_reset_judges_nothing_and_does_not_fail():
     sim = lv.Simulation("stack", report_residual=True)
     assert "residual" in sim.step()[4]
     assert "residual" not in sim.reset()[1]
+
+
+def test_no_size_wraps_around_where_entries_are_counted():
+    size = lv.Simulation("stack").snapshot().size
+    for k in range(len(size)):
+        large = size.copy()
+        large[k] = 2**31 - 1
+        assert -1 in lengths(large), k
