@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender._later import load
 from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem, check_problem
 from lavender.registry import available, get, known
@@ -105,7 +106,7 @@ class CrossCheck:
 
     def __str__(self) -> str:
         head = (
-            "solver", "verdict", "status", "relative", "floor", "distance", "allowed", "objective", "ms", "",
+            "solver", "verdict", "status", "relative", "floor", "distance", "allowed", "objective", "ms", "what ran",
         )  # fmt: skip
         body = [
             (
@@ -186,6 +187,7 @@ def cross_check(
             rows.append(CrossCheckRow(name, REFUSED, note=reason))
             continue
         try:
+            load(*get(name).requires)  # what the time of a first solve would hold besides
             solution = uninterrupted(solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit))
         except InputError:
             raise

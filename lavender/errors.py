@@ -38,7 +38,8 @@ class UnknownName(LavenderError, KeyError):
             if near
             else f"known: {', '.join(known) or 'none'}"
         )
-        self.message = f"unknown {kind} {name!r}; {hint}"
+        what, of, owner = kind.partition(" of ")
+        self.message = f"unknown {what} {name!r}{of}{owner}; {hint}"
         super().__init__(self.message)
 
     def __str__(self) -> str:

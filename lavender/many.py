@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lavender._arrays import whole_number
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
@@ -63,9 +64,10 @@ def solve_many(
     KeyboardInterrupt
         Ctrl-C.
     """
+    if isinstance(problems, Problem):
+        raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     given = list(problems)
-    if isinstance(threads, bool) or not isinstance(threads, (int, np.integer)) or threads < 1:
-        raise InputError(f"threads is {threads!r}; a whole number from 1 is needed")
+    threads = whole_number("threads", threads, 1, None)
     if "impulse" in options:
         raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
     if impulses is not None and len(impulses) != len(given):

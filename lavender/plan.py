@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
+from lavender._arrays import number
 from lavender.errors import CapabilityError, InputError
 from lavender.problem import Problem
 from lavender.registry import get
@@ -38,8 +35,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     """
     if not isinstance(problem, Problem):
         raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
-    if isinstance(tol, bool) or not isinstance(tol, (int, float, np.number)) or not 0.0 < tol < math.inf:
-        raise InputError(f"tol is {tol!r}; a number above 0 is needed")
+    tol = number("tol", tol, above=0.0)
     if problem.m == 0:
         raise InputError("the problem has no rows: there is nothing to plan")
     reason = get("auto").refuses(problem)
@@ -47,7 +43,7 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
         raise CapabilityError(f"solver 'auto' {reason}")
     problem = problem.disk  # where it has ellipses
     reference(problem)
-    plan = made(problem, float(tol))
+    plan = made(problem, tol)
     if not plan.candidates:
         raise CapabilityError(
             f"auto has no candidate that takes a problem under the law {problem.law!r} given as {problem.operator}: "

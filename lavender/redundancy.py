@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray, IntArray
+from lavender._arrays import FloatArray, IntArray, number
 from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import Cones
@@ -171,7 +171,7 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
     """
     check_problem(problem)
-    if not 0.0 <= tol < 1.0:
+    if not number("tol", tol, low=0.0) < 1.0:
         raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
     m = problem.m
     unique = np.ones(m, bool)
@@ -221,7 +221,7 @@ def _dense_island(
 ) -> tuple[Places, list[str]]:
     """Dependent rows of a symmetric island, each of those before it where A is `sound`, and how they were found."""
     if not sound:
-        return _by_qr(a, tol), [f"QR with pivoting, {tol:.0e}"]
+        return _by_qr(_even(a), tol, 1), [f"QR with pivoting, {tol:.0e}"]
     if not roots:
         tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
@@ -246,7 +246,7 @@ def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[Places, flo
             f"A is asymmetric or indefinite and {n} of its rows hang together; the rank of at most "
             f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
         )
-    return _by_qr(a.toarray().T, tol), tol, [f"QR with pivoting, {tol:.0e}"]
+    return _by_qr(_even(a.toarray().T), tol, 1), tol, [f"QR with pivoting, {tol:.0e}"]
 
 
 def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
@@ -297,14 +297,25 @@ def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
     return whole, bare
 
 
-def _by_qr(a: FloatArray, tol: float) -> Places:
-    """Columns of `a` (unit length) that depend on the others, by QR with column pivoting."""
+def _by_qr(a: FloatArray, tol: float, power: int = 2) -> Places:
+    """Columns of `a` that depend on the others, by QR with column pivoting; `tol` of the remaining lengths ** power.
+
+    Two of a root of A, whose squares are what is new in A_ii; one of A itself.
+    """
     from scipy.linalg import qr
 
     r, order = qr(a, mode="r", pivoting=True)
-    size = np.abs(np.diagonal(r)) ** 2
+    size = np.abs(np.diagonal(r)) ** power
     rank = int(np.count_nonzero(size > tol * size[0])) if len(size) and size[0] > 0.0 else 0
     return np.sort(order[rank:])
+
+
+def _even(a: FloatArray) -> FloatArray:
+    """`a` with the largest entry of each row and column near 1, by factors that leave its rank."""
+    for axis in (0, 1, 0, 1, 0, 1, 0, 1):
+        most = np.abs(a).max(axis=axis, keepdims=True)
+        a = a / np.sqrt(np.where(most > 0.0, most, 1.0))
+    return a
 
 
 def _by_cholesky(a: FloatArray, tol: float) -> Places:

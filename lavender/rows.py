@@ -15,6 +15,7 @@ from lavender._arrays import (
     equal,
     precision_of,
     read_only,
+    shape_of,
 )
 from lavender._later import sparse as sp
 from lavender.cones import Cones
@@ -124,8 +125,8 @@ class Rows:
     precision = "float64"  # of the numbers given, no field; an instance of float32 has its own
 
     def __post_init__(self) -> None:
-        n = np.shape(self.inv_mass)[0] if np.ndim(self.inv_mass) == 1 else None
-        c = np.shape(self.normal)[0] if np.ndim(self.normal) == 2 else None
+        masses, normals = shape_of("inv_mass", self.inv_mass), shape_of("normal", self.normal)
+        n, c = masses[0] if len(masses) == 1 else None, normals[0] if len(normals) == 2 else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
         if not checks.counts_up(ptr):
             raise InputError(
@@ -136,12 +137,14 @@ class Rows:
             "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
             "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
         }  # fmt: skip
-        given = [getattr(self, name) for name in shapes]
-        if precision_of(*(x for x in given if np.size(x))) == "float32":
-            object.__setattr__(self, "precision", "float32")
         object.__setattr__(self, "joint_ptr", ptr)
+        given = []
         for name, shape in shapes.items():
-            object.__setattr__(self, name, as_array(name, getattr(self, name), shape, copy=self.copy))
+            x = getattr(self, name)
+            object.__setattr__(self, name, as_array(name, x, shape, copy=self.copy))
+            given += [x] if getattr(self, name).size else []
+        if precision_of(*given) == "float32":
+            object.__setattr__(self, "precision", "float32")
         for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
             body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
             object.__setattr__(self, name, body)

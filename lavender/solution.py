@@ -18,7 +18,7 @@ from lavender.residuals import Residual, residual
 if TYPE_CHECKING:
     from lavender.motion import MotionError
 
-__all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn"]
+__all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn", "counted"]
 
 
 class Status(str, Enum):
@@ -248,13 +248,12 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """For notebooks: what came of it, as a small table."""
-        work = ", ".join(f"{n} {k}" for k, n in self.work.items())
         facts = {
             "status": self.status.name,
             "relative residual": f"{self.residual.relative:.2e} (asked for {self.tol:.0e})",
             "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
             "floor of float64": f"{self.residual.floor:.1e}",
-            "work": work or f"{self.iterations} iterations",
+            "work": self._done,
             "time": f"{1e3 * (self.setup_time + self.solve_time):.3g} ms",
         }
         if self.contradicted:
@@ -264,15 +263,23 @@ class Solution:
     def __repr__(self) -> str:
         return f"<Solution {self}>"
 
+    @property
+    def _done(self) -> str:
+        return ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
+
     def __str__(self) -> str:
-        work = ", ".join(f"{n} {k}" for k, n in self.work.items())
         note = f"; {self.message}" if self.message else ""
         wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
         return (
-            f"{self.solver.name}: {self.status.name}, {self.residual}, "
-            f"{work or f'{self.iterations} iterations'}, "
+            f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
             f"{1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
         )
+
+
+def counted(n: int, what: str) -> str:
+    """1 sweep, 2 sweeps: a count of `work` with its name in words."""
+    what = what.replace("_", " ")
+    return f"{n} {what.removesuffix('s') if n == 1 else what}"
 
 
 def uninterrupted(solution: Solution) -> Solution:

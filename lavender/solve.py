@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, equal, number, whole_number
+from lavender._arrays import ArrayLike, FloatArray, equal, flag, number, whole_number
 from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.errors import CapabilityError, InputError, InUse, UnknownName
 from lavender.foreign import Foreign
@@ -114,7 +114,7 @@ def solve(
     """
     check_problem(problem)  # first, for those who pass A and b
     spec = get(solver)
-    if max_iter is None and time_limit is None and callback is None and not (history or options):
+    if max_iter is None and time_limit is None and callback is None and history is False and not options:
         made = solve_small(problem, spec, impulse, tol)
         if made is not None:
             return made
@@ -123,7 +123,7 @@ def solve(
     )
 
 
-def prepare(problem: Problem, solver: str, **options: Any) -> Prepared:
+def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
     """Do once the part of a solve that many solves can share: factorisation, colouring, allocation.
 
     Parameters
@@ -231,7 +231,7 @@ class Prepared:
                 "make one for each thread (lavender.prepare)"
             )
         try:
-            plain = max_iter is None and time_limit is None and callback is None and not history
+            plain = max_iter is None and time_limit is None and callback is None and history is False
             if plain and self.spec.delegates and not self.options:
                 made = solve_small(self._given if problem is None else problem, self.spec, impulse, tol)
                 if made is not None:
@@ -585,7 +585,7 @@ def check_budget(
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
-    if (callback is not None and not spec.callback) or (history and not spec.history):
+    if (callback is not None and not spec.callback) or (flag("history", history) and not spec.history):
         raise CapabilityError(
             f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
         )

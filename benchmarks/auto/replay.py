@@ -36,7 +36,7 @@ class Replayed(Candidate):
         self.tape: Any = log
         self.curve, self.level = curve, level
         self.is_finite = not self.spec.resumable
-        self.again = self.is_finite and curve.candidate != "newton over velocities"
+        self.again = self.name == "direct"
         self.done, self.seconds, self.relative, self.rest_of = 0, 0.0, 1.0, math.inf
 
     def at(self, n: int) -> tuple[float, float]:

@@ -121,7 +121,9 @@ def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
             if not paths:
-                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)})")
+                kept = Path(word) / "records.jsonl"
+                shown = f": {kept} shows its report again" if kept.is_file() else ""
+                raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
             items += [_from_file(path) for path in paths]
         elif Path(word).exists():
             items.append(replace(_from_file(Path(word)), named=True))
@@ -348,7 +350,7 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
     if problem.m == 0:
         return ("empty",)
     found = []
-    mechanical = _asymmetry(problem) <= ASYMMETRY
+    mechanical = problem.asymmetry <= ASYMMETRY
     if mechanical:
         found.append(_shape(problem))
     if _redundant(problem):
@@ -362,14 +364,6 @@ def structure_of(problem: Problem) -> tuple[str, ...]:
     if not problem.is_symmetric:
         found.append("asymmetric")
     return tuple(found)
-
-
-def _asymmetry(problem: Problem) -> float:
-    # Largest entry of A - A^T over the largest of A.
-    if problem.rows is not None or problem.is_symmetric:
-        return 0.0
-    a = problem.csr
-    return float(abs(a - a.T).max() / abs(a).max())
 
 
 def _shape(problem: Problem) -> str:

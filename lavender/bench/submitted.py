@@ -149,7 +149,7 @@ def _same(records: Records, words: Sequence[Source]) -> tuple[list[Item], list[s
     for name, info in records.cases.items():
         item = found.get(name)
         if item is None:
-            others.append(f"{name}: no such problem here; name its file or folder")
+            others.append(f"{name}: no such problem here; name its file, folder or case of the suite")
             continue
         try:
             sha = fingerprint(item.problem)

@@ -13,7 +13,7 @@ import click
 from lavender import _starting
 from lavender._version import __version__
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
-from lavender.errors import LavenderError
+from lavender.errors import LavenderError, UnknownName
 
 __all__ = ["cli", "main"]
 
@@ -41,6 +41,8 @@ class Commands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The command of that name in its module."""
         if cmd_name not in COMMANDS:
+            if not ctx.resilient_parsing:  # of a shell that completes words
+                raise UnknownName("command", cmd_name, COMMANDS)
             return None
         command: click.Command = getattr(importlib.import_module(COMMANDS[cmd_name]), cmd_name)
         return command

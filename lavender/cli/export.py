@@ -15,8 +15,8 @@ __all__ = ["export"]
 @click.argument("kind", type=click.Choice(["c", "rust", "npm"]))
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
 @click.option(
-    "--for", "records", type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="records.jsonl of a report: add its recommended solver, settings and test vectors (only with c).",
+    "--for", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
+    help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors (c only).",
 )  # fmt: skip
 @click.option("--solver", help="With --for: use this solver of the records, not the recommended one.")
 @click.option(

@@ -31,7 +31,7 @@ __all__ = ["run"]
     "parameters",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Set a parameter of the scene, e.g. n=20 or order=top_down; may be repeated.",
+    help="Set a parameter of the scene, e.g. n=20, order=top_down or solver=newton; may be repeated.",
 )
 @click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
 @click.option(

@@ -53,7 +53,8 @@ def solve(
     Exit code 0: the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always).
     1: it does not. 3: the problem is infeasible, with a certificate that the judge confirms.
     """
-    from lavender import bench
+    from lavender import bench, registry
+    from lavender._later import load
     from lavender.report.text import residual, seconds
     from lavender.residuals import WRONG
     from lavender.solve import solve as solve_problem
@@ -67,6 +68,7 @@ def solve(
     if output is not None and output.exists() and Path(item.source).exists() and output.samefile(item.source):
         raise InputError(f"--output {output} is the problem itself, which would be lost: give another file")
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
+    load(*registry.get(solver).requires)  # else the printed time would hold it
     solution = solve_problem(
         item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options
     )

@@ -18,7 +18,7 @@ import numpy as np
 from lavender.engine.check import well_formed
 from lavender.errors import InputError
 from lavender.io.stored import framed, unframed, whole_file, write_atomically
-from lavender_ext.engine.arrays import N_SIZES, lengths
+from lavender_ext.engine.arrays import lengths
 
 __all__ = ["Snapshot"]
 
@@ -76,18 +76,16 @@ class Snapshot:
             raise InputError(f"it has version {str(header['version'])[:40]}; {VERSION} is read here")
         arrays: dict[str, Any] = {}
         for (name, code), n in zip(ARRAYS, header["lengths"], strict=True):
-            if type(n) is not int or n < 0:
+            if type(n) is not int or not 0 <= n <= len(body):
                 raise ValueError("lengths")
             x = np.frombuffer(body, code, n, end)
             end += x.nbytes
             arrays[name] = x.astype(x.dtype.newbyteorder("="))
-        if end != len(body) or len(arrays["size"]) != N_SIZES or min(arrays["size"]) < 0:
-            raise ValueError("lengths")
-        used = lengths(arrays["size"])
-        if [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
-            raise ValueError("lengths")
         found = cls(**{name: header[name] for name in WORDS} | arrays)
         well_formed(found)
+        used = lengths(found.size)
+        if end != len(body) or [max(n, 1) for n in used] != [max(n, 1) for n in header["lengths"][1:]]:
+            raise ValueError("lengths")
         return found
 
 

@@ -103,8 +103,8 @@ class Stepping:
         if stepper is not None and stepper != scene.parameters.stepper:
             scene = scene.with_parameters(stepper=stepper, stepper_options={})
         self.scene = scene = copy(scene)  # what is added to it later is not in this simulation
-        self.report_residual = report_residual
-        self.report_motion = report_motion
+        self.report_residual = checked("report_residual", report_residual)
+        self.report_motion = checked("report_motion", report_motion)
         self._lock, self._inside = RLock(), False
         self.films: list[Film] = []  # that every step is added to
         self._load(scene)

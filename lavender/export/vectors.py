@@ -37,7 +37,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     Parameters
     ----------
     path : Path
-        records.jsonl of a report.
+        records.jsonl of a report, or its folder.
     solver : str, optional
         One of its records; default: the one that it recommends.
     most : int

@@ -102,7 +102,7 @@ def refusal(problem: Problem) -> str | None:
     """Why no QP backend can take this problem, before any conversion; a factorisation sees the rest."""
     if not problem.is_symmetric:
         return (
-            f"needs a symmetric A; here max|A - A^T| / max|A| = {problem.asymmetry:.1e} "
+            f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "
             "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
         )
     if problem.rows is None and problem.m:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender._arrays import FloatArray, whole_number
+from lavender._arrays import FloatArray, flag, whole_number
 from lavender._later import sparse as sp
 from lavender.cones import project
 from lavender.errors import CapabilityError, InputError, LavenderError
@@ -220,10 +220,10 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     Raises
     ------
     InputError
-        `n` or `seed` is no whole number, or negative.
+        `n` or `seed` is no whole number, or negative; `always` is neither True nor False.
     """
     check_problem(problem)
-    n, seed = whole_number("n", n), whole_number("seed", seed, high=None)
+    n, seed, always = whole_number("n", n), whole_number("seed", seed, high=None), flag("always", always)
     proof = uniqueness(problem)
     own = reference_of(problem)
     found = [(own, "auto")] if own.accepted else []

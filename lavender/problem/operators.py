@@ -28,13 +28,14 @@ SHIFT = 1e-12
 class Operators(ProblemData):
     """A, J and what kernels and the judge read, of the problem's data."""
 
-    @cached_property
+    @property
     def asymmetry(self) -> float:
-        """max |A - A^T| / max |A|; exactly 0 with J and M."""
-        if self.matrix is None:
-            return 0.0
-        gap, big = self._scan[2:]
-        return gap / big if big > 0.0 else 0.0
+        """max |A - A^T| / max |A|; exactly 0 with J and M.
+
+        Where that is rounding (1e-14), and |A_ij - A_ji| / sqrt(d_i d_j) is none, more than 1e-10, its largest: beside
+        light bodies entries of heavy ones are small.
+        """
+        return 0.0 if self.matrix is None else self._scan[2]
 
     @cached_property
     def bandwidth(self) -> tuple[int, int]:
@@ -44,12 +45,12 @@ class Operators(ProblemData):
         return sparse.bandwidth(*self._compressed[:2])
 
     @cached_property
-    def _scan(self) -> tuple[int, int, float, float]:
-        return sparse.scan(*self._compressed)
+    def _scan(self) -> tuple[int, int, float]:
+        return sparse.scan(*self._compressed, self.d)
 
     @property
     def is_symmetric(self) -> bool:
-        """A = A^T up to rounding of its entries (1e-14 of the largest)."""
+        """A = A^T up to rounding of its entries (1e-14 of the largest, and 1e-10 of sqrt(d_i d_j))."""
         return self.asymmetry <= 1e-14
 
     @cached_property

@@ -182,7 +182,7 @@ def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
     made = "lavender export c"
     if final.line.solver == "auto":
-        made += " --for RECORD, which writes the turns that options are to name"
+        made += " --for records.jsonl, which writes the turns that options are to name"
     in_c = [f"# in C ({made}): {calls}, lav_run(solver, &budget, &result);"] if calls else []
     if calls and reason:
         in_c = [f"# not in C: {reason}"]

@@ -505,7 +505,7 @@ class Scene:
     ) -> tuple[FloatArray, FloatArray, float]:
         if anchor is not None or axis is not None:
             raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
-        pa, pb = (self._anchor(label, i, p) for i, p in zip(bodies, (a, b), strict=True))
+        pa, pb = (self._anchor(label, *given) for given in zip("ab", bodies, (a, b), strict=True))
         with np.errstate(over="ignore"):
             far = arithmetic.norm(pb - pa)
         length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
@@ -513,9 +513,9 @@ class Scene:
             raise InputError(f"{label} has length 0; use a ball joint")
         return pa, pb, length
 
-    def _anchor(self, label: str, body: int, point: Any) -> FloatArray:
+    def _anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
         if point is not None:
-            return numbers(f"anchor of {label} [m]", point, 3)
+            return numbers(f"anchor_{side} of {label} [m]", point, 3)
         if body < 0:
             raise InputError(f"{label}: the world has no centre; give the anchor at its side")
         return self.bodies[body].position

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender.errors import InputError
+from lavender._arrays import whole_number
 from lavender.registry import SolverSpec
 from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_OPTION, Accelerated
 
@@ -23,10 +23,7 @@ class Anderson(Accelerated):
     memory: int = 5
 
     def __post_init__(self) -> None:
-        if not isinstance(self.memory, int) or not 1 <= self.memory <= LARGEST_MEMORY:
-            raise InputError(
-                f"memory is {self.memory!r}; a whole number from 1 to {LARGEST_MEMORY} is needed"
-            )
+        whole_number("memory", self.memory, 1, LARGEST_MEMORY)
 
     @property
     def _memory(self) -> int:

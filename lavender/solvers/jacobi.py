@@ -1,9 +1,9 @@
 """Damped projected Jacobi: every block is updated with the same w = A lambda - b.
 
-    lambda <- Pi(lambda - omega w / d),   omega = min(1, 1.6 / max_i sum_j |A_ij| / d_i) by default
+    lambda <- Pi(lambda - omega w / d),   omega = min(1, 1.6 / max_i sum_j |A_ij| / sqrt(d_i d_j)) by default
 
-The row sum bounds the largest eigenvalue L of D^-1 A, and symmetric positive semidefinite A needs
-omega < 2 / L. Without damping (omega = 1), k coincident contacts multiply the error by k - 1 and never
+The row sum, the same in every unit, bounds the largest eigenvalue L of D^-1 A, and symmetric positive semidefinite A
+needs omega < 2 / L. Without damping (omega = 1), k coincident contacts multiply the error by k - 1 and never
 converge for k >= 2.
 """
 
@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender._arrays import FloatArray, number
 from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
@@ -45,10 +44,8 @@ class Jacobi:
     omega: float | None = None
 
     def __post_init__(self) -> None:
-        if self.omega is not None and not 0.0 < self.omega < np.inf:
-            raise InputError(
-                f"omega is {self.omega}; a number above 0 is needed, or None for the safe damping"
-            )
+        if self.omega is not None:
+            number("omega", self.omega, above=0.0)
 
     def prepare(self, problem: Problem) -> JacobiState:
         return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)
@@ -69,10 +66,11 @@ class Jacobi:
 
 @np.errstate(all="ignore")  # what overflows is judged
 def safe_damping(problem: Problem) -> float:
-    """min(1, 1.6 / max_i sum_j |A_ij| s_i), s the step of row i [kg] (1/d_i, on tangents 1/lambda_max)."""
+    """min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)), s the steps [kg] (1/d, on tangents 1/lambda_max)."""
     if problem.m == 0:
         return 1.0
-    bound = float((abs(problem.csr) @ np.ones(problem.m) * problem.csr_data.step).max())
+    root = np.sqrt(problem.csr_data.step)
+    bound = float((abs(problem.csr) @ root * root).max())
     return min(1.0, 1.6 / bound) if bound > 0.0 else 1.0
 
 

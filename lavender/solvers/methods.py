@@ -5,7 +5,6 @@ rest = n log(now / tol) / log(before / now)         sweeps left, by the contract
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +14,9 @@ from lavender.deadline import CHUNK_TIME, Deadline
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
-from lavender.solvers.costs import BOTH_WAYS, METHODS, TABLE, Cost, Costs
+from lavender.solvers.costs import METHODS, TABLE, Cost, Costs
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
-from lavender.solvers.newton_systems import general
 from lavender.solvers.schedule import BELIEVED, remainder
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
@@ -67,13 +65,20 @@ class Candidate:
 
     def run(self, work: float, others: float) -> bool:
         self.others = others
-        n = self.steps(BELIEVED * work if self.again else work)
+        n = self.steps(self.stretch * work)
         if n <= 0:
             return False
         before = self.log.best
         claim = self.turn(n)
         self.log.note(self.shown, claim, before)
         return self.has_done(claim)
+
+    @property
+    def stretch(self) -> float:
+        """The longest turn, relative to the remaining cost: what factors has little to show before its end."""
+        if not self.is_finite:
+            return 1.0
+        return self.costs.sure if self.again else BELIEVED
 
     def has_done(self, claim: Claim) -> bool:
         """Count what a turn took and what is left; return whether it may have another."""
@@ -262,10 +267,12 @@ class Relaxation(Resumed):
             self.shown_by = "nncg"
             self.solver = get("nncg").load()(**METHODS["nncg"][1])
             self.state = self.solver.prepare(self.log.problem)
-        if not self.slow:
-            return super().turn(n)
-        claim = super().turn(max(1, n // int(BOTH_WAYS)))
-        return replace(claim, iterations=min(n, int(BOTH_WAYS) * claim.iterations))
+        return super().turn(n)
+
+    def has_done(self, claim: Claim) -> bool:
+        more = super().has_done(claim)
+        self.cost = self.costs.of("nncg")  # which continues
+        return more
 
     shown_by = "relaxation"
 
@@ -298,72 +305,55 @@ class Relaxation(Resumed):
         return "relaxation: anderson" if self.shown_by == "relaxation" else "nncg"
 
 
-class Velocities(Candidate):
-    """Newton's method over generalised velocities, continued where its steps were used up."""
+class Newton(Candidate):
+    """Newton's method, continued where its steps were used up, from the system whose factor was counted."""
 
     is_finite = True
-    begun = False
 
     def turn(self, n: int) -> Claim:
         log = self.log
-        if not self.begun:
+        if self.state is None:
+            self.solver: Any = self.spec.load()(**METHODS[self.name][1])
+            self.state = self.prepare()
             self.impulse = log.impulse.copy()
-        kernel = self.costs.structure.kernel
-        claim = general.run(log.problem, kernel, self.impulse, n, log.tol, log.time_left, self.begun)
-        self.begun = True
+        claim: Claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left)
         _offer(log, self.impulse)
-        if claim.status is Status.MAX_ITERATIONS and not kernel.waits:
-            return Claim(Status.STALLED, claim.iterations, claim.work)
         return claim
 
+    def prepare(self) -> NewtonState:
+        problem, structure = self.log.problem, self.costs.structure
+        if self.over_velocities:
+            return NewtonState(problem, None, structure.kernel)
+        rows = self.name == "newton over rows" or problem.rows is None
+        if rows != (structure.system.form == "impulse"):
+            prepared: NewtonState = self.solver.prepare(problem)
+            return prepared
+        return NewtonState(problem, structure.system if structure.system.solve.m else None)
 
-class Finite(Candidate):
-    """A solver that begins anew in each turn, from the best impulse."""
+    @property
+    def over_velocities(self) -> bool:
+        """Generalised ones."""
+        return self.name == "newton" and self.log.problem.generalized is not None
+
+
+class Direct(Candidate):
+    """Begins anew in each turn, from the best impulse; a linear system is solved no closer than tol."""
 
     again = is_finite = True
 
     def turn(self, n: int) -> Claim:
         log = self.log
-        solver = self.make()
-        if self.state is None:
-            self.state = self.prepare(solver)
-        impulse = self.log.impulse.copy()
-        claim: Claim = solver.run(self.state, impulse, n, log.tol, log.time_left)
+        solver: Any = self.spec.load()()
+        if log.problem.law == "linear":
+            solver = Enough()
+        elif self.spent == 0.0:
+            solver = Impatient()
+        impulse = log.impulse.copy()
+        # after a turn the state's rows are those of the end; the problem keeps their order
+        claim: Claim = solver.run(solver.prepare(log.problem), impulse, n, log.tol, log.time_left)
         _offer(log, impulse)
-        return claim
-
-    def make(self) -> Any:
-        return self.spec.load()(**METHODS[self.name][1])
-
-    def prepare(self, solver: Any) -> Any:
-        return solver.prepare(self.log.problem)
-
-
-class Newton(Finite):
-    """From the system whose factor was counted."""
-
-    def prepare(self, solver: Any) -> Any:
-        system = self.costs.structure.system
-        rows = self.name == "newton over rows" or self.log.problem.rows is None
-        if rows != (system.form == "impulse"):
-            return super().prepare(solver)
-        return NewtonState(self.log.problem, system if system.solve.m else None)
-
-
-class Direct(Finite):
-    """A linear system no closer than tol."""
-
-    def make(self) -> Any:
-        if self.log.problem.law == "linear":
-            return Enough()
-        return super().make() if self.spent > 0.0 else Impatient()
-
-    def turn(self, n: int) -> Claim:
-        self.state = None  # after a turn its rows are those of the end; the problem keeps their order
-        first = self.spent == 0.0 and self.log.problem.law == "lcp"
-        claim = super().turn(n)
         # Stuck, or singular where rows are free: with more shifts and descent it takes far longer.
-        self.patient = first and claim.status is Status.STALLED
+        self.patient = self.spent == 0.0 and log.problem.law == "lcp" and claim.status is Status.STALLED
         return claim
 
 
@@ -408,8 +398,6 @@ def make(
     for name in names:
         spec = get(METHODS[name][0])
         kind = KINDS.get(name, KINDS.get(spec.name, Resumed))
-        if name == "newton" and log.problem.generalized is not None:
-            kind = Velocities
         made = kind(name, log, costs, spec)
         if made.rest < np.inf:
             found.append(made)
@@ -431,6 +419,11 @@ def first_turn(found: list[Candidate], planned: tuple[str, int] | None = None) -
                     cost.total, cost.setup + planned[1] * cost.each, *(c.rest for c in found)
                 )
         found.sort(key=lambda candidate: candidate.name != planned[0])
-    elif found and isinstance(found[0], Velocities) and found[0].costs.structure.goes_first:
+    elif (
+        found
+        and isinstance(found[0], Newton)
+        and found[0].over_velocities
+        and found[0].costs.structure.goes_first
+    ):
         found[0].count()
         found[0].rest = min(c.rest for c in found)

@@ -34,7 +34,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
-from lavender.solution import Claim, Status
+from lavender.solution import Claim, Status, counted
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.small import NEWTON
@@ -60,6 +60,7 @@ class NewtonState:
     problem: Problem
     system: System | None  # None where nothing moves
     general: Any = None  # lavender_ext.generalized.newton.Newton, in generalised coordinates
+    begun: bool = False  # by `turn`
 
 
 @dataclass(frozen=True)
@@ -131,6 +132,22 @@ class Newton:
             return self._run_general(state, impulse, max_iter, tol, time_limit)
         return self._run_system(problem, system, impulse, max_iter, tol, time_limit)
 
+    @np.errstate(all="ignore")  # what overflows is judged
+    def turn(
+        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+    ) -> Claim:
+        """n steps, or a few more, on from the end of the turn before; the first begins at `impulse` (m,), in place.
+
+        Over generalised velocities nothing follows over rows.
+        """
+        again, state.begun = state.begun, True
+        if state.general is None:
+            return self._run_system(state.problem, state.system, impulse, n, tol, time_limit, again, True)
+        claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, again)
+        if claim.status is Status.MAX_ITERATIONS and not state.general.waits:
+            return Claim(Status.STALLED, claim.iterations, claim.work)
+        return claim
+
     def _run_general(
         self, state: NewtonState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
@@ -168,23 +185,26 @@ class Newton:
         max_iter: int,
         tol: float,
         time_limit: float | None,
+        again: bool = False,
+        more: bool = False,
     ) -> Claim:
         if system is None:
             system = make_system(problem, "impulse")
             impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = worked = 0
-        if self.form == "auto" and problem.rows is not None:
+        before = system.solve.factorisations if again else 0
+        if self.form == "auto" and problem.rows is not None and not again:
             tried = warm_start(problem, impulse, tol, max_iter, time_limit)
             claim, sweeps, worked = claim_of(tried), tried.sweeps, tried.factorisations
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         max_iter -= worked
-        status, certificate = _turns(problem, system, impulse, max_iter, tol, time_limit)
+        status, certificate = _turns(problem, system, impulse, max_iter, tol, time_limit, again, more)
         solve = system.solve
-        factorisations = worked + solve.factorisations
+        factorisations = worked + solve.factorisations - before
         message = ", ".join(
-            f"{count} {what}" for count, what in zip(solve.counts, COUNTED, strict=True) if count
+            counted(count, what) for count, what in zip(solve.counts, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
@@ -197,12 +217,19 @@ def _turns(
     max_iter: int,
     tol: float,
     time_limit: float | None,
+    again: bool = False,
+    more: bool = False,
 ) -> tuple[Status, FloatArray | None]:
-    """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between."""
+    """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between.
+
+    `again`: on from where an earlier call has stopped; `more`: a later one may go on from where this one stops.
+    """
     deadline = Deadline(time_limit)
     solve, certificate = system.solve, None
     late = interrupted = False
-    solve.start(impulse, tol, max_iter)
+    last = max_iter + (solve.factorisations if again else 0)
+    if not again:
+        solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
     try:
         while True:
             before = solve.factorisations
@@ -213,7 +240,7 @@ def _turns(
                 if left <= system.seconds:
                     late = True
                     solve.stop()
-            end = solve.step(max(1, int(most)))
+            end = solve.step(max(1, int(min(most, last - before) if more else most)))
             if solve.factorisations > before:
                 system.took(watch.seconds / (solve.factorisations - before))
             if end == OUTCOMES["certificate"]:
@@ -222,7 +249,7 @@ def _turns(
                     solve.prove()
                 else:
                     certificate = None
-            elif end != OUTCOMES["more"]:
+            elif end != OUTCOMES["more"] or (more and solve.factorisations >= last):
                 break
     except KeyboardInterrupt:
         interrupted = True  # the best iterate goes back all the same
@@ -233,10 +260,12 @@ def _turns(
         return Status.INTERRUPTED, None
     if certificate is not None:
         return Status.INFEASIBLE, certificate
+    if end == OUTCOMES["more"]:
+        return Status.MAX_ITERATIONS, None
     if end == OUTCOMES["spent"]:
-        return (
-            Status.TIME_LIMIT if late and solve.factorisations < max_iter else Status.MAX_ITERATIONS
-        ), None
+        if more and not late:
+            return Status.STALLED, None  # none may follow
+        return (Status.TIME_LIMIT if late and solve.factorisations < last else Status.MAX_ITERATIONS), None
     return _ENDS[end], None
 
 

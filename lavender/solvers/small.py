@@ -20,7 +20,7 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
-from lavender.solution import Claim, Status, Turn
+from lavender.solution import Claim, Status, Turn, counted
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.weights import READ, of_law, rates, sweep_cost
@@ -226,7 +226,7 @@ def said(name: str, work: Mapping[str, int]) -> str:
     between = " "
     for kind, count in work.items():
         if count:
-            name += f"{between}{count} {kind}"
+            name += between + counted(count, kind)
             between = ", "
     return name
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number
 from lavender.errors import InputError
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
@@ -28,7 +28,7 @@ class SOR(Sweeping):
     omega: float = 1.5
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.omega < 2.0:
+        if not 0.0 < number("omega", self.omega) < 2.0:
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
     def run(

@@ -67,6 +67,17 @@ def sparse_factor(nnz: int, m: int) -> float:
     return SPARSE * nnz * (1.0 + m / SPARSE_ROWS)
 
 
+def body_factor(work: float) -> float:
+    """One factor over bodies of at least so many multiply-adds [ns]."""
+    return min(BLOCK * work, PANEL * max(work, PANELS))
+
+
+def row_factor(m: int, entries: float) -> float:
+    """One factor by panels of a matrix of so many entries, without fill-in [ns]."""
+    below = 0.5 * (entries / m - 1.0)
+    return FILLED + FILLED_ENTRY * entries + FILLED_WORK * m * 0.5 * below**2
+
+
 def newton_factor(system: System) -> float:
     """One symmetric factor of Newton's matrix [ns]."""
     if not isinstance(system, MatrixSystem):

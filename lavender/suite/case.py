@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ParamSpec
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, number
 from lavender.errors import InputError, UnknownName
 from lavender.problem import Problem
 
@@ -128,16 +128,12 @@ def _check(name: str, parameter: inspect.Parameter, value: Any) -> Any:
         if not isinstance(value, str):
             raise InputError(f"{what}; a word is needed")
         return value
-    if isinstance(value, (bool, str)) or not hasattr(value, "__float__"):
-        raise InputError(f"{what}; a number is needed")
-    number = float(value)
-    if number != number or abs(number) == float("inf"):
-        raise InputError(f"{what}; a finite number is needed")
+    found = number(f"{name}: {parameter.name}", value)
     if wanted is int:
-        if number != int(number) or not 0 <= number <= MAX_SIZE:
+        if found != int(found) or not 0 <= found <= MAX_SIZE:
             raise InputError(f"{what}; a whole number from 0 to {MAX_SIZE} is needed")
-        return int(number)
-    return number
+        return int(found)
+    return found
 
 
 def _text(name: str, values: Mapping[str, Any], given: frozenset[str]) -> str:

@@ -1,5 +1,5 @@
 """Rows of a compressed sparse row matrix: the products that sweeps and the judge share."""
-from libc.math cimport fabs
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 
@@ -93,13 +93,21 @@ cdef inline void by_columns(int32_t m, int32_t n, const int32_t* indptr, const i
             ptr[j] += 1
 
 
-cdef inline void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_t* band, double* size) noexcept nogil:
-    """Lower and upper bandwidth into band[2]; max |A - A^T|, max |A| into size[2]; columns are sorted.
+cdef inline double own_share(double gap, double d_i, double d_j) noexcept nogil:
+    """|A_ij - A_ji| / sqrt(d_i d_j): of rows of heavy bodies, too, whose entries are small."""
+    return gap / sqrt(d_i) / sqrt(d_j) if gap > 0.0 else 0.0
+
+
+cdef inline double scan_entries(const csr_t* a, const double* d, int32_t n, int32_t* cursor,
+                                int32_t* band) noexcept nogil:
+    """Asymmetry of A; its lower and upper bandwidth into band[2]; columns are sorted.
+
+        max |A - A^T| / max |A|;    where that is rounding, up to 1e-14:  max |A_ij - A_ji| / sqrt(d_i d_j) above 1e-10
 
     cursor (n) is scratch: the first entry of row j that no earlier row has looked up as its mirror image.
     """
     cdef int32_t i, j, q
-    cdef double x, gap = 0.0, big = 0.0
+    cdef double x, gap = 0.0, big = 0.0, own = 0.0
     band[0] = 0
     band[1] = 0
     for i in range(n):
@@ -118,19 +126,20 @@ cdef inline void scan_entries(const csr_t* a, int32_t n, int32_t* cursor, int32_
                 big = x
             j = a.indices[q]
             if j < i:
-                if q >= cursor[i] and x > gap:
-                    gap = x                             # no mirror image above the diagonal
+                if q >= cursor[i]:                      # no mirror image above the diagonal
+                    gap = max(gap, x)
+                    own = max(own, own_share(x, d[i], d[j]))
                 continue
             if j == i:
                 continue
             while cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] < i:
-                if fabs(a.data[cursor[j]]) > gap:
-                    gap = fabs(a.data[cursor[j]])
+                gap = max(gap, fabs(a.data[cursor[j]]))
+                own = max(own, own_share(fabs(a.data[cursor[j]]), d[j], d[a.indices[cursor[j]]]))
                 cursor[j] += 1
             if cursor[j] < a.indptr[j + 1] and a.indices[cursor[j]] == i:
                 x = fabs(a.data[q] - a.data[cursor[j]])
                 cursor[j] += 1
-            if x > gap:
-                gap = x
-    size[0] = gap
-    size[1] = big
+            gap = max(gap, x)
+            own = max(own, own_share(x, d[i], d[j]))
+    gap = gap / big if big > 0.0 else 0.0
+    return own if gap <= 1e-14 and own > 1e-10 else gap

@@ -199,22 +199,22 @@ def bandwidth(const int32_t[::1] indptr, const int32_t[::1] indices):
     return lower, upper
 
 
-def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
-    """(lower bandwidth, upper bandwidth, max |A - A^T|, max |A|) of a canonical CSR matrix."""
+def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, const double[::1] d):
+    """(lower bandwidth, upper bandwidth, asymmetry) of a canonical CSR matrix with the metric d (n,)."""
     cdef int32_t n = <int32_t>indptr.shape[0] - 1
     cdef int32_t band[2]
-    cdef double size[2]
+    cdef double asymmetry
     cdef csr_t a
     cdef int32_t[::1] cursor
     if n <= 0 or data.shape[0] == 0:
-        return 0, 0, 0.0, 0.0
+        return 0, 0, 0.0
     a.indptr = &indptr[0]
     a.indices = &indices[0]
     a.data = &data[0]
     cursor = np.empty(n, np.int32)
     with nogil:
-        scan_entries(&a, n, &cursor[0], band, size)
-    return band[0], band[1], size[0], size[1]
+        asymmetry = scan_entries(&a, &d[0], n, &cursor[0], band)
+    return band[0], band[1], asymmetry
 
 
 def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):

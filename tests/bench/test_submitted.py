@@ -88,7 +88,7 @@ def test_a_problem_that_differs_is_told_and_the_others_are_verified(tmp_path):
     assert done.exit_code == 1
     told = " ".join(done.output.split())
     assert "NOT VERIFIED: two: another problem here, hash " in told
-    assert "NOT VERIFIED: three: no such problem here; name its file or folder" in told
+    assert "NOT VERIFIED: three: no such problem here; name its file, folder or case of the suite" in told
     found = bench.verify(bench.read(path), [mine], isolate=False)
     assert {v.record.case for v in found.lines if v.agrees} == {"one"}
     assert {v.record.case for v in found.lines if v.agrees is None} == {"two", "three"}
@@ -112,5 +112,5 @@ def test_what_cannot_be_verified_is_an_error_or_a_note(submitted, tmp_path):
     assert {v.note for v in found.lines} == {"of_another_world: not registered here"}
     run = next(iter(records.runs.values()))
     records.runs[run.run] = replace(run, plan={"levels": [-1.0]})
-    with pytest.raises(lv.InputError, match=r"level -1\.0"):
+    with pytest.raises(lv.InputError, match="level is -1"):
         bench.verify(records)

@@ -169,10 +169,10 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--solvers", "pgs", "stak(n=8)"), "unknown case 'stak'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
-        (("report", "--levels", "0"), "level 0.0 must be"),
+        (("report", "--levels", "0"), "level is 0;"),
         (("report", "--budgets", "-4"), "budget is -4"),
         (("report", "--repeats", "0"), "repeats is 0"),
-        (("report", "--time-limit", "-1"), "time limit is -1.0"),
+        (("report", "--time-limit", "-1"), "time_limit is -1"),
         (("report", "--orders", "sideways"), "sideways"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
@@ -197,7 +197,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
-        (("nonsense",), "No such command"),
+        (("nonsense",), "unknown command 'nonsense'"),
+        (("slove", "stack(n=4)"), "did you mean 'solve'"),
+        (("run", "stack", "--set", "m=3"), "unknown parameter 'm' of scene 'stack'"),
         (("report", "random_spd", "--campaign", "--seeds", "0:1000000000000"), "1000000000000 seeds"),
         (("solve", "random_spd(n=10000000)"), "not enough memory"),  # 8e14 bytes
         *(
@@ -211,6 +213,27 @@ def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
     assert code == 2
     assert sign in err
     assert "Traceback" not in err + out
+
+
+def test_the_time_of_a_solve_holds_no_loading_of_modules():
+    code = (
+        "import sys, lavender; s = sys.modules['lavender.solve']; real = s.solve\n"
+        "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
+        "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("True\n")
+
+
+def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_told(lavender, tmp_path):
+    model, folder = tmp_path / "model.xml", tmp_path / "reported"
+    model.write_text("<mujoco/>")
+    folder.mkdir()
+    (folder / "records.jsonl").write_text("")
+    code, _, err = lavender("solve", model)
+    assert (code, err.count("\n")) == (2, 1) and "`lavender record` writes such files" in err
+    code, _, err = lavender("report", folder)
+    assert code == 2 and f"{folder / 'records.jsonl'} shows its report again" in err
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 broken", b"\x89HDF broken"])

@@ -223,6 +223,8 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
     scene = lv.Scene("bridge", n=4, solver="caller", substeps=3, solver_iterations=1)
     sim, twin = lv.Simulation(scene), lv.Simulation(scene)
     trajectory(sim, 3), trajectory(twin, 3)
+    for one in (sim, twin):
+        one.state.head[HEAD["step"]] = 2**31 - 1  # substeps are counted in 32 bits, which begin again
     before = sim.state.copy()
     solver = sim_solver(scene)
     solver.now, solver.at = staticmethod(stop), solver.runs + at
@@ -353,6 +355,14 @@ def test_coincident_spheres_touch_or_are_refused():
     # 92,683 of them are 2^32 and 55,607 pairs: what counts in 32 bits takes them for few
     pytest.importorskip("resource")
     python("-X", "faulthandler", "-c", COINCIDENT)
+
+
+def test_counts_of_32_bits_begin_again():
+    sim = after(1, "stack", substeps=2)
+    head = sim.state.head
+    head[[HEAD["step"], HEAD["rebuilds"]]], head[HEAD["pairs_valid"]] = 2**31 - 1, 0
+    sim.step()
+    assert (head[HEAD["step"]], head[HEAD["rebuilds"]]) == (1, 0)
 
 
 def test_room_for_more_contacts_than_memory_is_refused():

@@ -1,5 +1,8 @@
 """The problem inside a step: the same bits as the step, the judge's values, snapshots, other solvers."""
 
+import hashlib
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from worked import after
@@ -7,6 +10,8 @@ from worked import after
 import lavender as lv
 from lavender.engine import stepping
 from lavender.engine.layout import HEAD, SETTING
+from lavender.engine.snapshot import MAGIC
+from lavender.io.stored import framed, unframed
 from lavender.scene.scene import SCENE_ORDERS
 
 SCENES = {
@@ -213,10 +218,38 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
     path.write_bytes(data[:-40])
     with pytest.raises(lv.InputError, match="damaged"):
         sim.load(path)
+    # What is cut or lengthened inside a file whose checksum is right.
+    header, end = unframed(data, MAGIC, 2**20)
+    said, arrays = header["lengths"], bytes(data[end:-32])
+    for lengths, rest in (
+        (said, arrays[:-8]),
+        (said, arrays + bytes(8)),
+        ([*said[:3], said[3] - 1], arrays[:-8]),
+        ([*said[:3], said[3] + 1], arrays + bytes(8)),
+        ([said[0] - 1, *said[1:]], arrays[4:]),
+        ([*said[:3], -1], arrays),
+        ([10**30, *said[1:]], arrays),
+        ([*said[:3], float(said[3])], arrays),
+    ):
+        body = framed(MAGIC, {**header, "lengths": lengths}) + rest
+        path.write_bytes(body + hashlib.sha256(body).digest())
+        with pytest.raises(lv.InputError, match=r"does not hold what its header says|size has 9 entries"):
+            sim.load(path)
+    shot = sim.snapshot()
+    for name in ("real", "index", "keys"):
+        with pytest.raises(lv.InputError, match="do not fit its sizes"):
+            sim.restore(replace(shot, **{name: getattr(shot, name)[:-1]}))
+    with pytest.raises(lv.InputError, match="sizes are not those of this scene"):
+        sim.restore(replace(lv.Simulation(lv.Scene("stack", n=4)).snapshot(), fingerprint=shot.fingerprint))
     with pytest.raises(lv.InputError, match="cannot read"):
         sim.load(tmp_path / "missing")
     with pytest.raises(lv.InputError, match="Snapshot is needed"):
         sim.restore({"x": 1})
+    alone = lv.Scene()  # no pair, no contact: arrays of one entry or none
+    alone.add_sphere()
+    one = after(2, alone)
+    one.save(path)
+    one.load(path)
 
 
 def test_substeps_are_steps_of_a_fraction():

@@ -100,6 +100,20 @@ def test_a_ball_on_a_rod_swings_with_the_period_of_the_pendulum(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_no_stepper_sees_the_unit_of_mass(name):
+    """Powers of four, whose roots are exact, change no bit."""
+    seen = []
+    for unit in (1.0, 2.0**-40, 2.0**40):
+        scene, before = sliding(name, mass=unit), -1
+        for i in range(4):
+            link = scene.add_box((0.1, 0.1, 0.4), unit * 8.0 ** (i == 3), position=(3.0 + 0.5 * i, 0, 2.0))
+            scene.add_joint("ball", before, link, anchor=(2.75 + 0.5 * i, 0, 2.0))
+            before = link
+        seen.append(run(scene, 60)[1]["positions"].tobytes())
+    assert seen[0] == seen[1] == seen[2]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_boxes_stand_for_ten_seconds(name):
     # xpbd without warm starts: few of them, in short substeps
     more = {"n": 3, "substeps": 20, "solver_iterations": 1} if name == "xpbd" else {}

@@ -82,12 +82,8 @@ def test_m_is_refused_where_it_is_no_mass_matrix():
         lv.Generalized(jac, np.triu(good), np.zeros(2), ["hip", "knee"])
     with pytest.raises(lv.InputError, match="not symmetric"):
         lv.Generalized(jac, sp.csr_array(np.triu(good)), np.zeros(2))
-    with pytest.raises(lv.InputError, match="must be finite"):
-        lv.Generalized(jac, [[np.nan, 0.0], [0.0, 1.0]], np.zeros(2))
     with pytest.raises(lv.InputError, match=r"J has shape \(1, 3\); \(any, 2\) is needed, as M has 2"):
         lv.Generalized(np.ones((1, 3)), good, np.zeros(2))
-    with pytest.raises(lv.InputError, match=r"v_free .* has shape \(3,\)"):
-        lv.Generalized(jac, good, np.zeros(3))
     with pytest.raises(lv.InputError, match="a square matrix"):
         lv.Generalized(jac, np.ones((2, 3)), np.zeros(2))
     with pytest.raises(lv.InputError, match="1 names for 2"):
@@ -272,6 +268,8 @@ def test_many_start_where_they_are_told():
     warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
     assert warm[0].iterations == 0
     assert warm[1].iterations > 0
+    with pytest.raises(lv.InputError, match="one Problem; a list"):
+        lv.solve_many(problem)
     with pytest.raises(lv.InputError, match="1 impulses for 2"):
         lv.solve_many([problem, problem], impulses=[None])
     with pytest.raises(lv.InputError, match="threads is 0"):

@@ -74,6 +74,27 @@ def test_rank_is_that_of_numpy(seed):
         )
 
 
+def test_a_row_that_adds_little_is_one_also_where_a_is_not_symmetric():
+    new = 1e-8  # 2e-8 of A_ii, far above tol
+    for skew in (0.0, 1e-12):
+        assert (
+            redundancy(lv.Problem.linear([[1.0, 1.0 - new], [1.0 - new + skew, 1.0]], [1.0, 1.0])).rank == 2
+        )
+
+
+@pytest.mark.parametrize("kind", ["asymmetric", "indefinite"])
+def test_the_rank_of_a_matrix_is_that_of_exact_numbers_whatever_the_units_of_its_rows(kind):
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        m, r = rng.integers(1, 9, 2)
+        g = rng.integers(-3, 4, (m, r)).astype(float)
+        h = rng.integers(-2, 3, (r, m)) if kind == "asymmetric" else rng.choice([-1.0, 1.0], r)[:, None] * g.T
+        size = 2.0 ** rng.integers(-20, 21, m)
+        a = size[:, None] * (g @ h) * (1.0 if kind == "asymmetric" else size)
+        truth = len(eliminate([[Fraction(x) for x in row] for row in a.tolist()], m))
+        assert redundancy(lv.Problem.linear(a, np.zeros(m))).rank == truth, a
+
+
 @given(seed=seeds)
 def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
     rng = np.random.default_rng(seed)

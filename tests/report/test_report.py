@@ -231,7 +231,7 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert said.code == (  # records of old: of prepare and solve
         'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call',
         (
-            "# in C (lavender export c --for RECORD, which writes the turns that options are to name): "
+            "# in C (lavender export c --for records.jsonl, which writes the turns that options are to name): "
             "lav_default_options(LAV_AUTO, &options), lav_default_budget(&budget), budget.tol = 1e-06, "
             "budget.iterations = 1000000, lav_run(solver, &budget, &result);"
         ),

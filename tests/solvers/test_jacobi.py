@@ -32,6 +32,14 @@ def test_safe_damping_is_below_the_limit_of_convergence(seed):
 
 
 @given(seed=seeds)
+def test_the_damping_is_the_same_in_every_unit(seed):
+    problem, rng = random_lcp(seed, m=12), np.random.default_rng(seed)
+    size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
+    other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
+    assert safe_damping(other) == pytest.approx(safe_damping(problem), rel=1e-12)
+
+
+@given(seed=seeds)
 def test_the_energy_falls_with_every_safe_sweep(seed):
     problem = random_lcp(seed, m=10)
     a, b = problem.dense(), problem.b

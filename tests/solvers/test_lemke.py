@@ -98,8 +98,12 @@ def test_budgets():
     cut = [lv.solve(problem, "lemke", max_iter=n).residual.relative for n in range(1, 40, 2)]
     assert max(cut) <= 1.0, "no worse than doing nothing"
     assert min(cut) < 0.5, "where the path stands, not the start"
-    with pytest.raises(lv.CapabilityError, match="dense dictionary"):
-        lv.solve(lv.Problem.lcp(sp.eye_array(5000, format="csr"), np.ones(5000)), "lemke")
+    for cones, words in (
+        (lv.Cones.contacts(0.0, 0, count=5001), "5001: use"),
+        (lv.Cones.contacts(0.5, count=1667, shape="box"), r"5001, its friction as bounded rows \d+: use"),
+    ):
+        with pytest.raises(lv.CapabilityError, match=words):
+            lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
 
 
 @given(

@@ -81,6 +81,10 @@ def test_an_unknown_name_tells_the_nearest():
     for senseless in ("", None, 7, ["pgs"]):
         with pytest.raises(lv.UnknownName):
             lv.get(senseless)
+    with pytest.raises(
+        lv.UnknownName, match="unknown option 'max_iters' of solver 'pgs'; did you mean 'max_iter'"
+    ):
+        lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "pgs", max_iters=3)
 
 
 def test_known_tells_of_everybody_and_available_of_those_that_can():

@@ -32,10 +32,15 @@ class Fake:
         return True
 
 
-class Anew(Fake):
-    """The same for a method that begins anew in each turn."""
+class Long(Fake):
+    """The same for a method with longer turns."""
 
-    spent_before = 0.0
+    def run(self, work, others):
+        return super().run(BELIEVED * work, others)
+
+
+class Anew(Fake):
+    """The same for one that also begins anew in each turn."""
 
     def run(self, work, others):
         assert self.counted and not self.over
@@ -66,21 +71,21 @@ def test_all_turns_together_are_bounded_by_any_method_that_ends(made, guesses):
     assert total <= bound * (1.0 + 1e-9)
 
 
-@given(made=methods, anew=st.lists(st.booleans(), min_size=5, max_size=5))
+@given(made=methods, kinds=st.lists(st.sampled_from([Fake, Long, Anew]), min_size=5, max_size=5))
 @settings(max_examples=300)
-def test_methods_that_begin_anew_count_for_their_longer_turns(made, anew):
+def test_methods_with_longer_turns_count_for_them(made, kinds):
     """Without promises; what a method itself takes counts with the runs that were cut short."""
     if all(needs == inf for _, needs, _ in made):
         made = [*made[:-1], (made[-1][0], 1.0, made[-1][2])]
-    fakes = [(Anew if a else Fake)(e, c, []) for (e, c, _), a in zip(made, anew, strict=False)]
+    fakes = [kind(e, c, []) for (e, c, _), kind in zip(made, kinds, strict=False)]
     race(list(fakes), lambda: any(f.over for f in fakes))
     (winner,) = (f for f in fakes if f.over)
-    others = sum((1.0 + BELIEVED) if isinstance(f, Anew) else 2.0 for f in fakes if f is not winner)
+    others = sum(2.0 if type(f) is Fake else 1.0 + BELIEVED for f in fakes if f is not winner)
     for j in fakes:
         if j.needs < inf:
             # r_j never exceeds what was expected, or twice its last run, which is shorter than it needs.
             most = max(j.expected, 2.0 * j.needs)
-            own = BELIEVED * most + most if isinstance(winner, Anew) else 2.0 * most
+            own = 2.0 * most if type(winner) is Fake else (1.0 + BELIEVED) * most
             assert sum(f.spent for f in fakes) <= (others * most + own) * (1.0 + 1e-9)
 
 
@@ -95,6 +100,20 @@ def test_a_bound_from_below_is_counted_before_it_has_a_turn():
     cheap, dear = Fake(5.0, 4.0, []), Fake(100.0, 1.0, [], guess=0.1)
     race([dear, cheap], lambda: cheap.over or dear.over)
     assert dear.counted and dear.spent == 0.0 and cheap.over
+
+
+def test_a_turn_is_told_the_least_that_is_left_of_the_others():
+    told = []
+
+    class Told(Fake):
+        def run(self, work, others):
+            told.append((self.expected, others))
+            return super().run(work, others) and len(told) > 1
+
+    race([Told(cost, inf, [inf] * 9) for cost in (4.0, 9.0, 1.0)], lambda: len(told) == 2)
+    assert told == [(1.0, 4.0), (4.0, 9.0)]
+    race([Told(2.0, 1.0, [])], lambda: len(told) == 3)
+    assert told[2] == (2.0, inf)
 
 
 def test_nobody_left_is_an_end():

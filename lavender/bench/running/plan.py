@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from lavender._arrays import whole_number
+from lavender._arrays import flag, number, whole_number
 from lavender.bench.record import CaseInfo, Record
 from lavender.bench.running.timing import Ask, Task
 from lavender.errors import InputError, UnknownName
@@ -74,15 +74,14 @@ class Plan:
             ("time budget", self.times),
         ):
             for value in values:
-                if not (math.isfinite(value) and value > 0):
-                    raise InputError(f"{name} {value} must be a positive number")
+                number(name, value, above=0.0)
         if not self.levels and not self.budgets:
             raise InputError("nothing to run: give levels, budgets or both")
         whole_number("repeats", self.repeats, 1)
-        if not (math.isfinite(self.time_limit) and self.time_limit > 0.0):
-            raise InputError(f"time limit is {self.time_limit}; a positive number of seconds is needed")
-        if not self.pass_limit > 0.0:
-            raise InputError(f"pass limit is {self.pass_limit}; a positive number of seconds is needed")
+        number("time_limit", self.time_limit, above=0.0)
+        number("pass_limit", self.pass_limit, above=0.0)
+        for name in ("warm", "campaign", "motion"):
+            flag(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = word.partition(":")
             if name not in ORDERS:

@@ -217,11 +217,11 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
 
 static int32_t prepare_admm(lav_solver *s) {
   const int64_t m = s->p.n_rows, numbers = (int64_t)k_admm_room(s->p.n_rows, s->options.memory);
-  double *x, size[2] = {0.0, 0.0};
+  double *x;
   int32_t bands[2];
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
-  if (size[1] > 0.0 && size[0] / size[1] > 1e-14) return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
+  if (m > 0 && s->a.indptr[m] > 0 && core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
+    return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
   s->table = TAKE(s, double, m * m);
   x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_ROOM;

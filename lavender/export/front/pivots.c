@@ -9,10 +9,10 @@ static int32_t prepare_pivots(lav_solver *s) {
   struct pivot_direct_direct_t *t = &s->direct;
   const int64_t m = s->p.n_rows;
   int32_t bands[2] = {0, 0}, band, i, *index, *whole = NULL;
-  double size[2] = {0.0, 0.0}, *real;
+  double asymmetry = 0.0, *real;
   GIVE_BACK(form_matrix(s));
-  if (m > 0 && s->a.indptr[m] > 0) core_csr_scan_entries(&s->a, (int32_t)m, s->marks, bands, size);
-  t->symmetric = size[1] == 0.0 || size[0] / size[1] <= 1e-14;
+  if (m > 0 && s->a.indptr[m] > 0) asymmetry = core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands);
+  t->symmetric = asymmetry <= 1e-14;
   band = !t->symmetric ? (int32_t)m - 1 : bands[0] > bands[1] ? bands[0] : bands[1];
   t->linear = 1;
   for (i = 0; i < m; i++)

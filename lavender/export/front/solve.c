@@ -65,9 +65,10 @@ static int32_t prepare_sweeps(lav_solver *s) {
   if (s->options.method == LAV_JACOBI) {
     double most = 0.0, sum;
     int32_t i, q;
-    for (i = 0; i < s->p.n_rows; i++) { /* max_i sum_j |A_ij| / d_i */
-      for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++) sum += fabs(s->a.data[q]);
-      sum *= s->p.step[i];
+    for (i = 0; i < s->p.n_rows; i++) { /* max_i sum_j |A_ij| sqrt(s_i s_j) */
+      for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
+        sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
+      sum *= sqrt(s->p.step[i]);
       if (sum > most) most = sum;
     }
     if (s->options.omega == 0.0) s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
