@@ -224,7 +224,8 @@ SCRIPT = """
 import { readFileSync } from 'node:fs';
 const [folder, given] = [process.argv[1], JSON.parse(process.argv[2])], lav = await import(`${folder}/index.mjs`);
 const solver = (await lav.load(readFileSync(`${folder}/liblavender.wasm`))).solver(lav.LAV_PGS);
-const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value: [2, 0, 0, 0, 2, 0, 0, 0, 2], b: [1, 2, 3], lower: [0, 0, 0] };
+const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
+const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
 const said = given.map(([problem, budget]) => {
   try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
   catch (error) { return error.message; }
