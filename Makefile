@@ -39,7 +39,7 @@ docs:  ## the documentation, in site/
 verdict:  ## docs/verdict.md: the tables of the built-in report, measured on this machine
 	$(BIN)lavender report --fresh --no-figures --out build/verdict
 	sed -i '1,/^The tables/!d' docs/verdict.md
-	sed -e '1d' -e 's/^```python/```text/' -e '/^| case | solver/,$$d' build/verdict/summary.md >> docs/verdict.md
+	sed -e '1d' -e 's/^```python/```text/' -e '/^\*\*Cases/,$$d' build/verdict/summary.md >> docs/verdict.md
 
 wasm:  ## the WebAssembly modules, in lavender/web/
 	$(BIN)lavender web build lavender/web/lavender.wasm

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 
 __all__ = ["check_certificate"]
+
+UNIT = 2.0**-53
 
 
 def check_certificate(problem: Problem, y: Any) -> str | None:
@@ -23,7 +26,8 @@ def check_certificate(problem: Problem, y: Any) -> str | None:
 
     over all lambda within the bounds, for any A and every law. z_i counts as zero up to
     1e-10 (b.y / |b|.|y|) (|A|^T |y|)_i: with more a solution could exist, but only one with
-    |A| |lambda| > 1e10 |b| in the weights |y|, whose floor is above 1e-6.
+    |A| |lambda| > 1e10 |b| in the weights |y|, whose floor is above 1e-6. Where rounding of the sums is more than
+    that, they are taken exactly.
     """
     with np.errstate(all="ignore"):  # what overflows proves nothing
         y = np.asarray(y, float)
@@ -48,14 +52,47 @@ def _disproof(problem: Problem, y: FloatArray) -> str | None:
     outside = _recession_violation(problem, y)
     if outside:
         return outside
-    z, zero = a.T @ y[rows], 1e-10 * (gain / most) * (abs(a).T @ np.abs(y[rows]))
+    z, size = a.T @ y[rows], abs(a).T @ np.abs(y[rows])
+    zero = 1e-10 * (gain / most) * size
+    off = (len(rows) + 2.0) * UNIT * size
+    if off.max() > 0.5 * zero.max():  # what has rounded may be what b.y needs
+        z, off = _exactly(problem, y, rows, size)
     if not np.isfinite(z).all():
         return "A^T y overflows"
-    z[np.abs(z) <= zero] = 0.0
-    pull = _pull(problem, z, zero)
+    none = np.abs(z) + off <= zero
+    z[none], off[none] = 0.0, 0.0
+    pull = _pull(problem, z, off, zero)
     if gain - pull.sum() > 1e-10 * (most + np.abs(pull).sum()):
         return None
     return f"A^T y reaches {np.abs(z).max(initial=0.0):.2e}, above rounding; impulses within the bounds can meet b.y"
+
+
+def _exactly(problem: Problem, y: FloatArray, rows: Any, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A^T y and what rounding may have changed in it: what A was formed with, but where J^T y is 0 exactly."""
+    if problem.matrix is None and not np.any(_product(problem.jacobian, y)):
+        return problem.compliance * y, np.zeros(problem.m)  # type: ignore[operator]
+    z = _product(problem.csr[rows], y[rows])
+    return z, 2.0 * UNIT * (np.abs(z) if problem.matrix is not None else size)
+
+
+def _product(a: Any, y: FloatArray) -> FloatArray:
+    """A^T y of a CSR matrix (k, m), each sum rounded once: products of halves of 26 bits are exact."""
+    columns = a.tocsc()
+    halves, power = [], []
+    for x in (columns.data, y[columns.indices]):
+        part, exponent = np.frexp(x)
+        high = np.ldexp(np.round(np.ldexp(part, 26)), -26)
+        halves.append((high, part - high))
+        power.append(exponent)
+    total, out = power[0] + power[1], np.zeros(a.shape[1])
+    for i, (start, end) in enumerate(pairwise(columns.indptr.tolist())):
+        if start < end:
+            top = int(total[start:end].max())
+            terms = [
+                np.ldexp(p[start:end] * q[start:end], total[start:end] - top) for p, q in product(*halves)
+            ]
+            out[i] = np.ldexp(math.fsum(np.concatenate(terms)), top)
+    return out
 
 
 def _exponent(x: FloatArray) -> int:
@@ -72,14 +109,14 @@ def _rims(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]
     return normal, bound, np.array([np.hypot.reduce(x[part]) for _, part in parts])
 
 
-def _pull(problem: Problem, z: FloatArray, zero: FloatArray) -> FloatArray:
-    """Largest z_i lambda_i (m,) of each row within its bounds; of a contact's together, on its normal."""
+def _pull(problem: Problem, z: FloatArray, off: FloatArray, zero: FloatArray) -> FloatArray:
+    """Largest (z +- off)_i lambda_i (m,) of each row within its bounds; of a contact's together, on its normal."""
     c = problem.cones
-    bound = np.where(z > 0.0, c.upper, c.lower)
-    pull = np.zeros(problem.m)
-    np.multiply(z, bound, out=pull, where=z != 0.0)
-    normal, limit, size = _rims(problem, z)
-    most, first = z.copy(), c.normal_rows
+    pull = np.full(problem.m, -np.inf)
+    for x, bound in ((z - off, c.lower), (z + off, c.upper)):
+        pull = np.maximum(pull, np.multiply(x, bound, out=np.zeros(problem.m), where=x != 0.0))
+    normal, limit, size = _rims(problem, np.abs(z) + off)
+    most, first = z + off, c.normal_rows
     np.add.at(most, normal, limit * size)
     pull[c.contact_rows] = 0.0
     # What pulls along tangents alone is beyond its own zero already; against a normal it may be rounding.

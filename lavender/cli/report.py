@@ -105,10 +105,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     is writing to the folder.
     """
     from lavender import bench
-    from lavender.report.contents import engine_table
-    from lavender.report.engine import ENGINES, contestants
+    from lavender.report.engine import contestants
     from lavender.report.findings import Report
-    from lavender.report.table import print_table
     from lavender.report.terminal import print_report
     from lavender.report.text import count
     from lavender.report.write import write
@@ -135,9 +133,6 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     engines = [] if asked["campaign"] else contestants(files, done.records.latest())
     found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
     print_report(found, console(), whole=asked["tables"])
-    if engines:
-        _say(f"\n{ENGINES}")
-        print_table(console(), engine_table(engines))
     index = write(found, out, figures=not asked["no_figures"])
     if asked["paper"]:
         from lavender.report.paper import write_paper

@@ -22,7 +22,7 @@ TURNS = 3  # periods of it
 
 
 def _zeros(time: FloatArray, x: FloatArray) -> FloatArray:
-    """Times at which x changes sign, between two looks by a straight line."""
+    """Times at which x changes sign, between two samples by a straight line."""
     i = np.flatnonzero(x[1:] * x[:-1] < 0.0)
     found: FloatArray = time[i] + (time[i + 1] - time[i]) * x[i] / (x[i] - x[i + 1])
     return found

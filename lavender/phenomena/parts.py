@@ -40,7 +40,7 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """What an engine did of a scene, looked at in equal times; bodies in the scene's order, static ones too."""
+    """What an engine did of a scene, sampled in equal times; bodies in the scene's order, static ones too."""
 
     time: FloatArray  # (k,) s, 0 first
     positions: FloatArray  # (k, n, 3) m
@@ -83,7 +83,7 @@ class Phenomenon:
     ]  # of parameters, and of what an engine asks of the scene
     seconds: Callable[[Values], float]  # simulated
     measure: Callable[[Values, Track], dict[str, float]]
-    look: float = 1.0 / 60.0  # s between two looks
+    interval: float = 1.0 / 60.0  # s between two samples
 
     def values(self, given: Mapping[str, Any] | None = None) -> dict[str, float]:
         """Every parameter, as given or by default.
@@ -133,7 +133,7 @@ class Record:
 
 
 def crossing(time: FloatArray, x: FloatArray, level: float) -> float:
-    """Time at which x (k,) first falls below `level`, between two looks by a straight line; inf where it does not."""
+    """Time at which x (k,) first falls below `level`, between two samples by a straight line; inf where it does not."""
     below = np.flatnonzero(x < level)
     if not len(below):
         return float("inf")
@@ -156,7 +156,7 @@ def judged(phenomenon: Phenomenon, engine: str, case: dict[str, float], track: T
     if len(lost):
         return Record(**head, note=f"poses are not finite from {track.time[lost[0]]:.3g} s on")
     if len(track.time) < 2:
-        raise InputError(f"a track of {len(track.time)} looks; two are needed")
+        raise InputError(f"a track of {len(track.time)} samples; two are needed")
     values = {name: float(x) for name, x in phenomenon.measure(case, track).items()}
     passed = all(not values[q.name] > q.bound for q in phenomenon.quantities)
     return Record(**head, values=values, passed=passed)

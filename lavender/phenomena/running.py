@@ -33,13 +33,13 @@ class Apart:
         self.limit = limit
         self._process = Process(MODULE)
 
-    def track(self, way: Way, scene: Scene, seconds: float, look: float) -> Track | str:
+    def track(self, way: Way, scene: Scene, seconds: float, interval: float) -> Track | str:
         """What the engine did, or why there is nothing."""
         cause = self._process.start()
         if cause:
             return f"its process does not start: {cause}"
         try:
-            return _track(*self._process.ask([(way.name, scene, seconds, look)], self.limit, ROOM))
+            return _track(*self._process.ask([(way.name, scene, seconds, interval)], self.limit, ROOM))
         except TimeoutError:
             return f"no answer within {self.limit:g} s"
         except Ended as end:
@@ -61,7 +61,7 @@ def _track(words: bytes, numbers: bytes) -> Track | str:
         if "error" in said:
             cannot = said["kind"] == CapabilityError.__name__
             return str(said["error"]) if cannot else f"it failed: {said['kind']}: {said['error']}"
-        k, n = int(said["looks"]), int(said["bodies"])
+        k, n = int(said["samples"]), int(said["bodies"])
         x = np.frombuffer(numbers, float)
         time, place, turn, speed, last = np.split(x, np.cumsum([k, 3 * k * n, 4 * k * n, 6 * k * n]))
         shapes = ((k, n, 3), (k, n, 4), (k, n, 6))
@@ -197,7 +197,7 @@ def _one(way: Way, phenomenon: Phenomenon, case: dict[str, float], apart: Apart)
     try:
         scene = phenomenon.scene(case, **way.scene)
         if way.module != "own":
-            return apart.track(way, scene, seconds, phenomenon.look)
-        return follow(make(way, scene), seconds, phenomenon.look)
+            return apart.track(way, scene, seconds, phenomenon.interval)
+        return follow(make(way, scene), seconds, phenomenon.interval)
     except (InputError, CapabilityError) as error:  # a stepper that does not take the scene
         return str(error)

@@ -111,7 +111,7 @@ STACKS = (
         },
         cases=({"slope": 0.95}, {"slope": 0.98}, {"slope": 1.02}, {"slope": 1.1}),
         quantities=(
-            Quantity("time", "s", 0.05, "distance from the time to tip by 0.5 rad; three looks"),
+            Quantity("time", "s", 0.05, "distance from the time to tip by 0.5 rad; three samples"),
             WRONG,
         ),
         needs=frozenset({"box"}),
@@ -158,7 +158,7 @@ STACKS = (
         build=_heavy,
         seconds=lambda p: 60.0,
         measure=_loaded,
-        look=0.1,
+        interval=0.1,
     ),
     Phenomenon(
         name="arch",

@@ -1,11 +1,16 @@
-"""Every table of a report, described once: its page, the terminal, the summary and a paper show the same rows."""
+"""Every table of a report, described once: its page, the terminal, the summary and a paper show the same rows.
+
+`sections` is their order for those who read from top to bottom: the terminal and the summary walk it. The page has the
+same tables between its figures.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
-from lavender.bench.record import Record, Skip, file_name, level_name
+from lavender.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
@@ -16,6 +21,7 @@ from lavender.report.tables import Advice, Line
 from lavender.report.text import NONE, count, percent, residual, seconds, share, times, who
 
 __all__ = [
+    "Section",
     "advice_table",
     "backend_table",
     "case_table",
@@ -29,6 +35,7 @@ __all__ = [
     "pass_table",
     "reach_table",
     "robustness_table",
+    "sections",
     "skip_table",
     "speed_table",
     "spread_table",
@@ -38,6 +45,60 @@ __all__ = [
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")
 SHOWN_TIES = 2
+NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table under its heading."""
+
+    title: str
+    note: str  # what its numbers are
+    table: Table
+    grouped: bool = False  # rows of one case or structure stand together
+    details: bool = (
+        False  # of single cases and sequences: a terminal shows them on request, or if they are few
+    )
+    empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
+
+
+def sections(report: Report) -> list[Section]:
+    """What a report has to show as tables, from the recommendations to what changed since an earlier one."""
+    records, levels = report.records, report.levels
+    moved = "how wrong the body moves that is furthest off"
+    if report.is_campaign:
+        shares = robustness_table(tables.robustness(records), levels)
+        by_speed = robustness_table(tables.robustness(report.by_speed), report.speeds, " m/s")
+        note = "no times; share of cases brought to a level, residual at each budget"
+        found = [
+            Section("Campaign", note, shares, grouped=True),
+            Section("By motion error", moved, by_speed, grouped=True),
+        ]
+    else:
+        by_structure = (
+            "to a level: mean time, share of cases that get there, budget; in a time or with sweeps: share of cases "
+            "served, residual at the 90th percentile; ≈ as good within noise"
+        )
+        by_sweeps = "share of cases served, residual at the 90th percentile"
+        inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
+        every = "floor: rounding to float64 allows no better"
+        carried = "median residual, time of all steps; carried from step to step, or cold"
+        cases = reach_table(tables.reaches(records, levels), levels).without("form")
+        found = [
+            Section("By structure", by_structure, advice_table(report)),
+            Section("By sweeps", by_sweeps, sweeps_table(report.lines)),
+            Section("Inside the engine", inside, engine_table(report.engines)),
+            Section("By motion error", moved, speed_table(report)),
+            Section("Motion error of each case", moved, moved_table(report), grouped=True, details=True),
+            Section("Cases", every, cases, grouped=True, details=True),
+            Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True, details=True),
+        ]
+    if report.before is not None:
+        changed = change_table(report.before, records)
+        title = f"Against {printable(report.before.source)}"
+        empty = "nothing beyond noise" if tables.changes(report.before, records) else NOT_COMPARED
+        found.append(Section(title, "times to a level", changed, empty=empty))
+    return [s for s in found if s.table.rows or s.empty]
 
 
 # -- recommendations ---------------------------------------------------------------------------------------

@@ -19,11 +19,8 @@ from lavender.bench.store import Records
 from lavender.io.stored import ENGINE, whole_file
 from lavender.residuals import AT_FLOOR
 
-__all__ = ["ENGINES", "Contestant", "contestants"]
+__all__ = ["Contestant", "contestants"]
 
-ENGINES = (
-    "Inside the engine: its own answers, judged like ours; its time holds no copy of the problem and no judge"
-)
 _NUMBERS = ("rows", "seconds", "relative")
 
 

@@ -171,6 +171,7 @@ def _changes(old: Records | None, records: Records) -> dict[str, Any]:
         "drift": 1.0 if old is None else tables.drift(old, records),
         "changes": None if old is None else contents.change_table(old, records),
         "n_changes": len(found),
+        "not_compared": contents.NOT_COMPARED,
     }
 
 

@@ -10,13 +10,13 @@ from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, options_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE
+from lavender_ext.sweep.serial cimport context_t, form_velocity
 
 
 cdef enum:
@@ -63,6 +63,7 @@ cdef struct turns_t:            # of one part
     double* w                   # (m)
     double* error               # (m)
     double* scratch             # (12 n_bodies)
+    context_t sweeps
     sweep_data_t c
     options_t options
     room_t room
@@ -82,15 +83,17 @@ cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* r
     t.swept, t.w, t.error, t.scratch = work, work + m, work + 2 * m, work + 3 * m
     work += 3 * m + 12 * n
     memset(&t.c, 0, sizeof(t.c))
-    t.c.v, t.c.control, t.c.gram = work, work + 6 * n, work + 6 * n + CONTROL
+    memset(&t.sweeps, 0, sizeof(t.sweeps))
+    t.sweeps.v, t.c.control, t.c.gram = work, work + 6 * n, work + 6 * n + CONTROL
     t.c.work = t.c.gram + MAX_MEMORY * MAX_MEMORY
     memset(t.c.control, 0, (CONTROL + MAX_MEMORY * MAX_MEMORY) * sizeof(double))
     for i in range(v.p.n_blocks):
         order[i] = i
     rng[0] = 0
-    t.c.blocks, t.c.csr, t.c.rows, t.c.nv = &v.p, v.a, v.r, <int32_t>(6 * n)
-    t.c.order, t.c.rng, t.c.split, t.c.memory = order, rng, t.s.split, MEMORY
-    t.c.exact, t.c.start, t.c.g = t.s.at != NULL, t.s.at, t.s.prepared
+    t.c.sweeps, t.c.memory = &t.sweeps, MEMORY
+    t.sweeps.blocks, t.sweeps.csr, t.sweeps.rows, t.sweeps.n_v = &v.p, v.a, v.r, <int32_t>(6 * n)
+    t.sweeps.order, t.sweeps.rng, t.sweeps.split = order, rng, t.s.split
+    t.sweeps.exact, t.sweeps.start, t.sweeps.g = t.s.at != NULL, t.s.at, t.s.prepared
 
 
 cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
@@ -180,8 +183,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     less = own / o.e0 if own < o.e0 else o.e0 / own     # squares of what is far from 1 vanish
     t.e0, t.v0 = (own if own > o.e0 else o.e0) * sqrt(0.5 * (1.0 + less * less)), o.v0
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
-    if s.v.r != NULL:
-        rows_velocity(p, s.v.r, t.swept, t.c.v)
+    form_velocity(&t.sweeps, t.swept)
     t.said.factorisations = 0
     now = sweep_on(&t, o.first, True)
     if now <= o.tol or now < 1.0:

@@ -332,7 +332,10 @@ def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
     assert "Sequences" in out
     code, out, _ = lavender(*words, "--no-figures", "--repeats", 1, "--compare", "lavender-report")
     assert code == 0
-    assert "nothing beyond noise" in out
+    assert "steps of sequences are not compared" in out and "nothing beyond noise" not in out
+    assert (
+        "| sequential_impulses | 4 iterations |" in (tmp_path / "here/lavender-report/summary.md").read_text()
+    )
     code, _, err = lavender("run", "stack", "--steps", 5, "--record", folder)
     assert (code, "steps of two recordings" in err) == (2, True)
     assert lavender("run", "stack", "--steps", 3, "--record", folder, "--replace")[0] == 0

@@ -24,6 +24,6 @@ def serve(lifeline):
         Path(name.removeprefix("waits ")).write_text(str(lines.ask(None)))
         lines.ask(None)
     if name == "babbles":
-        answer(answers, '{"looks": 3, "bodies": 1, "setting": ""}', b"12345678")
+        answer(answers, '{"samples": 3, "bodies": 1, "setting": ""}', b"12345678")
         time.sleep(600)
     sys.exit(0)

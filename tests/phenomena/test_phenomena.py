@@ -83,7 +83,9 @@ def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     left = []
     for substeps in (4, 16):
         scene = p.scene(case, stepper=stepper, dt=1 / 60, substeps=substeps)
-        left.append(p.measure(case, follow(make(WAYS[stepper], scene), p.seconds(case), p.look))["energy"])
+        left.append(
+            p.measure(case, follow(make(WAYS[stepper], scene), p.seconds(case), p.interval))["energy"]
+        )
     assert left[1] < 0.5 * left[0]
 
 
@@ -104,7 +106,7 @@ def test_a_track_that_stays_where_it_began_is_wrong_about_what_moves():
         p = PHENOMENA[name]
         values = p.values(case)
         scene = p.scene(values)
-        t = np.arange(0.0, p.seconds(values), p.look)
+        t = np.arange(0.0, p.seconds(values), p.interval)
         x, q = (np.array([getattr(b, f) for b in scene.bodies]) for f in ("position", "quaternion"))
         still = Track(
             t, np.tile(x, (len(t), 1, 1)), np.tile(q, (len(t), 1, 1)), np.zeros((len(t), len(x), 6))

@@ -308,6 +308,23 @@ def test_certificates_are_checked():
     assert "leaves the bounds" in check_certificate(boxed, [1.0, 1.0])
 
 
+def test_a_sum_that_rounds_to_zero_proves_nothing():
+    """A^T y is (0, 0, -2^-53), which impulses of 3e7 N s meet to 1e-9; exact zeros are a proof at the same b.y."""
+    y, b = [1.0, 1.0, -1.0], np.array([1.0, 0.0, 1.0 - 3e-9])
+    for small, proves in ((2.0**-53, False), (0.0, True)):
+        a = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, small], [1.0, 1.0, 1.0]])
+        for upper in (np.inf, 1e12):
+            problem = lv.Problem.lcp(a, b, lower=-np.inf, upper=[np.inf, np.inf, upper])
+            assert (check_certificate(problem, y) is None) is proves
+        met = np.array([1.0 - 3e-9 * 2.0**53, -3e-9, 3e-9 * 2.0**53])
+        if not proves:
+            assert lv.residual(problem, met).relative < 2e-9
+    for jac, proves in (([[1.0], [-1.0]], True), ([[1.0], [2.0**-30 - 1.0]], False)):
+        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-8]
+        opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
+        assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
+
+
 def test_certificates_hold_for_any_matrix_and_every_law():
     # A^T y = 0 and y.w >= 0 on every row: nothing about symmetry, definiteness or friction is needed.
     a = np.array([[0.0, 0.0, 0.0], [3.0, 1.0, -2.0], [1.0, 4.0, 1.0]])

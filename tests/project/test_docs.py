@@ -11,12 +11,13 @@ import click
 import numpy as np
 import pytest
 
+import benchmarks.__main__ as benchmarks
 import lavender as lv
 from lavender.cli import cli
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-BLOCK = re.compile(r"^```(python|pycon|sh)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(python|pycon|sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FLAGS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -85,19 +86,35 @@ def test_doctests_of_a_module(name):
     assert failures == 0
 
 
+def commands_of(page):
+    """(where, words) of the commands of a page: lines of blocks, and code within the text without places left open."""
+    lines = [(line, text) for line, _, block in blocks(page, "sh", "console") for text in block.splitlines()]
+    text = page.read_text(encoding="utf-8")
+    for found in re.finditer(r"`((?:lavender|python -m benchmarks) [^`]+)`", BLOCK.sub("", text)):
+        if not set("[…") & set(found[1]) and not found[1].endswith("..."):
+            lines.append((0, found[1]))
+    for line, command in lines:
+        yield (
+            f"{page.name}, block at line {line}: {command}",
+            shlex.split(command.removeprefix("$ "), comments=True),
+        )
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_command_lines_of_a_page_are_understood(page):
-    for line, _, text in blocks(page, "sh"):
-        for command in text.splitlines():
-            words = shlex.split(command, comments=True)
-            if words[:1] != ["lavender"]:
-                continue
-            where = f"{page.name}, block at line {line}: {command}"
-            sub = cli.get_command(None, words[1])
+    for where, words in commands_of(page):
+        group, rest = (cli, words[1:]) if words[:1] == ["lavender"] else (benchmarks.cli, words[3:])
+        if words[:1] != ["lavender"] and words[:3] != ["python", "-m", "benchmarks"]:
+            continue
+        try:
+            sub = group.get_command(None, rest[0])
             assert sub is not None, where
-            try:
-                sub.make_context(words[1], words[2:])
-            except click.ClickException as error:
+            sub.make_context(rest[0], rest[1:])
+        except (click.exceptions.Exit, click.exceptions.MissingParameter):
+            pass  # --help, or named without what it is for
+        except click.ClickException as error:
+            # An option that is spoken of without its value, and a file of the reader's own, are well.
+            if not (words[-1].startswith("--") or "does not exist" in error.format_message()):
                 pytest.fail(f"{where}: {error.format_message()}")
 
 

@@ -559,10 +559,19 @@ def test_changes_beyond_noise_are_named(tmp_path):
     text = report.write(Report(new, old), tmp_path, figures=False).read_text()
     assert "Against the earlier run" in text
     assert text.count("slower 3 times") == 2  # to both levels
+    shown = io.StringIO()
+    print_report(Report(new, old), Console(width=200, file=shown))
+    for said in (
+        shown.getvalue(),
+        (tmp_path / "summary.md").read_text(),
+    ):  # the page's tables, from top to bottom
+        assert said.count("slower 3 times") == 2 and "Against" in said
     # A case whose numbers have changed is not compared.
     moved = records_of(record("a", "x", 3.0, 1e-7))
     moved.cases["a"] = CaseInfo(**{**vars(info("a")), "sha": "another"})
     assert tables.changes(old, moved) == []
+    text = report.write(Report(moved, old), tmp_path, figures=False).read_text()
+    assert "no case has the same numbers in both" in text
 
 
 def test_a_full_disk_leaves_the_page_of_the_last_time(tmp_path, monkeypatch):

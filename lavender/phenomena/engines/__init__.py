@@ -216,12 +216,12 @@ def make(way: Way, scene: Scene) -> Stepping:
     return engine(way.module, scene, **way.options)
 
 
-def follow(engine: Stepping, seconds: float, look: float) -> Track:
-    """Step for so long, and look every `look` seconds, in whole steps; a state that is not finite is the last."""
-    every = max(1, round(look / engine.dt))
-    looks = max(2, int(np.ceil(seconds / (every * engine.dt) - 1e-9)))
+def follow(engine: Stepping, seconds: float, interval: float) -> Track:
+    """Step for so long, a sample every `interval` seconds, in whole steps; a state that is not finite is the last."""
+    every = max(1, round(interval / engine.dt))
+    samples = max(2, int(np.ceil(seconds / (every * engine.dt) - 1e-9)))
     states, spent, done = [engine.state()], 0.0, 0
-    for _ in range(looks):
+    for _ in range(samples):
         begin = engine.clock()
         engine.advance(every)
         spent += engine.clock() - begin

@@ -20,16 +20,16 @@ def _runner() -> apart.Handler:
     from lavender.phenomena.engines import WAYS, follow, make
 
     def run(message: Any) -> tuple[dict[str, Any], bytes]:
-        name, scene, seconds, look = message
+        name, scene, seconds, interval = message
         engine = make(WAYS[name], scene)
         try:
-            track = follow(engine, seconds, look)
+            track = follow(engine, seconds, interval)
         finally:
             engine.close()
         k, n = track.positions.shape[:2]
         last = np.array([track.force, track.cpu])
         parts = (track.time, track.positions, track.quaternions, track.velocities, last)
         numbers = b"".join(np.ascontiguousarray(x, float).tobytes() for x in parts)
-        return {"looks": k, "bodies": n, "setting": track.setting}, numbers
+        return {"samples": k, "bodies": n, "setting": track.setting}, numbers
 
     return run
