@@ -51,10 +51,14 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: sleeps by the system's calls; `checked_sweeps` calls the Python faces of kernels one after the other, `many` and
 #: `call` the kernels themselves, and allocate what these need; `checks` and `blocks` read arrays of Python, `newton`
 #: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
-#: check sees, but for the logarithms by which `checked_sweeps` guesses about sweeps; that of `direct`, `lemke`,
-#: `principal`, `measure` and `watch` is cut out for the C library, which refuses what needs Python.
+#: check sees, but for the logarithms by which `checked_sweeps` guesses about sweeps; that of `pgs`, `serial`,
+#: `accelerated`, `direct`, `lemke`, `principal`, `measure` and `watch` is cut out for the C library, which refuses what
+#: needs Python.
 EXEMPT = {
     "threaded": "threads",
+    "pgs": "called by serial; the C library has it whole",
+    "serial": "calls loops over blocks by pointer; the C library has it whole",
+    "accelerated": "calls sweeps by pointer; the C library has it whole",
     "checked_sweeps": "calls kernels, guesses how long they will take",
     "checks": "reads arrays of Python, computes nothing",
     "blocks": "reads and fills arrays of Python, computes nothing",

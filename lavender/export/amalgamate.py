@@ -24,6 +24,7 @@ MODULES = (
     "core.problem",
     "judge.measure",
     "judge.watch",
+    "sweep.pgs",
     "sweep.serial",
     "local.gauss_seidel",
     "accelerate.accelerated",

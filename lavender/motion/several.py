@@ -231,10 +231,7 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     whole = bool(proof)
     if (always or not proof) and (modes := enumerated(problem)) is not None:
         best_last = sorted(modes[0], key=lambda x: -residual(problem, x).relative)
-        speed = float(np.max(np.abs(problem.b), initial=0.0)) or 1.0  # m/s, of which 1e-9 is rounding
-        single = {
-            tuple(np.round(problem.slack(x) / speed, 9)): x for x in best_last
-        }  # modes that share a motion
+        single = {_rounded(problem, x): x for x in best_last}  # modes that share a motion
         ends = [judged(problem, x, "every mode") for x in list(single.values())[:MANY]]
         solved = [end for end in ends if end.accepted]
         found += [(end, "every mode") for end in solved]
@@ -268,6 +265,15 @@ def motions(problem: Problem, n: int = RUNS, seed: int = 0, *, always: bool = Fa
     )
     kept(problem).motions = result
     return result
+
+
+def _rounded(problem: Problem, x: FloatArray) -> bytes:
+    """w to 1e-9 of the largest |b|, in m/s and in sqrt(J): heavy bodies that move slowly move all the same."""
+    parts = []
+    for unit in (np.ones(problem.m), 1.0 / np.sqrt(problem.d)):
+        largest = float(np.max(np.abs(unit * problem.b), initial=0.0)) or 1.0
+        parts.append(np.round(unit * problem.slack(x) / largest, 9) + 0.0)
+    return np.concatenate(parts).tobytes()
 
 
 def motions_of(problem: Problem, n: int = RUNS) -> Motions:

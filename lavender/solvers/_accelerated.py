@@ -10,11 +10,9 @@ from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, swept
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
-from lavender_ext.judge import measure
-from lavender_ext.local import gauss_seidel
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
@@ -30,16 +28,15 @@ SWEEP_OPTION = (
 
 
 class AcceleratedState(SweepState):
-    """A sweep state with the memory of the acceleration and, where there are rows, v = M^-1 J^T lambda."""
+    """A sweep state with the memory of the acceleration."""
 
     def __init__(
         self, problem: Problem, data: Any, order: Order, exact: bool, convex: int, memory: int
     ) -> None:
-        super().__init__(problem, data, order, PATIENCE)
-        self.exact, self.convex = exact, convex
-        self.prepared = gauss_seidel.prepare(data) if exact or convex else None
-        self.memory = memory
-        self.space = accelerated.allocate(data, memory)
+        sweeps = accelerated.sweeps_of(data, *plan_of(order), exact, convex > 0)
+        super().__init__(problem, data, order, sweeps, PATIENCE)
+        self.exact, self.convex, self.memory = exact, convex, memory
+        self.space = accelerated.allocate(sweeps, memory)
         self.restarts = 0
 
 
@@ -86,17 +83,13 @@ class Accelerated(Sweeping):
         time_limit: float | None = None,
     ) -> Claim:
         """`max_iter` iterations, or fewer where a check ends them."""
-        o, data = state.order, state.data
-        if state.first and (data.factored or data.is_general):
-            measure.velocity_change(data, impulse, state.space[3])
         status, done, sweeps, restarts = accelerated.run(
-            data, state.watch, impulse, max_iter, tol, state.memory, state.prepared, state.exact, state.convex,
-            state.space, o.blocks, o.split, o.mode, o.rng, self._keeps,
+            state.sweeps, state.watch, impulse, max_iter, tol, state.memory, state.convex, state.space, self._keeps
         )  # fmt: skip
         work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
         state.restarts = restarts
         sweep = "blocks" if state.exact else "pgs"
-        form = f"{sweep} on {over(data)}"
+        form = f"{sweep} on {over(state.data)}"
         return replace(claim(status, done), work=work, form=form)
 
 

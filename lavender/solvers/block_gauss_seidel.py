@@ -12,67 +12,38 @@ counts blocks without an exact solution, which got the update of `pgs` instead.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, swept
-from lavender_ext.judge import measure
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, swept
 from lavender_ext.local import gauss_seidel
-
-
-class BlockState(SweepState):
-    """A sweep state with the prepared numbers of every block, and v = M^-1 J^T lambda where there are rows."""
-
-    velocity: FloatArray | None = None  # (n + 1, 6); of J and M u = Y^T lambda (nv + 1, 1)
-
-    def __init__(self, problem: Problem, data: Any, order: Order) -> None:
-        super().__init__(problem, data, order)
-        self.prepared = gauss_seidel.prepare(data)
+from lavender_ext.sweep import serial
 
 
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
 
-    def _state(self, problem: Problem, order: Order, before: BlockState | None) -> BlockState:
-        return BlockState(problem, swept(problem), order)
+    def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
+        data = swept(problem)
+        sweeps = serial.Sweeps(data, *plan_of(order), gauss_seidel.prepare(data), exact=True)
+        return SweepState(problem, data, order, sweeps)
 
     def run(
         self,
-        state: BlockState,
+        state: SweepState,
         impulse: FloatArray,
         max_iter: int,
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        o, data = state.order, state.data
-        if state.velocity is None:
-            state.velocity = np.zeros(
-                (data.n_velocities + 1, 1) if data.is_general else (data.n_bodies + 1, 6)
-            )
-            if data.factored or data.is_general:
-                measure.velocity_change(data, impulse, state.velocity)
-        status, done, fallbacks = gauss_seidel.run(
-            data,
-            state.watch,
-            impulse,
-            max_iter,
-            tol,
-            *state.prepared,
-            state.velocity,
-            o.blocks,
-            o.split,
-            o.mode,
-            o.rng,
-        )
-        form = over(data)
-        return replace(claim(status, done), work={"sweeps": done, "fallbacks": fallbacks}, form=form)
+        ended = serial.run(serial.SWEEPS, state.sweeps, state.watch, impulse, max_iter, tol)
+        status, done, fallbacks = ended
+        work = {"sweeps": done, "fallbacks": fallbacks}
+        return replace(claim(status, done), work=work, form=over(state.data))
 
 
 SPEC = SolverSpec(

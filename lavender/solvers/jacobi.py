@@ -23,12 +23,11 @@ from lavender_ext.sweep import serial
 
 
 class JacobiState(SweepState):
-    """A sweep state with its damping and a scratch vector (m,)."""
+    """A sweep state with its damping."""
 
     def __init__(self, problem: Problem, omega: float) -> None:
         super().__init__(problem, problem.csr_data, block_order(problem))
         self.omega = omega
-        self.scratch = np.empty(problem.m + 1)
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class Jacobi:
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        return run_kernel(state, impulse, max_iter, tol, serial.JACOBI, state.omega, state.scratch)
+        return run_kernel(state, impulse, max_iter, tol, serial.JACOBI, state.omega)
 
 
 @np.errstate(all="ignore")  # what overflows is judged

@@ -21,15 +21,10 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers.sweeping import SweepState, Threaded, reads_whitened, run_kernel, run_threads
-from lavender_ext.judge import measure
+from lavender.solvers.sweeping import SweepState, Threaded, plan_of, reads_whitened, run_kernel, run_threads
 from lavender_ext.sweep import serial
 
-
-class PGSState(SweepState):
-    """A sweep state, over J and M with u = Y^T lambda."""
-
-    velocity: FloatArray | None = None  # (nv + 1,)
+_NONE = np.empty(0, np.int32)
 
 
 @dataclass(frozen=True)
@@ -37,21 +32,26 @@ class PGS(Threaded):
     """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
 
     def run(
-        self, state: PGSState, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self,
+        state: SweepState,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
     ) -> Claim:
         if state.data.is_general:
-            if state.velocity is None:
-                state.velocity = np.zeros(state.data.n_velocities + 1)
-                measure.velocity_change(state.data, impulse, state.velocity[:, None])
-            made = run_kernel(state, impulse, max_iter, tol, serial.PGS, scratch=state.velocity)
-            return replace(made, form="whitened J")
+            return replace(run_kernel(state, impulse, max_iter, tol), form="whitened J")
         if self.uses_threads(state):
             return run_threads(state, impulse, max_iter, tol, self.threads)
-        return run_kernel(state, impulse, max_iter, tol, serial.PGS)
+        return run_kernel(state, impulse, max_iter, tol)
 
-    def _state(self, problem: Problem, order: Order, before: Any) -> PGSState:
-        data = problem.metric if reads_whitened(problem) else problem.csr_data
-        return PGSState(problem, data, order)
+    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+        if reads_whitened(problem):
+            return SweepState(problem, problem.metric, order)
+        data, (blocks, *rest) = problem.csr_data, plan_of(order)
+        # The same bits with or without an order; without one the kernel skips two lookups a row.
+        row_by_row = data.single_rows and order.is_given
+        return SweepState(problem, data, order, serial.Sweeps(data, _NONE if row_by_row else blocks, *rest))
 
 
 SPEC = SolverSpec(

@@ -11,7 +11,6 @@ swept in pairs, with the same bits (`lavender_ext/sweep/packed.pxd`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,34 +21,30 @@ from lavender.registry import SolverSpec
 from lavender.solution import Claim
 from lavender.solvers.layout import Layout, lay_out
 from lavender.solvers.layout import pays as layout_pays
-from lavender.solvers.sweeping import SweepState, Threaded, run_kernel, run_threads
-from lavender_ext.judge import measure
+from lavender.solvers.sweeping import SweepState, Threaded, plan_of, run_kernel, run_threads
 from lavender_ext.sweep import serial
 
 
 class ImpulseState(SweepState):
-    """A sweep state with v = M^-1 J^T lambda (n + 2, 6), formed once and kept by the sweeps.
+    """A sweep state over bodies: v = M^-1 J^T lambda is formed once and kept by the sweeps.
 
-    The last two rows are zeros, and a dummy to which packed blocks write the velocity of a static body. A large problem
-    with an order of its own is copied in that order; the impulse of the sweeps is then `laid`.
+    A large problem with an order of its own is copied in that order; the impulse of the sweeps is then `laid`.
     """
 
-    velocity: FloatArray | None = None
     laid: FloatArray | None = None  # (m,) impulse in sweep order, as the last run left it
     layout: Layout | None
-    packing: Any  # lavender_ext.sweep.serial.Packing, or None
 
     def __init__(self, problem: Problem, order: Order, before: ImpulseState | None) -> None:
-        layout, packing = (None, None) if before is None else (before.layout, before.packing)
+        layout, sweeps = (None, None) if before is None else (before.layout, before.sweeps)
         self.layout = lay_out(problem, order.blocks, layout) if layout_pays(problem, order) else None
-        if self.layout is None:
-            super().__init__(problem, problem.data, order)
-        else:
-            laid = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-            super().__init__(problem, self.layout.data, laid)
-            self.plan = order
-        packs = order.is_fixed and serial.may_pack(self.data)
-        self.packing = serial.Packing(self.data, packing) if packs else None
+        data, swept = problem.data, order
+        if self.layout is not None:
+            data = self.layout.data
+            swept = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
+        packs = order.is_fixed and serial.may_pack(data)
+        sweeps = serial.Sweeps(data, *plan_of(swept), packs=packs, before=sweeps)
+        super().__init__(problem, data, swept, sweeps)
+        self.plan = order
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -83,16 +78,10 @@ class SequentialImpulses(Threaded):
             if state.laid is None:
                 state.laid = state.layout.take(impulse)
             lam = state.laid
-        if state.velocity is None:
-            state.velocity = np.zeros((state.data.n_bodies + 2, 6))
-            measure.velocity_change(state.data, lam, state.velocity)
-        velocity = state.velocity.ravel()
         if self.uses_threads(state):
-            claim = run_threads(state, lam, max_iter, tol, self.threads, velocity)
+            claim = run_threads(state, lam, max_iter, tol, self.threads)
         else:
-            claim = run_kernel(
-                state, lam, max_iter, tol, serial.IMPULSES, scratch=velocity, packing=state.packing
-            )
+            claim = run_kernel(state, lam, max_iter, tol)
         if state.layout is not None:
             state.layout.put(lam, impulse)
         return claim

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
 from lavender.ordering import Order, block_order
@@ -34,7 +32,6 @@ GRAIN = 20_000
 LEAST = 400_000  # multiply-adds of a sweep: 4,000 contacts, below which starting threads costs what they save
 MOST_THREADS = 64
 PATIENCE = 64  # sweeps that may always pass without a better check
-_ROW_BY_ROW = np.empty(0, np.int32)
 
 
 def watch_over(problem: Problem, data: Any, patience: int) -> Watch:
@@ -48,7 +45,9 @@ class SweepState:
 
     alone: dict[str, Any] | None = None  # how long the leader of several threads goes on alone
 
-    def __init__(self, problem: Problem, data: Any, order: Order, patience: int = PATIENCE) -> None:
+    def __init__(
+        self, problem: Problem, data: Any, order: Order, sweeps: Any = None, patience: int = PATIENCE
+    ) -> None:
         self.problem = problem
         self.data = data  # lavender_ext.core.problem.Data that the kernel sweeps over, and that checks read
         self.order = self.plan = order  # `plan` is of the problem's own blocks
@@ -56,11 +55,8 @@ class SweepState:
         if data is not problem.metric:
             data.set_start(*start)  # the error of doing nothing is the judge's, in whatever form
         self.watch = watch_over(problem, data, patience)
-
-    @property
-    def first(self) -> bool:
-        """No sweep was done yet."""
-        return self.watch.total == 0
+        # What the kernel runs over, a `lavender_ext.sweep.serial.Sweeps`; of blocks as they stand, relaxed, by default.
+        self.sweeps = serial.Sweeps(data, *plan_of(order)) if sweeps is None else sweeps
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -78,41 +74,28 @@ def claim(status: int, done: int) -> Claim:
     return Claim(STATUS[status], done, {"sweeps": done})
 
 
+def plan_of(order: Order) -> tuple[Any, ...]:
+    """(blocks, split, mode, rng) of an order, as kernels take it."""
+    return order.blocks, order.split, order.mode, order.rng
+
+
 def run_kernel(
     state: SweepState,
     impulse: FloatArray,
     max_iter: int,
     tol: float,
-    kind: int,
+    kind: int = serial.SWEEPS,
     omega: float = 1.0,
-    scratch: FloatArray | None = None,
-    packing: Any = None,
 ) -> Claim:
     """`max_iter` sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
-    o = state.order
-    # The same bits with or without an order array; without one the kernel skips two look-ups a row.
-    rows = kind == serial.PGS and state.data.single_rows and not state.data.is_general
-    blocks = _ROW_BY_ROW if rows and o.is_given else o.blocks
-    return claim(
-        *serial.run(
-            kind, state.data, state.watch, impulse, max_iter, tol, blocks, o.split, o.mode, o.rng, omega, scratch,
-            packing,
-        )
-    )  # fmt: skip
+    status, done, _ = serial.run(kind, state.sweeps, state.watch, impulse, max_iter, tol, omega)
+    return claim(status, done)
 
 
-def run_threads(
-    state: SweepState,
-    impulse: FloatArray,
-    max_iter: int,
-    tol: float,
-    threads: int,
-    velocity: FloatArray | None = None,
-) -> Claim:
+def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: float, threads: int) -> Claim:
     """Coloured sweeps on several threads: the bits of one thread."""
-    o = state.order
     alone = state.alone or {}
-    team = threaded.Team(state.data, state.watch, impulse, o.blocks, o.color_ptr, threads, velocity, **alone)
+    team = threaded.Team(state.sweeps, state.watch, impulse, state.order.color_ptr, threads, **alone)
     for thread in range(1, threads):
         _helpers().submit(team.help, thread)
     result = claim(*team.lead(max_iter, tol))

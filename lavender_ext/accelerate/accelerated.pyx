@@ -15,23 +15,19 @@ order.
 where contacts stick, its answer is Coulomb's.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.accelerate.accelerated cimport sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, clip, n_apart, n_tangents, norm2
-from lavender_ext.core.generalized cimport whitened_gather
-from lavender_ext.core.order cimport RANDOM, SYMMETRIC, advance_order
+from lavender_ext.core.order cimport RANDOM, SYMMETRIC
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport relax_rows_block
-from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again
-from lavender_ext.local.gauss_seidel cimport solve_csr_block, solve_general_block, solve_rows_block
-from lavender_ext.sweep.levels cimport sweep_levels
-from lavender_ext.sweep.packed cimport pack_order, packed_t, room_of
-from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again, sweep_t
+from lavender_ext.local.gauss_seidel import prepare
+from lavender_ext.sweep.serial cimport Sweeps, form_velocity, is_packed, sweep
+from lavender_ext.sweep.serial import may_pack
 
 cdef enum:
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
@@ -44,48 +40,16 @@ cdef enum:                      # places in control of nncg
     RESTARTS = 1                # p dropped
 
 
-cdef inline void sweep(sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t i, q, k, exact = c.exact or c.turn < c.convex
+cdef inline void iterate(sweep_data_t* c, double* lam, int32_t first) noexcept nogil:
+    """One sweep, or with the symmetric order one and the same backwards."""
+    cdef const blocks_t* p = c.sweeps.blocks
+    cdef bint exact = c.sweeps.exact
+    cdef int32_t k
     if c.turn < c.convex:
         p = &c.cone
-    for k in range(2 if c.mode == SYMMETRIC else 1):
-        advance_order(c.mode, first and k == 0, c.order, 0, c.split, c.rng)
-        advance_order(c.mode, first and k == 0, c.order, c.split, p.n_blocks, c.rng)
-        if c.mode == SYMMETRIC and not (first and k == 0):
-            c.backwards = 1 - c.backwards
-        if c.general != NULL:
-            for q in range(p.n_blocks):
-                i = c.order[q]
-                if exact:
-                    solve_general_block(p, c.general, i, c.g + c.start[i], lam, c.v)
-                else:
-                    relax_general_block(p, c.general, i, lam, c.v)
-        elif c.csr != NULL:
-            if not exact:
-                for q in range(p.n_blocks):
-                    relax_csr_block(p, c.csr, c.order[q], lam)
-            else:
-                for q in range(p.n_blocks):
-                    i = c.order[q]
-                    solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
-        elif c.packed != NULL and not exact:
-            sweep_levels(p, c.rows, c.packed, c.backwards, lam, c.v)
-        elif not exact:
-            for q in range(p.n_blocks):
-                relax_rows_block(p, c.rows, c.order[q], lam, c.v)
-        else:
-            for q in range(p.n_blocks):
-                i = c.order[q]
-                solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.v)
-
-
-cdef inline void form_velocity(const sweep_data_t* c, const double* lam) noexcept nogil:
-    # nothing to do where A is swept
-    if c.general != NULL:
-        whitened_gather(c.general, lam, c.v)
-    elif c.nv > 0:
-        rows_velocity(c.blocks, c.rows, lam, c.v)
+        exact = True
+    for k in range(2 if c.sweeps.mode == SYMMETRIC else 1):
+        sweep(c.sweeps, p, exact, lam, first and k == 0)
 
 
 cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
@@ -171,30 +135,31 @@ cdef inline void follow(double* y, double* x, double* p, double beta, int32_t n)
 cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (1)."""
     cdef sweep_data_t* c = <sweep_data_t*>context
-    cdef int32_t m = c.blocks.n_rows, i, s
+    cdef int32_t m = c.sweeps.blocks.n_rows, n_v = c.sweeps.n_v, i, s
     cdef double* x = c.work                             # x, then g; behind lam's part that of v
-    cdef double* q = c.work + m + c.nv                  # beta p, to be added
-    cdef double* p = q + m + c.nv
+    cdef double* q = c.work + m + n_v                   # beta p, to be added
+    cdef double* p = q + m + n_v
+    cdef double* v = c.sweeps.v
     cdef double* control = c.control
-    cdef const double* d = c.blocks.d
+    cdef const double* d = c.sweeps.blocks.d
     cdef double norm, beta = 0.0
     for s in range(n):
         if c.turn > 0 and c.turn % REFRESH == 0:
-            form_velocity(c, lam)
+            form_velocity(c.sweeps, lam)
         if s > 0:
             follow(lam, x, p, beta, m)
-            follow(c.v, x + m, p + m, beta, c.nv)
+            follow(v, x + m, p + m, beta, n_v)
         else:
             for i in range(m):
                 lam[i] += q[i]
                 x[i] = lam[i]
-            for i in range(c.nv):
-                c.v[i] += q[m + i]
-                x[m + i] = c.v[i]
-        sweep(c, lam, first_sweep and s == 0)
+            for i in range(n_v):
+                v[i] += q[m + i]
+                x[m + i] = v[i]
+        iterate(c, lam, first_sweep and s == 0)
         norm = step_energy(d, x, lam, m)
-        for i in range(c.nv):
-            x[m + i] -= c.v[i]
+        for i in range(n_v):
+            x[m + i] -= v[i]
         beta = norm / control[NORM] if control[NORM] > 0.0 else 0.0
         if not beta <= 1.0:
             if c.keeps and beta > 1.0 and energy(d, x, p, m) <= 0.0:
@@ -207,7 +172,7 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
         if c.turn == c.convex:
             control[NORM] = 0.0                         # another map: start anew
     if n > 0:
-        for i in range(m + c.nv):
+        for i in range(m + n_v):
             q[i] = beta * p[i]
             p[i] = q[i] - x[i]
 
@@ -215,9 +180,9 @@ cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
     """n iterations of (2)."""
     cdef sweep_data_t* c = <sweep_data_t*>context
-    cdef int32_t m = c.blocks.n_rows, i, s, mixed
+    cdef const blocks_t* p = c.sweeps.blocks
+    cdef int32_t m = p.n_rows, i, s, mixed
     cdef double* x = c.work                             # x, later f
-    cdef const double* d = c.blocks.d
     cdef double* root                                   # (m) square roots of d
     cdef mixing_t mixing
     mixing.m = m
@@ -231,20 +196,20 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
     root = mixing.dg + c.memory * m
     if c.turn == 0:
         for i in range(m):
-            root[i] = sqrt(d[i])
+            root[i] = sqrt(p.d[i])
     for s in range(n):
         mixed = mix(&mixing, lam)
         if mixed:
-            for i in range(c.blocks.n_blocks):
-                project_block(c.blocks, i, lam)
-            form_velocity(c, lam)
+            for i in range(p.n_blocks):
+                project_block(p, i, lam)
+            form_velocity(c.sweeps, lam)
         for i in range(m):
             x[i] = lam[i]
-        sweep(c, lam, first_sweep and s == 0)
+        iterate(c, lam, first_sweep and s == 0)
         for i in range(m):
             x[i] = root[i] * (lam[i] - x[i])
         if not take(&mixing, mixed, lam, x):
-            form_velocity(c, lam)
+            form_velocity(c.sweeps, lam)
         c.turn += 1
         if c.turn == c.convex:
             forget(&mixing)                             # another map
@@ -252,114 +217,64 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
 
 cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
     """As before the first iteration, from lam (m), but for the counts."""
-    cdef int32_t i, m = c.blocks.n_rows
+    cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
     if c.memory == 0:
         c.control[NORM] = 0.0
-        for i in range(2 * (m + c.nv)):
-            c.work[m + c.nv + i] = 0.0
+        for i in range(2 * n):
+            c.work[n + i] = 0.0
     else:
         for i in range(CONTROL):
             if i != UNDONE:
                 c.control[i] = 0.0
-    form_velocity(c, lam)
+    form_velocity(c.sweeps, lam)
 
 
-cdef enum:
-    FEWEST = 24                 # blocks: below, a sweep costs less than to find pairs
-    FIRST = 16                  # sweeps of a run that packs, with all before: packing costs two to four
+def sweeps_of(Data p, int32_t[::1] order, int split, int mode, rng, bint exact=False, bint convex=False):
+    """`Sweeps` to be accelerated; `convex`: some of them under the cone law first."""
+    cdef bint packs = may_pack(p) and not exact and mode != RANDOM and split == p.rows.n_joints
+    return Sweeps(p, order, split, mode, rng, prepare(p) if exact or convex else None, exact, packs, True)
 
 
-cdef class Pairs:
-    """Blocks of rows in pairs, level by level, for accelerated sweeps in a fixed order; made once these are many.
-
-    wanted : without it none are made, and the bits are the same.
-    """
-    cdef packed_t packed
-    cdef object keep
-    cdef bint asked, ready
-    cdef int32_t backwards
-
-    def __init__(self, bint wanted=True):
-        self.asked = not wanted
-
-    cdef void make(self, Data p, const int32_t[::1] order, int split, int mode, const double* lam):
-        cdef double[::1] room
-        self.asked = True
-        self.backwards = 0
-        if mode == RANDOM or not p.factored or p.blocks.n_blocks < FEWEST or split != p.rows.n_joints:
-            return
-        self.keep = room = np.empty(room_of(&p.blocks, &p.rows))
-        self.ready = pack_order(&p.blocks, &p.rows, &order[0], 1, &room[0], lam, &self.packed)
-
-    @property
-    def count(self):
-        """Pairs; 0 where blocks are swept one after the other."""
-        return self.packed.pairs if self.ready else 0
-
-
-def allocate(Data p, int memory):
-    """Zeroed (control, gram, work, v) for a run, and its pairs; memory 0 is nncg."""
-    cdef Py_ssize_t m = p.blocks.n_rows, nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
+def allocate(Sweeps x, int memory):
+    """Zeroed (control, gram, work) for a run; memory 0 is nncg."""
+    cdef Py_ssize_t m = x.c.blocks.n_rows
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY), np.zeros(3 * (m + nv) + (1 + 2 * memory) * m + 1),
-            np.zeros((nv // 6 + 2, 6)), Pairs())
+    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY),
+            np.zeros(3 * (m + x.c.n_v) + (1 + 2 * memory) * m + 1))
 
 
-def run(Data p, Watch watch, double[::1] lam, int n, double tol, int memory, prepared, bint exact, int convex, space,
-        int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint keeps=False):
+def run(Sweeps x, Watch watch, double[::1] lam, int n, double tol, int memory, int convex, space, bint keeps=False):
     """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
 
-    prepared is (start, numbers) of gauss_seidel.prepare, or None where neither `exact` nor `convex` asks for it;
-    space comes from `allocate`, v in it holding M^-1 J^T lam.
+    Blocks of x are prepared where they are exact or `convex` is not 0. space comes from `allocate`.
     """
     cdef sweep_data_t c
     cdef int32_t status, done = 0, more = 0
-    cdef double[::1] control = space[0], gram = space[1], work = space[2], g
-    cdef double[:, ::1] v = space[3]
-    cdef int32_t[::1] start
-    cdef Pairs pairs = space[4]
+    cdef double[::1] control = space[0], gram = space[1], work = space[2]
+    cdef sweep_t step = lav_nncg if memory == 0 else lav_anderson
     if lam.shape[0] == 0:
         if tol > 0.0:
             return CONVERGED, 0, 0, 0
         return RUNNING, n, n, 0
-    c.blocks = &p.blocks
-    c.csr = NULL if p.factored else &p.csr
-    c.rows = &p.rows
-    c.general = &p.general if p.is_general else NULL
-    c.start = NULL
-    c.g = NULL
-    c.exact = exact
+    c.sweeps = &x.c
+    c.cone = x.c.blocks[0]
+    c.cone.law = CONE
     c.convex = convex
     c.turn = watch.state.total
-    c.cone = p.blocks
-    c.cone.law = CONE
-    if prepared is not None:
-        start, g = prepared
-        c.start = &start[0]
-        c.g = &g[0]
-    c.order = &order[0]
-    c.split = split
-    c.mode = mode
     c.memory = memory
     c.keeps = keeps
-    c.rng = &rng[0]
-    c.v = &v[0, 0]
-    c.nv = p.general.n if p.is_general else 6 * p.rows.n_bodies if p.factored else 0
-    c.packed = NULL
-    if not exact and not pairs.asked and c.turn + <int64_t>n >= FIRST:
-        pairs.make(p, order, split, mode, &lam[0])
-    if pairs.ready:
-        c.packed = &pairs.packed
-    c.backwards = pairs.backwards
     c.control = &control[0]
     c.gram = &gram[0]
     c.work = &work[0]
+    x.make_room(c.turn + <int64_t>n)
     with nogil:
-        status = watch.run(lav_nncg if memory == 0 else lav_anderson, &c, &lam[0], n, tol, &done)
+        if c.turn == 0:
+            form_velocity(&x.c, &lam[0])
+        is_packed(&x.c, &lam[0], c.turn + <int64_t>n)
+        status = watch.run(step, &c, &lam[0], n, tol, &done)
         while status == STALLED and begins_again(&watch.state, AGAIN):
             forget_all(&c, &lam[0])
-            status = watch.run(lav_nncg if memory == 0 else lav_anderson, &c, &lam[0], n - done, tol, &more)
+            status = watch.run(step, &c, &lam[0], n - done, tol, &more)
             done += more
-    pairs.backwards = c.backwards
-    return status, done, done * (2 if mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])
+    return status, done, done * (2 if x.c.mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])

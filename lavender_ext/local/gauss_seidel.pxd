@@ -319,3 +319,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
             twist[k] += w[roll] * t1[k] + w[roll + 1] * t2[k]
     push_bodies(v, a, b, r.inv_mass, r.inv_inertia, r.arm_a + 3 * c, r.arm_b + 3 * c, impulse, twist)
     return found
+
+
+cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
+                          const double* g, const int32_t* order, double* lam, double* v) noexcept nogil

@@ -4,17 +4,15 @@
     over the factored form       w = J v + c lam - b, then v += M^-1 J^T (change)                   (2)
     over J and M                 w = Y u + c lam - b, then u += Y^T (change)                        (3)
 """
-from libc.stdint cimport int32_t, uint64_t
+from libc.stdint cimport int32_t
 
 import numpy as np
 
 from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
-from lavender_ext.core.order cimport advance_order
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin
 from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
@@ -126,66 +124,23 @@ def prepare(Data p):
     return np.asarray(start), np.asarray(g)
 
 
-cdef struct context_t:          # what a sweep needs besides lam
-    const blocks_t* blocks
-    const csr_t* csr            # NULL where factored
-    const rows_t* rows
-    const generalized_t* general        # NULL but for J and M
-    const int32_t* start
-    const double* g
-    double* velocity            # v (n_bodies, 6) of (2), u (nv) of (3)
-    int32_t* order
-    int32_t split
-    int32_t mode
-    uint64_t* rng
-    double fallbacks
-
-
-cdef void step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps, order as in sweep/serial.pyx; counts how often a block fell back."""
-    cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t s, q, i
-    for s in range(n):
-        advance_order(c.mode, first_sweep and s == 0, c.order, 0, c.split, c.rng)
-        advance_order(c.mode, first_sweep and s == 0, c.order, c.split, p.n_blocks, c.rng)
+cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
+                          const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
+    """One sweep over A, or over J and M (`o`), or over bodies (`r`), whose velocities v keeps; counts what fell back."""
+    cdef int32_t q, i, fallbacks = 0
+    if o != NULL:
         for q in range(p.n_blocks):
-            i = c.order[q]
-            if c.general != NULL:
-                c.fallbacks += solve_general_block(p, c.general, i, c.g + c.start[i], lam, c.velocity)
-            elif c.csr == NULL:
-                c.fallbacks += solve_rows_block(p, c.rows, i, c.g + c.start[i], lam, c.velocity)
-            else:
-                c.fallbacks += solve_csr_block(p, c.csr, i, c.g + c.start[i], lam)
-
-
-def run(Data p, Watch watch, double[::1] lam, int n, double tol, const int32_t[::1] start, const double[::1] g,
-        double[:, ::1] velocity, int32_t[::1] order, int split, int mode, uint64_t[::1] rng):
-    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done, fallbacks).
-
-    velocity (n_bodies + 1, 6) holds M^-1 J^T lam of a factored problem.
-    """
-    cdef context_t c
-    cdef int32_t status, done = 0
-    if lam.shape[0] == 0:
-        if tol > 0.0:
-            return CONVERGED, 0, 0
-        return RUNNING, n, 0
-    c.blocks = &p.blocks
-    c.general = &p.general if p.is_general else NULL
-    c.csr = NULL if p.factored else &p.csr
-    c.rows = &p.rows
-    c.start = &start[0]
-    c.g = &g[0]
-    c.velocity = &velocity[0, 0]
-    c.order = &order[0]
-    c.split = split
-    c.mode = mode
-    c.rng = &rng[0]
-    c.fallbacks = 0
-    with nogil:
-        status = watch.run(step, &c, &lam[0], n, tol, &done)
-    return status, done, int(c.fallbacks)
+            i = order[q]
+            fallbacks += solve_general_block(p, o, i, g + start[i], lam, v)
+    elif a != NULL:
+        for q in range(p.n_blocks):
+            i = order[q]
+            fallbacks += solve_csr_block(p, a, i, g + start[i], lam)
+    else:
+        for q in range(p.n_blocks):
+            i = order[q]
+            fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
+    return fallbacks
 
 
 def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, const double[:, ::1] q,

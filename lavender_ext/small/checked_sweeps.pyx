@@ -11,12 +11,10 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.accelerate.accelerated import allocate, run
+from lavender_ext.accelerate.accelerated import allocate, run, sweeps_of
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport Judged
-from lavender_ext.judge.measure import velocity_change
 from lavender_ext.judge.watch cimport RUNNING, Watch
-from lavender_ext.local import gauss_seidel
 
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
@@ -48,7 +46,7 @@ cdef class CheckedSweeps:
     cdef readonly bint exact
     cdef readonly int split, memory
     cdef readonly Watch watch
-    cdef readonly object space, prepared, order, rng     # as `accelerated.run` takes them
+    cdef readonly object over, space    # as `accelerated.run` takes them
     cdef readonly Judged now, best      # of the last check, and of all
     cdef readonly double before         # relative residual before the last sweeps,
     cdef readonly int last, done        # how many these were, and all of them
@@ -62,23 +60,14 @@ cdef class CheckedSweeps:
         self.metric, self.data, self.exact, self.split, self.memory = metric, data, exact, split, MEMORY
         # Rows of A that were formed: the form that was given has the last word.
         self.watch = Watch(data, PATIENCE, metric if formed else None)
-        self.prepared = gauss_seidel.prepare(data) if exact else None
-        self.space = allocate(data, MEMORY)
+        self.over = sweeps_of(data, np.arange(data.blocks.n_blocks, dtype=np.int32), split, 0, np.zeros(1, np.uint64), exact)
+        self.space = allocate(self.over, MEMORY)
         self.space[2].fill(0.0)         # its pages are there before the first sweep
-        self.order = np.arange(data.blocks.n_blocks, dtype=np.int32)
-        self.rng = np.zeros(1, np.uint64)
-
-    cdef int begin(self, lam) except -1:
-        if self.data.factored or self.data.is_general:
-            velocity_change(self.data, lam, self.space[3])
-        return 0
 
     cdef int sweep(self, lam, int n, double tol) except -1:
         """n of them, fewer where their watch ends them, whose checks cost as much as the first sweeps; none for tol = 0."""
         cdef int32_t last, swept
-        self.status, last, swept, self.restarts = run(
-            self.data, self.watch, lam, n, tol, MEMORY, self.prepared, self.exact, 0, self.space, self.order,
-            self.split, 0, self.rng, False)
+        self.status, last, swept, self.restarts = run(self.over, self.watch, lam, n, tol, MEMORY, 0, self.space)
         if tol == 0.0:
             self.watch.state.check_at = self.watch.state.total
         self.done += last
@@ -103,7 +92,8 @@ cdef class CheckedSweeps:
         cdef int last
         cdef int32_t end = self.done + n
         cdef double now
-        self.begin(lam)
+        if self.done:
+            self.over.start(lam)
         while True:
             last = self.sweep(lam, sweeps, tol)
             now = self.check(lam, before, last, tol)
@@ -123,7 +113,8 @@ cdef class CheckedSweeps:
         cdef int32_t at = self.done, end = at + n, due = at + first, step
         cdef double fit = min(share * time, chunk) / each
         cdef bint is_due
-        self.begin(lam)
+        if self.done:
+            self.over.start(lam)
         while True:
             step = max(1, min(<int32_t>min(fit, 1e9), min(due, end) - self.done))
             self.sweep(lam, step, 0.0)

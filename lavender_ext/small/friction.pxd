@@ -4,19 +4,19 @@ One call solves a part over A or over bodies, in room that the caller has. Facto
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
-from libc.string cimport memcpy, memset
+from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, options_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
 from lavender_ext.judge.score cimport score_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE
+from lavender_ext.sweep.serial cimport context_t, form_velocity
 
 
 cdef enum:
@@ -35,6 +35,7 @@ cdef struct part_t:
     int32_t split               # blocks before it are swept before the others: joints, contacts
     const int32_t* at           # of blocks that are solved exactly, as gauss_seidel.prepare has them; else NULL
     const double* prepared
+    double nothing              # relative residual of doing nothing where the part is the whole, else -1
 
 
 cdef struct ask_t:
@@ -63,6 +64,7 @@ cdef struct turns_t:            # of one part
     double* w                   # (m)
     double* error               # (m)
     double* scratch             # (12 n_bodies)
+    context_t sweeps
     sweep_data_t c
     options_t options
     room_t room
@@ -82,15 +84,17 @@ cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* r
     t.swept, t.w, t.error, t.scratch = work, work + m, work + 2 * m, work + 3 * m
     work += 3 * m + 12 * n
     memset(&t.c, 0, sizeof(t.c))
-    t.c.v, t.c.control, t.c.gram = work, work + 6 * n, work + 6 * n + CONTROL
+    memset(&t.sweeps, 0, sizeof(t.sweeps))
+    t.sweeps.v, t.c.control, t.c.gram = work, work + 6 * n, work + 6 * n + CONTROL
     t.c.work = t.c.gram + MAX_MEMORY * MAX_MEMORY
     memset(t.c.control, 0, (CONTROL + MAX_MEMORY * MAX_MEMORY) * sizeof(double))
     for i in range(v.p.n_blocks):
         order[i] = i
     rng[0] = 0
-    t.c.blocks, t.c.csr, t.c.rows, t.c.nv = &v.p, v.a, v.r, <int32_t>(6 * n)
-    t.c.order, t.c.rng, t.c.split, t.c.memory = order, rng, t.s.split, MEMORY
-    t.c.exact, t.c.start, t.c.g = t.s.at != NULL, t.s.at, t.s.prepared
+    t.c.sweeps, t.c.memory = &t.sweeps, MEMORY
+    t.sweeps.blocks, t.sweeps.csr, t.sweeps.rows, t.sweeps.n_v = &v.p, v.a, v.r, <int32_t>(6 * n)
+    t.sweeps.order, t.sweeps.rng, t.sweeps.split = order, rng, t.s.split
+    t.sweeps.exact, t.sweeps.start, t.sweeps.g = t.s.at != NULL, t.s.at, t.s.prepared
 
 
 cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
@@ -111,9 +115,12 @@ cdef inline bint promises(double before, double now, double tol, int32_t rounds)
     return False
 
 
-cdef inline double sweep_on(turns_t* t, int32_t most, bint hoping) noexcept nogil:
-    """Sweeps of `swept` up to `most` in all, `hoping` as long as they promise an end within that; its relative residual."""
-    cdef double before, tol = t.o.tol, now = found_at(t, t.swept)
+cdef inline double sweep_on(turns_t* t, double now, int32_t most, bint hoping) noexcept nogil:
+    """Sweeps of `swept`, whose residual is `now`, up to `most` in all; its relative residual then.
+
+    `hoping`: as long as they promise an end within that.
+    """
+    cdef double before, tol = t.o.tol
     cdef int32_t step = FIRST
     while now > tol and t.c.turn < most:
         before = now
@@ -156,7 +163,7 @@ cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
         return 1.0 / 0.0
     now = step_newton(t, SHORT)
     if now > t.o.tol and t.o.factored + t.said.factorisations * cubed < t.o.most_factored:
-        now = sweep_on(t, AGAIN * t.o.most, t.s.v.p.law == CONE)
+        now = sweep_on(t, found_at(t, t.swept), AGAIN * t.o.most, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, STEPS)
         memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
@@ -169,27 +176,31 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     cdef turns_t t
     cdef uint64_t rng
     cdef const blocks_t* p = &s.v.p
-    cdef double own, less, now
+    cdef double own = o.e0, fast = o.v0, less, now = s.nothing
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
     do_nothing(p, s.answer, t.w)
-    judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
-    own = nothing.energy
-    if own == 0.0 and nothing.velocity == 0.0:
+    if now < 0.0:
+        judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
+        own, fast = nothing.energy, nothing.velocity
+    if own == 0.0 and fast == 0.0:
         return True     # doing nothing is right
     less = own / o.e0 if own < o.e0 else o.e0 / own     # squares of what is far from 1 vanish
     t.e0, t.v0 = (own if own > o.e0 else o.e0) * sqrt(0.5 * (1.0 + less * less)), o.v0
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
-    if s.v.r != NULL:
-        rows_velocity(p, s.v.r, t.swept, t.c.v)
+    form_velocity(&t.sweeps, t.swept)
     t.said.factorisations = 0
-    now = sweep_on(&t, o.first, True)
+    if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
+        now = found_at(&t, t.swept)
+    elif now < 0.0:
+        now = relative_of(&nothing, t.w, p.n_rows, t.e0, t.v0)
+    now = sweep_on(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol:
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
-        now = t.e0 / own if t.e0 / own < t.v0 / nothing.velocity else t.v0 / nothing.velocity
+        now = t.e0 / own if t.e0 / own < t.v0 / fast else t.v0 / fast
         t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
         now = factor_in_turns(&t)
     o.swept += t.c.turn

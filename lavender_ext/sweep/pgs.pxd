@@ -12,6 +12,7 @@ from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n
                                       relax_tangents)
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
+from lavender_ext.core.rows cimport rows_t
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
@@ -85,3 +86,11 @@ cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, 
         take_general(g, b, q, relax_row(lam[q], x, p.step[q], -bound, bound), lam, u)
     if kind == CONTACT_ROLLING:
         relax_general_disk(p, g, b, end - 2, 2, p.rolling[i] * lam[j], lam, u)
+
+
+cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, int32_t first, int32_t end,
+                       double* lam) noexcept nogil
+cdef void relax_bodies(const blocks_t* p, const rows_t* r, const int32_t* order, int32_t first, int32_t end, double* lam,
+                       double* v) noexcept nogil
+cdef void relax_general(const blocks_t* p, const generalized_t* g, const int32_t* order, int32_t first, int32_t end,
+                        double* lam, double* u) noexcept nogil

@@ -1,12 +1,13 @@
-"""Sweeps of Gauss-Seidel and Jacobi type, on the rows of A or on the factored form.
+"""Sweeps of Gauss-Seidel and Jacobi type, on the rows of A, on bodies, or on J and M.
 
     pgs                   block i, then the next, each on w = A lam - b with the lam of now          (1)
     sequential impulses   the same sweep on v = M^-1 J^T lam: w = J v + c lam - b, A never formed     (2)
+    block gauss seidel    as (1) or (2), each block solved exactly (local/gauss_seidel.pxd)
     jacobi                all blocks on the w of before the sweep, each step times omega              (3)
     sor                   lam_i <- lam_i - omega w_i / d_i on free rows                              (4)
 
-The update of one block is core/block.pxd (1)-(4) everywhere. Invariant of (2), on entry and after every
-block: v = M^-1 J^T lam to rounding.
+Over J and M the sweeps of (1) run on u = Y^T lam: w = Y u + c lam - b. The update of one block is core/block.pxd (1)-(4)
+everywhere. Invariant of (2), on entry and after every block: v = M^-1 J^T lam to rounding.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
@@ -14,98 +15,49 @@ import numpy as np
 
 from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, relax_normal,
                                       relax_row, relax_tangents)
-from lavender_ext.core.csr cimport csr_dot, csr_t
-from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.order cimport advance_order
+from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
-from lavender_ext.sweep.packed cimport MOST, move_impulses, pack_order, packed_t, room_of, sweep_records
-from lavender_ext.sweep.pgs cimport relax_csr_block, relax_general_block
-
-
-cdef public void lav_impulse_sweeps(const blocks_t* p, const rows_t* r, double* lam, double* v, int32_t* order,
-                                    int32_t split, int32_t mode, uint64_t* rng, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (2), order as in next_order; v (n_bodies, 6)."""
-    cdef int32_t s, i
-    for s in range(n):
-        advance_order(mode, first_sweep and s == 0, order, 0, split, rng)
-        advance_order(mode, first_sweep and s == 0, order, split, p.n_blocks, rng)
-        for i in range(p.n_blocks):
-            relax_rows_block(p, r, order[i], lam, v)
+from lavender_ext.local.gauss_seidel cimport solve_blocks
+from lavender_ext.sweep.levels cimport sweep_levels
+from lavender_ext.sweep.packed cimport MOST, move_impulses, room_of, sweep_records
+from lavender_ext.sweep.pgs cimport relax_bodies, relax_general, relax_matrix
+from lavender_ext.sweep.serial cimport NOT_YET, READY, USELESS, context_t, form_velocity, is_packed, next_order
 
 
 cdef enum:
     FEWEST = 24                 # blocks: below, calls cost more than sweeps
     FIRST = 8                   # sweeps of the run that packs: packing costs two to four
-    FIRST_FAR = 16              # from FAR blocks, whose records leave the second-level cache
+    FIRST_FAR = 16              # from FAR blocks, whose records leave the second-level cache; of sweeps one at a time
     FAR = 4000
 
 
-cdef enum:                      # of a packing
-    NOT_YET = 0
-    READY = 1
-    USELESS = 2
+cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
+    """One sweep over blocks p, those of `c` or with another law."""
+    next_order(c, first)
+    if exact:
+        c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.g, c.order, lam, c.v)
+    elif c.general != NULL:
+        relax_general(p, c.general, c.order, 0, p.n_blocks, lam, c.v)
+    elif c.csr != NULL:
+        relax_matrix(p, c.csr, c.order, 0, p.n_blocks, lam)
+    elif c.packing != NULL and c.packing.single and c.packing.status == READY:
+        sweep_levels(p, c.rows, &c.packing.packed, c.packing.backwards, lam, c.v)
+    else:
+        relax_bodies(p, c.rows, c.order, 0, p.n_blocks, lam, c.v)
 
 
-cdef struct packing_t:          # blocks in pairs, made at the first run of sweeps that is long enough
-    packed_t packed
-    double* room
-    int32_t status
-    int32_t first               # sweeps of a run that makes it
-
-
-cdef inline int32_t impulse_sweeps_packed(const blocks_t* p, const rows_t* r, double* lam, double* v, const int32_t* order,
-                                          packing_t* x, int32_t n) noexcept nogil:
-    """n sweeps of (2) with the same bits, or 0 and none where one block after the other is faster; v (n_bodies + 2, 6),
-    behind the last body zeros."""
-    if x.status == NOT_YET and n >= x.first:
-        x.status = READY if pack_order(p, r, order, 0, x.room, lam, &x.packed) else USELESS
-    if x.status != READY or n < x.packed.stages:
-        return 0
-    move_impulses(p, order, &x.packed, 0, lam)
-    sweep_records(p, r, &x.packed, n, lam, v)
-    move_impulses(p, order, &x.packed, 1, lam)
-    return 1
-
-
-cdef struct context_t:          # what a sweep needs besides lam
-    const blocks_t* blocks
-    const csr_t* csr
-    const rows_t* rows
-    const generalized_t* general        # NULL where A is swept
-    double omega
-    double* scratch             # (m) Jacobi; (n_bodies, 6) velocity of sequential impulses; (nv) u
-    int32_t* order
-    int32_t split
-    int32_t mode
-    uint64_t* rng
-    packing_t* packing          # NULL: one block after the other
-
-
-cdef inline void next_order(context_t* c, int32_t first_sweep) noexcept nogil:
-    """Advance order (k) within order[:split] and order[split:] apart; `first_sweep` says that none came before."""
-    advance_order(c.mode, first_sweep, c.order, 0, c.split, c.rng)
-    advance_order(c.mode, first_sweep, c.order, c.split, c.blocks.n_blocks, c.rng)
-
-
-cdef void pgs_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (1); over J and M u (nv) = Y^T lam is in scratch."""
+cdef void sweep_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
+    """n sweeps of (1) or (2), over exact blocks or not; in pairs with the same bits."""
     cdef context_t* c = <context_t*>context
-    cdef const blocks_t* p = c.blocks
-    cdef int32_t s, i
+    cdef int32_t s
+    if is_packed(c, lam, n) and n >= c.packing.packed.stages:
+        move_impulses(c.blocks, c.order, &c.packing.packed, 0, lam)
+        sweep_records(c.blocks, c.rows, &c.packing.packed, n, lam, c.v)
+        move_impulses(c.blocks, c.order, &c.packing.packed, 1, lam)
+        return
     for s in range(n):
-        if c.order == NULL:                             # every block is one row, as it stands: without the lookups
-            for i in range(p.n_rows):
-                lam[i] = relax_row(lam[i], csr_dot(c.csr, i, lam) - p.b[i], p.step[i], p.lower[i], p.upper[i])
-            continue
-        next_order(c, first_sweep and s == 0)
-        if c.general == NULL:
-            for i in range(p.n_blocks):
-                relax_csr_block(p, c.csr, c.order[i], lam)
-        else:
-            for i in range(p.n_blocks):
-                relax_general_block(p, c.general, c.order[i], lam, c.scratch)
+        sweep(c, c.blocks, c.exact, lam, first_sweep and s == 0)
 
 
 cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
@@ -121,10 +73,10 @@ cdef void sor_step(void* context, double* lam, int32_t first_sweep, int32_t n) n
 
 
 cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    """n sweeps of (3); scratch (m) holds w."""
+    """n sweeps of (3); w (m) is scratch."""
     cdef context_t* c = <context_t*>context
     cdef const blocks_t* p = c.blocks
-    cdef double* w = c.scratch
+    cdef double* w = c.w
     cdef int32_t _s, i, j, q, nt, end
     cdef double bound, omega = c.omega
     for _s in range(n):
@@ -151,84 +103,121 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
                 relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
 
 
-cdef void impulse_step(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil:
-    cdef context_t* c = <context_t*>context
-    if c.packing != NULL and impulse_sweeps_packed(c.blocks, c.rows, lam, c.scratch, c.order, c.packing, n):
-        return
-    lav_impulse_sweeps(c.blocks, c.rows, lam, c.scratch, c.order, c.split, c.mode, c.rng, first_sweep, n)
-
-
-PGS, SOR, JACOBI, IMPULSES = range(4)
-
-
-cdef class Packing:
-    """Blocks of `p` in pairs, for sequential impulses in one fixed order.
-
-    Made at the first run of sweeps that is long enough; `before`, of another problem, hands over its room.
-    """
-    cdef packing_t state
-    cdef object keep
-
-    def __init__(self, Data p, Packing before=None):
-        cdef int64_t size = room_of(&p.blocks, &p.rows)
-        cdef double[::1] room
-        self.keep = None
-        if before is not None:
-            self.keep, before.keep = before.keep, None
-            before.state.status = USELESS
-        if self.keep is None or len(self.keep) < size:
-            self.keep = np.empty(size)
-        room = self.keep
-        self.state.room = &room[0]
-        self.state.first = FIRST if p.blocks.n_blocks < FAR else FIRST_FAR
-        self.state.status = NOT_YET
-
-    @property
-    def shape(self):
-        """(records, stages); (0, 0) where nothing is packed."""
-        if self.state.status != READY:
-            return 0, 0
-        return self.state.packed.pairs, self.state.packed.stages
+SWEEPS, SOR, JACOBI = range(3)
 
 
 def may_pack(Data p):
-    """Whether there are as many blocks over bodies as gain by packing."""
+    """Whether there are as many blocks over bodies as gain by standing in pairs."""
     return bool(p.factored and FEWEST <= p.blocks.n_blocks <= MOST)
 
 
-def run(int kind, Data p, Watch watch, double[::1] lam, int n, double tol, int32_t[::1] order, int split, int mode,
-        uint64_t[::1] rng, double omega=1.0, double[::1] scratch=None, Packing packing=None):
-    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done).
+cdef class Sweeps:
+    """What sweeps of a problem run over: its blocks in an order, and the velocities that they keep.
 
-    kind is PGS, SOR, JACOBI or IMPULSES; an empty order means row by row, for PGS over single rows.
-    `packing`, of this `p` and `order`, makes impulses pack; scratch is then (n_bodies + 2, 6).
+    Parameters
+    ----------
+    p : Data
+    order : (k,) int32
+        Turned round or shuffled in place, as `mode` says; empty: row by row, over single rows of A.
+    split, mode, rng
+        As in `lavender.ordering.Order`.
+    prepared : tuple, optional
+        (start, numbers) of `gauss_seidel.prepare`, for blocks that are solved exactly.
+    exact : bool
+        They all are; else in the first sweeps of `accelerated.run` alone.
+    packs : bool
+        In pairs, from a run on that is long enough; the order is the same in each sweep, or turned round.
+    single : bool
+        Something is done between two sweeps: pairs are of one.
+    before : Sweeps, optional
+        Of another problem: hands over the room of its pairs, and packs no more.
     """
-    cdef context_t c
+
+    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, prepared=None,
+                 bint exact=False, bint packs=False, bint single=False, Sweeps before=None):
+        cdef int32_t[::1] start
+        cdef double[::1] g
+        cdef double[:, ::1] v
+        cdef context_t* c = &self.c
+        self.keep = p, order, rng, prepared
+        c.blocks = &p.blocks
+        if p.is_general:
+            c.general = &p.general
+            c.n_v = p.general.n
+        elif p.factored:
+            c.rows = &p.rows
+            c.n_v = 6 * p.rows.n_bodies
+        else:
+            c.csr = &p.csr
+        if c.n_v > 0:
+            self.velocity = v = np.zeros((c.n_v // 6 + 2, 6))
+            c.v = &v[0, 0]
+        c.split = split
+        c.mode = mode
+        c.order = &order[0] if order.shape[0] else NULL
+        c.rng = &rng[0]
+        c.exact = exact
+        if prepared is not None:
+            start, g = prepared
+            c.start = &start[0]
+            c.g = &g[0]
+        self.packing.single = single
+        self.packing.first = FIRST_FAR if single or p.blocks.n_blocks >= FAR else FIRST
+        if packs:
+            c.packing = &self.packing
+        if before is not None:
+            self.room, before.room = before.room, None
+            before.packing.status = USELESS
+
+    cdef int make_room(self, int64_t sweeps) except -1:
+        """Room of pairs, where so many sweeps in a run make them."""
+        cdef int64_t size
+        cdef double[::1] room
+        cdef packing_t* x = self.c.packing
+        if x != NULL and x.status == NOT_YET and x.room == NULL and sweeps >= x.first:
+            size = room_of(self.c.blocks, self.c.rows)
+            if self.room is None or len(self.room) < size:
+                self.room = np.empty(size)
+            room = self.room
+            x.room = &room[0]
+        return 0
+
+    def start(self, const double[::1] lam):
+        """The velocities of an impulse (m,), where it is another than the last sweep left."""
+        if lam.shape[0]:
+            form_velocity(&self.c, &lam[0])
+
+    @property
+    def pairs(self):
+        """(records, stages); (0, 0) where one block is swept after the other."""
+        if self.packing.status != READY:
+            return 0, 0
+        return self.packing.packed.pairs, self.packing.packed.stages
+
+
+def run(int kind, Sweeps x, Watch watch, double[::1] lam, int n, double tol, double omega=1.0):
+    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done, blocks that fell back).
+
+    kind is SWEEPS, SOR or JACOBI. Before the first sweep the velocities of lam are formed; later ones keep them.
+    """
     cdef int32_t status, done = 0
-    cdef sweep_t step = pgs_step
+    cdef double[::1] w
+    cdef sweep_t step = sweep_step
     if lam.shape[0] == 0:
         if tol > 0.0:
-            return CONVERGED, 0
-        return RUNNING, n
+            return CONVERGED, 0, 0
+        return RUNNING, n, 0
     if kind == 1:
         step = sor_step
     elif kind == 2:
         step = jacobi_step
-    elif kind == 3:
-        step = impulse_step
-    c.blocks = &p.blocks
-    c.csr = &p.csr
-    c.rows = &p.rows
-    c.general = &p.general if p.is_general else NULL
-    c.omega = omega
-    c.scratch = &scratch[0] if scratch is not None else NULL
-    c.order = &order[0] if order.shape[0] else NULL
-    c.split = split
-    c.mode = mode
-    c.rng = &rng[0]
-    c.packing = NULL
-    if packing is not None:
-        c.packing = &packing.state
+        w = np.empty(lam.shape[0])
+        x.c.w = &w[0]
+    x.c.omega = omega
+    x.c.fallbacks = 0.0
+    x.make_room(n)
     with nogil:
-        status = watch.run(step, &c, &lam[0], n, tol, &done)
-    return status, done
+        if watch.state.total == 0:
+            form_velocity(&x.c, &lam[0])
+        status = watch.run(step, &x.c, &lam[0], n, tol, &done)
+    return status, done, int(x.c.fallbacks)

@@ -15,12 +15,9 @@ OpenMP would make the end of every run wait for all of them.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport blocks_t
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
-from lavender_ext.sweep.pgs cimport relax_csr_block
+from lavender_ext.sweep.pgs cimport relax_bodies, relax_matrix
+from lavender_ext.sweep.serial cimport Sweeps, context_t, form_velocity
 
 
 cdef extern from *:
@@ -68,12 +65,8 @@ cdef enum:
 
 
 cdef struct colored_t:
-    const blocks_t* blocks
-    const csr_t* csr
-    const rows_t* rows          # NULL: projected Gauss-Seidel on csr
-    double* v                   # (n_bodies, 6), sequential impulses
+    const context_t* c          # over A, or bodies; its order is by colour
     double* lam                 # (m)
-    const int32_t* order        # (k) by colour
     const int32_t* color_ptr    # (n_colors + 1)
     int32_t n_colors
     int32_t team                # threads that may take part, one range each
@@ -91,13 +84,10 @@ cdef inline int32_t range_start(const colored_t* x, int32_t color, int32_t t) no
 
 
 cdef inline void sweep_chunk(const colored_t* x, int32_t first, int32_t end) noexcept nogil:
-    cdef int32_t k
-    if x.rows == NULL:
-        for k in range(first, end):
-            relax_csr_block(x.blocks, x.csr, x.order[k], x.lam)
+    if x.c.csr != NULL:
+        relax_matrix(x.c.blocks, x.c.csr, x.c.order, first, end, x.lam)
     else:
-        for k in range(first, end):
-            relax_rows_block(x.blocks, x.rows, x.order[k], x.lam, x.v)
+        relax_bodies(x.c.blocks, x.c.rows, x.c.order, first, end, x.lam, x.c.v)
 
 
 cdef int32_t take_part(colored_t* x, int32_t thread) noexcept nogil:
@@ -174,33 +164,22 @@ cdef void follow(colored_t* x, int32_t thread) noexcept nogil:
 cdef class Team:
     """One run of coloured sweeps, for one thread that calls `lead` and others that call `help`.
 
-    With v (6 (n_bodies + 1),) = M^-1 J^T lam: sequential impulses; without: projected Gauss-Seidel on A. order
-    (k,) holds the blocks by colour, color_ptr the first place of each.
+    sweeps: over A or bodies, in an order by colour; color_ptr is the first place of each.
     """
     cdef colored_t x
     cdef Watch watch
     cdef object keep
 
-    def __init__(self, Data p, Watch watch, double[::1] lam, const int32_t[::1] order,
-                 const int32_t[::1] color_ptr, int threads, double[::1] v=None, alone=(0, ALONE)):
+    def __init__(self, Sweeps sweeps, Watch watch, double[::1] lam, const int32_t[::1] color_ptr, int threads,
+                 alone=(0, ALONE)):
         cdef int32_t t
         self.x.alone, self.x.penalty = alone
         self.watch = watch
-        self.keep = (p, lam, order, color_ptr, v)
-        self.x.blocks = &p.blocks
-        self.x.csr = &p.csr
-        self.x.rows = NULL
-        self.x.v = NULL
-        if v is not None:
-            self.x.rows = &p.rows
-            self.x.v = &v[0]
+        self.keep = (sweeps, lam, color_ptr)
+        self.x.c = &sweeps.c
         self.x.n_colors = <int32_t>color_ptr.shape[0] - 1
         self.x.color_ptr = &color_ptr[0]
-        self.x.lam = NULL
-        self.x.order = NULL
-        if lam.shape[0] > 0:
-            self.x.lam = &lam[0]
-            self.x.order = &order[0]
+        self.x.lam = &lam[0] if lam.shape[0] > 0 else NULL
         self.x.team = min(threads, MOST)
         self.x.stop[0] = self.x.done[0] = 0
         for t in range(self.x.team):
@@ -215,6 +194,8 @@ cdef class Team:
                 return CONVERGED, 0
             return RUNNING, n
         with nogil:
+            if self.watch.state.total == 0:
+                form_velocity(self.x.c, self.x.lam)
             status = self.watch.run(lead, &self.x, self.x.lam, n, tol, &done)
             lav_store(&self.x.stop[0], 1)
         return status, done

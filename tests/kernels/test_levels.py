@@ -7,19 +7,21 @@ from worked import after
 
 import lavender as lv
 from benchmarks.kernels import lattice_pile
-from lavender_ext.accelerate.accelerated import Pairs
+from lavender_ext.accelerate import accelerated
 
 
 def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
     """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    prepared = lv.prepare(problem, name, **options)
+    with pytest.MonkeyPatch.context() as patch:
+        if not packs:
+            patch.setattr(accelerated, "may_pack", lambda data: False)
+        prepared = lv.prepare(problem, name, **options)
     solver, state = prepared.solver, prepared.state
-    state.space = (*state.space[:4], Pairs(packs))
     rng = np.random.default_rng(problem.m)
     lam = 0.05 * np.abs(rng.normal(size=problem.m))
     for n in counts:
         solver.run(state, lam, n, tol)
-    return lam, state.space[3][: problem.rows.n_bodies], state.space[4].count
+    return lam, state.sweeps.velocity[: problem.rows.n_bodies], state.sweeps.pairs[0]
 
 
 ORDERS = ["given", "reverse", "symmetric", "bottom_up", "colored", "array"]

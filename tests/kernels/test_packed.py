@@ -12,6 +12,7 @@ import lavender as lv
 from benchmarks.kernels import lattice_pile
 from lavender.engine.layout import HEAD
 from lavender.solvers import layout
+from lavender_ext.sweep import serial
 
 CASES = [
     ("stack", {}),
@@ -118,27 +119,33 @@ def tangled(seed, contacts, joints, bodies=None, kind="disks"):
     return KINDS[kind](seed, bodies=bodies, joints=joints, contacts=contacts)
 
 
+def impulses(problem, packs=True, **options):
+    """Sequential impulses of a problem, prepared, perhaps never in pairs."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not packs:
+            patch.setattr(serial, "may_pack", lambda data: False)
+        return lv.prepare(problem, "sequential_impulses", **options)
+
+
 def in_chunks(problem, order, counts, start, *, packs=True):
     """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
     if order == "array":
         order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
-    prepared = lv.prepare(problem, "sequential_impulses", order=order)
+    prepared = impulses(problem, packs, order=order)
     solver, state = prepared.solver, prepared.state
-    if not packs:
-        state.packing = None
     lam = start.copy()
     for n in counts:
         solver.run(state, lam, n, 0.0)
-    return lam, state.velocity[:-2], state.packing
+    return lam, state.sweeps.velocity[:-2], state.sweeps.pairs
 
 
 def packed(problem, order, counts, start):
-    """How the contacts were packed in those runs, which have the bits of one contact after the other."""
-    lam, v, packing = in_chunks(problem, order, counts, start)
+    """(records, stages) of those runs, which have the bits of one contact after the other."""
+    lam, v, pairs = in_chunks(problem, order, counts, start)
     one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
     np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
     np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
-    return packing
+    return pairs
 
 
 @pytest.mark.parametrize("order", FIXED)
@@ -152,15 +159,12 @@ def test_packed_runs_of_any_length_are_the_plain_ones(order, kind, contacts, joi
     warm = np.abs(rng.normal(size=problem.m)) * 0.05
     for start in (problem.start(), warm):
         for counts in ([1], [7], [40], [1, 2, 16, 1, 3, 9, 2], [*rng.integers(1, 20, 6).tolist(), 30]):
-            packing = packed(problem, order, counts, start)
-            assert (packing is not None) == (problem.n_blocks >= 24)
-            if packing is not None:
-                pairs, _ = packing.shape
-                if max(counts) < 8 or (kind in NO_LANES and contacts > joints):
-                    assert pairs == 0
-                elif problem.n_blocks > 100:  # else too few may be free of each other
-                    assert pairs > 0
-                assert pairs <= problem.n_blocks
+            pairs, _ = packed(problem, order, counts, start)
+            if problem.n_blocks < 24 or max(counts) < 8 or (kind in NO_LANES and contacts > joints):
+                assert pairs == 0
+            elif problem.n_blocks > 100:  # else too few may be free of each other
+                assert pairs > 0
+            assert pairs <= problem.n_blocks
 
 
 @pytest.mark.parametrize("order", ["given", "reverse"])
@@ -168,7 +172,7 @@ def test_a_tall_stack_is_packed_over_sweeps(order):
     """Few contacts are free of each other in one sweep: those of several sweeps stand in pairs."""
     sim = after(5, "stack", n=40)
     problem = sim.constraint_problem()
-    assert packed(problem, order, [8, 1, 2, 3, 5, 30, 4], problem.start()).shape[1] > 1
+    assert packed(problem, order, [8, 1, 2, 3, 5, 30, 4], problem.start())[1] > 1
 
 
 def test_a_joint_on_top_of_a_tower_leaves_it_packed():
@@ -181,7 +185,7 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
             scene.add_joint("ball", -1, len(scene.bodies) - 1, anchor=(top[0], top[1], top[2] + 0.5))
         sim = after(5, scene)
         problem = sim.constraint_problem()
-        shapes.append(packed(problem, "given", [20], problem.start()).shape)
+        shapes.append(packed(problem, "given", [20], problem.start()))
     assert shapes[1][0] <= shapes[0][0] + 2
     assert shapes[1][1] >= shapes[0][1]
 
@@ -191,7 +195,7 @@ def test_large_piles_pack_at_longer_runs_and_written_out(monkeypatch):
     for least in (layout.LARGE, 1):
         monkeypatch.setattr(layout, "LARGE", least)
         for counts, packs in (([8], False), ([16, 3], True)):
-            assert (packed(pile, "reverse", counts, pile.start()).shape[0] > 0) == packs
+            assert (packed(pile, "reverse", counts, pile.start())[0] > 0) == packs
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-6])
@@ -199,11 +203,9 @@ def test_checks_between_packed_sweeps_see_what_they_would(tol):
     pile = lattice_pile(300)
     solutions = []
     for packs in (True, False):
-        prepared = lv.prepare(pile, "sequential_impulses")
-        if not packs:
-            prepared.state.packing = None
+        prepared = impulses(pile, packs)
         solutions.append(prepared.solve(tol=tol, max_iter=300))
-        assert not packs or prepared.state.packing.shape[0] > 0
+        assert not packs or prepared.state.sweeps.pairs[0] > 0
     a, b = solutions
     assert (a.status, a.iterations) == (b.status, b.iterations)
     np.testing.assert_array_equal(a.impulse.view(np.uint8), b.impulse.view(np.uint8))
@@ -219,8 +221,8 @@ def test_a_new_problem_takes_over_the_room():
     fresh = lv.solve(other, "sequential_impulses", tol=0.0, max_iter=20)
     np.testing.assert_array_equal(again.impulse.view(np.uint8), fresh.impulse.view(np.uint8))
     # what was there before goes on one by one
-    assert state.packing.shape == (0, 0)
-    state.velocity = None
+    assert state.sweeps.pairs == (0, 0)
+    state.sweeps.start(lam)
     prepared.solver.run(state, lam, 20, 0.0)
     one = in_chunks(problem, "given", [20], np.zeros(problem.m), packs=False)[0]
     np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
@@ -230,9 +232,11 @@ def test_contacts_of_one_body_are_not_packed():
     problem = tangled(1, 40, 0, bodies=3)
     ground = np.stack([np.full(40, -1), np.zeros(40)], axis=1).astype(np.int32)
     alone = lv.Problem.from_rows(replace(problem.rows, contact_body=ground), mu=0.5)
-    assert packed(alone, "given", [20], alone.start()).shape == (0, 0)
+    assert packed(alone, "given", [20], alone.start()) == (0, 0)
 
 
 @pytest.mark.parametrize("order", ["symmetric", "random"])
 def test_orders_that_change_are_not_packed(order):
-    assert lv.prepare(tangled(2, 60, 10), "sequential_impulses", order=order).state.packing is None
+    prepared = impulses(tangled(2, 60, 10), order=order)
+    prepared.solve(tol=0.0, max_iter=40)
+    assert prepared.state.sweeps.pairs == (0, 0)

@@ -6,6 +6,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import given, settings
 from kkt_truth import HAS_WIDE, Exact, Wide, matrix_in, solution_in
 from motion_truth import draw, truth
@@ -579,6 +580,15 @@ def test_rows_of_ellipses_are_the_problems_own(form):
     assert e.rows == pytest.approx(np.abs(p.slack(y) - p.slack(x)).max(), rel=1e-6)
     assert e.row == 2
     assert e.row_name == p.row_name(2)
+
+
+@pytest.mark.parametrize(("slow", "light"), [(1.0, 1.0), (1e-11, 1e-22), (1e-10, 1e-24)])
+def test_motions_of_a_heavy_body_are_told_beside_a_fast_one(slow, light):
+    """The three of a slow, heavy body differ by 1e-11 of the fastest row, and by as much energy as there is."""
+    p, fast = suite.case("painleve").problem, lv.Problem.contact(np.eye(2), [1.0, 0.1], [0.5])
+    both = sp.block_diag([light * p.csr, fast.csr], format="csr")
+    found = lv.motions(lv.Problem(np.concatenate([slow * p.b, fast.b]), p.cones + fast.cones, both))
+    assert len(found) == 3 and found.all
 
 
 @pytest.mark.parametrize("size", [1e-10, 1e-100, 1e150, 1e299])

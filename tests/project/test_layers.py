@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 #: Bottom to top, the rooms of lavender_ext, whose modules share inline headers by cimport.
 KERNEL_LEVELS = [
     {"core"},
-    {"factor", "judge"},
-    {"generalized", "local", "newton", "pivot", "sweep"},
+    {"factor", "judge", "local"},
+    {"generalized", "newton", "pivot", "sweep"},
     {"accelerate", "engine"},
     {"warm"},
     {"driver", "host"},

@@ -84,8 +84,7 @@ def test_a_leader_needs_no_helper(pile):
     """Helpers that never come, or come when all is done, change nothing."""
     prepared = lv.prepare(pile, "sequential_impulses", order="colored")
     state, lam = prepared.state, pile.start()
-    velocity = np.zeros(6 * (state.data.n_bodies + 1))
-    team = Team(state.data, state.watch, lam, state.order.blocks, state.order.color_ptr, 8, velocity)
+    team = Team(state.sweeps, state.watch, lam, state.order.color_ptr, 8)
     assert team.lead(5, 0.0) == (0, 5)
     np.testing.assert_array_equal(lam, sweeps(pile, NAME, 5, order="colored"))
     before = lam.copy()

@@ -10,6 +10,7 @@ typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64, CONTROL = 9, GRAM = 256 };
 enum { MOST_TURNS = 16, FEW_ROWS = 600 }; /* of auto, and up to which it forms dense matrices */
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
+enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */
 
 typedef struct kept_t { /* impulses of the problem before, by key */
   int32_t n_blocks, n_rows, most_blocks, most_rows;
@@ -28,6 +29,7 @@ struct lav_solver {
   lav_options options;
   kept_t kept;
   int32_t form, has_keys, is_short, n_v; /* n_v: numbers of v */
+  int32_t in_rows; /* every block is one row, and they are swept as they stand */
   blocks_t p;
   csr_t a;
   rows_t r;
@@ -46,13 +48,7 @@ struct lav_solver {
   double deadline;  /* by the clock of the budget */
 #ifndef LAV_SWEEPS_ONLY
   struct sweep_serial_packing_t packing;
-  struct local_gauss_seidel_context_t local;
-  int32_t *prepared_at;
-  double *prepared;
   struct accelerate_accelerated_sweep_data_t fast;
-  struct sweep_packed_packed_t pairs;
-  double *pair_room;
-  int32_t pairs_asked;
   struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
   struct driver_driver_options_t newton_options;
   struct driver_driver_room_t drive;

@@ -2,45 +2,27 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
 
-enum { PACK_ACCELERATED = 16 };
-
 static int32_t prepare_accelerated(lav_solver *s) {
   const int32_t rubs = core_block_has_friction(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
   const int64_t m = s->p.n_rows, work = 3 * (m + s->n_v) + (1 + 2 * (int64_t)memory) * m + 1;
   double *x;
   memset(&s->fast, 0, sizeof s->fast);
-  s->fast.exact = s->options.sweep == LAV_BLOCK_SWEEP || (s->options.sweep == LAV_DEFAULT_SWEEP && is_cone);
+  s->swept.exact = s->options.sweep == LAV_BLOCK_SWEEP || (s->options.sweep == LAV_DEFAULT_SWEEP && is_cone);
   s->fast.convex = rubs && !is_cone ? s->options.convex : 0;
-  if (s->fast.exact || s->fast.convex > 0) {
-    GIVE_BACK(prepare_blocks(s));
-    s->fast.start = s->prepared_at;
-    s->fast.g = s->prepared;
-  }
+  if (s->swept.exact || s->fast.convex > 0) GIVE_BACK(prepare_blocks(s));
   x = TAKE(s, double, CONTROL + GRAM + work);
-  s->pair_room = NULL;
-  s->pairs_asked = s->fast.exact || s->mode == core_order_RANDOM || s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM ||
-                   s->split != s->r.n_joints;
-  if (!s->pairs_asked) s->pair_room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  if (!s->swept.exact && s->mode != core_order_RANDOM && s->form == LAV_BODIES && s->split == s->r.n_joints) take_packing(s, 1);
   if (s->is_short) return LAV_ERROR_ROOM;
   memset(x, 0, (size_t)(CONTROL + GRAM + work) * sizeof(double));
+  s->fast.sweeps = &s->swept;
   s->fast.control = x;
   s->fast.gram = x + CONTROL;
   s->fast.work = x + CONTROL + GRAM;
-  s->fast.blocks = &s->p;
-  s->fast.csr = s->form == LAV_BODIES ? NULL : &s->a;
-  s->fast.rows = &s->r;
-  s->fast.general = general_of(s);
   s->fast.cone = s->p;
   s->fast.cone.law = LAV_CONE;
-  s->fast.order = s->order;
-  s->fast.split = s->split;
-  s->fast.mode = s->mode;
   s->fast.memory = memory;
   s->fast.keeps = s->options.keeps;
-  s->fast.rng = &s->rng;
-  s->fast.v = s->v;
-  s->fast.nv = s->n_v;
   s->context = &s->fast;
   s->step = memory == 0 ? k_nncg : k_anderson;
   return LAV_OK;
@@ -50,16 +32,8 @@ static int32_t is_accelerated(const lav_solver *s) {
   return s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG;
 }
 
-/* Blocks in pairs, once sweeps are many: the same bits. */
-static void pack_pairs(lav_solver *s, int32_t n) {
-  if (!is_accelerated(s) || s->pairs_asked || s->fast.turn + (int64_t)n < PACK_ACCELERATED) return;
-  s->pairs_asked = 1;
-  s->fast.backwards = 0;
-  if (sweep_packed_pack_order(&s->p, &s->r, s->order, 1, s->pair_room, s->impulse, &s->pairs)) s->fast.packed = &s->pairs;
-}
-
 static int32_t restarts_of(const lav_solver *s) {
-  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) return (int32_t)s->local.fallbacks;
+  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) return (int32_t)s->swept.fallbacks;
   if (s->options.method == LAV_ADMM) return s->factors;
   return is_accelerated(s) ? (int32_t)s->fast.control[s->fast.memory == 0 ? 1 : accelerate_mixing_UNDONE] : 0;
 }

@@ -160,7 +160,7 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
     core_order_reverse(s->order, 0, s->split);
     core_order_reverse(s->order, s->split, k);
   }
-  s->swept.order = single && !q->order && s->options.order == LAV_GIVEN && q->form == LAV_MATRIX ? NULL : s->order;
+  s->in_rows = single && !q->order && s->options.order == LAV_GIVEN && q->form == LAV_MATRIX;
   return LAV_OK;
 }
 

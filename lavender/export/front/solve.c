@@ -43,97 +43,98 @@ static void carry(lav_solver *s) {
 
 /* -- methods ---------------------------------------------------------------------------------------------------------- */
 
-static void impulse_step(void *context, double *lam, int32_t first, int32_t n) {
+#ifdef LAV_SWEEPS_ONLY
+/* Block after block, over A or bodies. */
+static void sweep_step(void *context, double *lam, int32_t first, int32_t n) {
   struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
-  k_impulse_sweeps(c->blocks, c->rows, lam, c->scratch, c->order, c->split, c->mode, c->rng, first, n);
+  int32_t i;
+  for (i = 0; i < n; i++) {
+    sweep_serial_next_order(c, first && i == 0);
+    if (c->csr) sweep_pgs_relax_matrix(c->blocks, c->csr, c->order, 0, c->blocks->n_blocks, lam);
+    else sweep_pgs_relax_bodies(c->blocks, c->rows, c->order, 0, c->blocks->n_blocks, lam, c->v);
+  }
+}
+#else
+#define sweep_step sweep_serial_sweep_step
+
+/* Room for pairs of blocks, with the same bits; `single`: something is done between two sweeps. */
+static void take_packing(lav_solver *s, int32_t single) {
+  if (s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM || s->p.n_blocks > sweep_packed_MOST) return;
+  memset(&s->packing, 0, sizeof s->packing);
+  s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  s->packing.first = single || s->p.n_blocks >= FAR_FROM ? PACK_FAR_AT : PACK_AT;
+  s->packing.single = single;
+  s->swept.packing = &s->packing;
+}
+
+/* Each block's own part of A, for those that are solved exactly. */
+static int32_t prepare_blocks(lav_solver *s) {
+  int32_t *start = TAKE(s, int32_t, s->p.n_blocks);
+  double numbers, *g;
+  if (s->is_short) return LAV_ERROR_ROOM;
+  numbers = k_prepared_sizes(&s->p, start);
+  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
+  g = TAKE(s, double, (int64_t)numbers);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(g, 0, ((size_t)numbers + 1) * sizeof(double));
+  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, start, g);
+  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, start, g);
+  else k_prepare_csr(&s->p, &s->a, start, g);
+  s->swept.start = start;
+  s->swept.g = g;
+  return LAV_OK;
+}
+
+static int32_t prepare_accelerated(lav_solver *s);
+#endif
+
+/* max_i sum_j |A_ij| sqrt(s_i s_j), s the steps, of which a damping that is safe follows. */
+static double largest_row(const lav_solver *s) {
+  double most = 0.0, sum;
+  int32_t i, q;
+  for (i = 0; i < s->p.n_rows; i++) {
+    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
+      sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
+    sum *= sqrt(s->p.step[i]);
+    if (sum > most) most = sum;
+  }
+  return most;
 }
 
 static int32_t prepare_sweeps(lav_solver *s) {
+  const int32_t method = s->options.method;
+  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
+  s->swept.packing = NULL;
   s->swept.blocks = &s->p;
-  s->swept.csr = &s->a;
-  s->swept.rows = &s->r;
+  s->swept.csr = s->form == LAV_MATRIX ? &s->a : NULL;
+  s->swept.rows = s->form == LAV_BODIES ? &s->r : NULL;
   s->swept.general = general_of(s);
-  s->swept.omega = s->options.omega;
-  s->swept.scratch = s->form == LAV_MATRIX ? s->watch.e : s->v; /* of jacobi, which the watch does not need between sweeps */
+  s->swept.v = s->v;
+  s->swept.n_v = s->n_v;
+  s->swept.order = method == LAV_PGS && s->in_rows ? NULL : s->order;
   s->swept.split = s->split;
   s->swept.mode = s->mode;
   s->swept.rng = &s->rng;
-  s->swept.packing = NULL;
+  s->swept.omega = s->options.omega;
+  s->swept.w = s->watch.e; /* which the watch does not need between sweeps */
   s->context = &s->swept;
-  s->step = s->options.method == LAV_PGS ? sweep_serial_pgs_step : sweep_serial_sor_step;
-  if (s->options.method == LAV_SOR || s->options.method == LAV_GAUSS_SEIDEL) s->swept.order = s->order;
-  if (s->options.method == LAV_JACOBI) {
-    double most = 0.0, sum;
-    int32_t i, q;
-    for (i = 0; i < s->p.n_rows; i++) { /* max_i sum_j |A_ij| sqrt(s_i s_j) */
-      for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
-        sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
-      sum *= sqrt(s->p.step[i]);
-      if (sum > most) most = sum;
-    }
-    if (s->options.omega == 0.0) s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
-    s->step = sweep_serial_jacobi_step;
+  s->step = method == LAV_SOR || method == LAV_GAUSS_SEIDEL ? sweep_serial_sor_step
+            : method == LAV_JACOBI                          ? sweep_serial_jacobi_step
+                                                            : sweep_step;
+  if (method == LAV_JACOBI && s->options.omega == 0.0) {
+    const double most = largest_row(s);
+    s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
   }
-  if (s->options.method != LAV_SEQUENTIAL_IMPULSES) return LAV_OK;
-  s->step = impulse_step;
 #ifndef LAV_SWEEPS_ONLY
-  s->step = sweep_serial_impulse_step; /* in pairs, with the same bits */
-  if (s->mode == core_order_GIVEN && s->p.n_blocks >= PACK_FROM && s->p.n_blocks <= sweep_packed_MOST) {
-    s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
-    s->packing.status = 0;
-    s->packing.first = s->p.n_blocks < FAR_FROM ? 8 : 16;
-    s->swept.packing = &s->packing;
-  }
+  if (method == LAV_SEQUENTIAL_IMPULSES && s->mode == core_order_GIVEN) take_packing(s, 0);
+  if (method == LAV_ANDERSON || method == LAV_NNCG) return prepare_accelerated(s);
+  s->swept.exact = method == LAV_BLOCK_GAUSS_SEIDEL;
+  if (s->swept.exact) return prepare_blocks(s);
 #endif
   return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
 }
 
 #ifndef LAV_SWEEPS_ONLY
-static int32_t prepare_blocks(lav_solver *s) {
-  double numbers;
-  s->prepared_at = TAKE(s, int32_t, s->p.n_blocks);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  numbers = k_prepared_sizes(&s->p, s->prepared_at);
-  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
-  s->prepared = TAKE(s, double, (int64_t)numbers);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  memset(s->prepared, 0, ((size_t)numbers + 1) * sizeof(double));
-  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, s->prepared_at, s->prepared);
-  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, s->prepared_at, s->prepared);
-  else k_prepare_csr(&s->p, &s->a, s->prepared_at, s->prepared);
-  s->local.blocks = &s->p;
-  s->local.csr = s->form == LAV_BODIES ? NULL : &s->a;
-  s->local.rows = &s->r;
-  s->local.general = general_of(s);
-  s->local.start = s->prepared_at;
-  s->local.g = s->prepared;
-  s->local.velocity = s->v;
-  s->local.order = s->order;
-  s->local.split = s->split;
-  s->local.mode = s->mode;
-  s->local.rng = &s->rng;
-  s->local.fallbacks = 0.0;
-  s->context = &s->local;
-  s->step = local_gauss_seidel_step;
-  return LAV_OK;
-}
-#endif
-
-/* v = M^-1 J^T lambda, or Y^T lambda of J and M. */
-static void form_velocity(lav_solver *s) {
-  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
-  if (s->p.n_rows == 0 || s->n_v == 0) return;
-#ifndef LAV_SWEEPS_ONLY
-  if (s->form == LAV_VELOCITIES) {
-    core_generalized_whitened_gather(&s->g, s->impulse, s->v);
-    return;
-  }
-#endif
-  core_velocity_rows_velocity(&s->p, &s->r, s->impulse, s->v);
-}
-
-#ifndef LAV_SWEEPS_ONLY
-static int32_t prepare_accelerated(lav_solver *s);
 static int32_t prepare_newton(lav_solver *s);
 static int32_t prepare_pivots(lav_solver *s);
 static int32_t prepare_admm(lav_solver *s);
@@ -142,7 +143,6 @@ static int32_t prepare_auto(lav_solver *s, const lav_problem *q);
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
 static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out);
-static void pack_pairs(lav_solver *s, int32_t n);
 static int32_t restarts_of(const lav_solver *s);
 static int32_t begins_again(lav_solver *s);
 #endif
@@ -150,8 +150,6 @@ static int32_t begins_again(lav_solver *s);
 static int32_t prepare(lav_solver *s) {
   switch (s->options.method) {
 #ifndef LAV_SWEEPS_ONLY
-    case LAV_BLOCK_GAUSS_SEIDEL: return prepare_blocks(s);
-    case LAV_ANDERSON: case LAV_NNCG: return prepare_accelerated(s);
     case LAV_NEWTON: return prepare_newton(s);
     case LAV_DIRECT: case LAV_LEMKE: return prepare_pivots(s);
     case LAV_ADMM: return prepare_admm(s);
@@ -178,7 +176,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
     if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
 #ifndef LAV_SWEEPS_ONLY
-    pack_pairs(s, n);
+    if (s->context == &s->fast) sweep_serial_is_packed(&s->swept, s->impulse, (int64_t)s->fast.turn + n);
 #endif
     status = judge_watch_watched(&s->watch, &s->read, NULL, s->step, s->context, s->impulse, n, budget->tol, &done);
     out->iterations += done;
@@ -210,7 +208,7 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
     judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
     if (!(best.relative <= s->watch.best_relative)) {
       COPY(s->impulse, s->watch.best, s->p.n_rows);
-      form_velocity(s);
+      sweep_serial_form_velocity(&s->swept, s->impulse);
     }
   }
 }
@@ -222,7 +220,7 @@ static void begin_method(lav_solver *s) {
                           : method == LAV_ADMM                         ? SPLIT_PATIENCE
                                                                        : PATIENCE,
                           s->score_room, s->p.n_rows);
-  form_velocity(s);
+  sweep_serial_form_velocity(&s->swept, s->impulse);
 }
 
 static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out) {
@@ -378,6 +376,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else code = fill_velocities(s, q);
 #endif
   if (code != LAV_OK) return code;
+  memset(&s->swept, 0, sizeof s->swept);
   memset(&s->read, 0, sizeof s->read);
   s->read.p = s->p;
   if (q->form == LAV_MATRIX) s->read.a = &s->a;
