@@ -414,7 +414,7 @@ cdef class Friction(Small):
         cdef bint good
         s.v = self.matrix.view()
         s.lam, s.answer, s.split = &own[0], x, self.split
-        s.at, s.prepared = NULL, NULL
+        s.at, s.prepared, s.nothing = NULL, NULL, self.data.start_relative
         if self.prepared is not None:
             at, prepared = self.at, self.prepared
             s.at, s.prepared = &at[0], &prepared[0]
@@ -466,7 +466,7 @@ cdef class Friction(Small):
                 if same(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
-                    x.s.split, x.s.at, x.s.prepared = size[i, 4], NULL, NULL
+                    x.s.split, x.s.at, x.s.prepared, x.s.nothing = size[i, 4], NULL, NULL, -1.0
                     if p.law == CONE:
                         for j in range(k):
                             at[j] = prepared_at[block[first + j]]

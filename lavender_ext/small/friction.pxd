@@ -4,7 +4,7 @@ One call solves a part over A or over bodies, in room that the caller has. Facto
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t, uint64_t
-from libc.string cimport memcpy, memset
+from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
@@ -35,6 +35,7 @@ cdef struct part_t:
     int32_t split               # blocks before it are swept before the others: joints, contacts
     const int32_t* at           # of blocks that are solved exactly, as gauss_seidel.prepare has them; else NULL
     const double* prepared
+    double nothing              # relative residual of doing nothing where the part is the whole, else -1
 
 
 cdef struct ask_t:
@@ -114,9 +115,12 @@ cdef inline bint promises(double before, double now, double tol, int32_t rounds)
     return False
 
 
-cdef inline double sweep_on(turns_t* t, int32_t most, bint hoping) noexcept nogil:
-    """Sweeps of `swept` up to `most` in all, `hoping` as long as they promise an end within that; its relative residual."""
-    cdef double before, tol = t.o.tol, now = found_at(t, t.swept)
+cdef inline double sweep_on(turns_t* t, double now, int32_t most, bint hoping) noexcept nogil:
+    """Sweeps of `swept`, whose residual is `now`, up to `most` in all; its relative residual then.
+
+    `hoping`: as long as they promise an end within that.
+    """
+    cdef double before, tol = t.o.tol
     cdef int32_t step = FIRST
     while now > tol and t.c.turn < most:
         before = now
@@ -159,7 +163,7 @@ cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
         return 1.0 / 0.0
     now = step_newton(t, SHORT)
     if now > t.o.tol and t.o.factored + t.said.factorisations * cubed < t.o.most_factored:
-        now = sweep_on(t, AGAIN * t.o.most, t.s.v.p.law == CONE)
+        now = sweep_on(t, found_at(t, t.swept), AGAIN * t.o.most, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, STEPS)
         memcpy(t.s.answer, t.swept, t.s.v.p.n_rows * sizeof(double))
@@ -172,26 +176,31 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     cdef turns_t t
     cdef uint64_t rng
     cdef const blocks_t* p = &s.v.p
-    cdef double own, less, now
+    cdef double own = o.e0, fast = o.v0, less, now = s.nothing
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
     do_nothing(p, s.answer, t.w)
-    judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
-    own = nothing.energy
-    if own == 0.0 and nothing.velocity == 0.0:
+    if now < 0.0:
+        judge_view(&s.v, s.answer, t.w, t.error, t.scratch, False, &nothing)
+        own, fast = nothing.energy, nothing.velocity
+    if own == 0.0 and fast == 0.0:
         return True     # doing nothing is right
     less = own / o.e0 if own < o.e0 else o.e0 / own     # squares of what is far from 1 vanish
     t.e0, t.v0 = (own if own > o.e0 else o.e0) * sqrt(0.5 * (1.0 + less * less)), o.v0
     memcpy(t.swept, s.lam, p.n_rows * sizeof(double))
     form_velocity(&t.sweeps, t.swept)
     t.said.factorisations = 0
-    now = sweep_on(&t, o.first, True)
+    if memcmp(t.swept, s.answer, p.n_rows * sizeof(double)) != 0:
+        now = found_at(&t, t.swept)
+    elif now < 0.0:
+        now = relative_of(&nothing, t.w, p.n_rows, t.e0, t.v0)
+    now = sweep_on(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
     if now > o.tol:
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
-        now = t.e0 / own if t.e0 / own < t.v0 / nothing.velocity else t.v0 / nothing.velocity
+        now = t.e0 / own if t.e0 / own < t.v0 / fast else t.v0 / fast
         t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
         now = factor_in_turns(&t)
     o.swept += t.c.turn
