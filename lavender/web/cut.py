@@ -27,7 +27,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 __all__ = ["CutFailed", "Item", "core_functions", "cut", "path_of", "read", "source_hash", "translate"]
 
@@ -109,8 +109,7 @@ class Item:
     origin: str = ""
 
 
-@dataclass
-class Token:
+class Token(NamedTuple):
     kind: str
     text: str
     before: str  # white space
@@ -153,7 +152,7 @@ def _declarations(
                     inner = [
                         i
                         for i in range(at + 1, last)
-                        if _level(stream, closing, at, i) and _word(stream[i]) == "else"
+                        if _word(stream[i]) == "else" and _level(closing, at, i)
                     ]
                     yield from _declarations(stream, closing, (inner[-1] if inner else at) + 1, last, origin)
                     return
@@ -173,12 +172,15 @@ def _declarations(
 
 def _word(token: Token) -> str:
     """The first word of a line of the preprocessor; empty for anything else."""
-    return (WORD.findall(token.text) or [""])[0] if token.kind == "directive" else ""
+    if token.kind != "directive":
+        return ""
+    found = WORD.search(token.text)
+    return found.group() if found else ""
 
 
-def _level(stream: list[Token], closing: dict[int, int], outer: int, at: int) -> bool:
-    """Whether the token at `at` is of the conditional that opens at `outer` itself, not of one inside."""
-    return stream[at].kind == "directive" and not any(i < at < j for i, j in closing.items() if outer < i)
+def _level(closing: dict[int, int], outer: int, at: int) -> bool:
+    """Whether the line at `at` is of the conditional that opens at `outer` itself, not of one inside."""
+    return not any(outer < i < at < j for i, j in closing.items())
 
 
 def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
@@ -202,7 +204,9 @@ def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
 def _text(part: list[Token]) -> str:
     out = []
     for i, token in enumerate(part):
-        before = re.sub(r"\n\s*\n", "\n", token.before) if i else ""
+        before = token.before if i else ""
+        if before.count("\n") > 1:
+            before = re.sub(r"\n\s*\n", "\n", before)
         if token.kind == "directive" or (i and part[i - 1].kind == "directive"):
             before = "\n" if i else ""
         out.append(before + token.text)

@@ -240,3 +240,16 @@ def test_what_is_neither_true_nor_false_is_refused_by_name(door):
     call(good)
     for what, x in WRONG_FLAGS.items():
         refused(call, x, door, what)
+
+
+@pytest.mark.parametrize(
+    ("solver", "option"),
+    [(name, option) for name in lv.available(external=False) for option in lv.get(name).options],
+)
+def test_every_option_of_every_solver_refuses_what_is_no_value_of_it(solver, option):
+    spec = lv.get(solver)
+    problem = next(p for p in (LCP, replace(LCP, cones=lv.Cones.free(2)), CONTACT) if spec.refuses(p) is None)
+    for what, x in {"a word": "no such word", "NaN": np.nan, "complex": 1j, "a mapping": {1: 2}}.items():
+        print(what)
+        with pytest.raises(lv.LavenderError, match=option):
+            lv.solve(problem, solver, **{option: x})

@@ -71,13 +71,6 @@ def test_every_factorisation_gives_the_same(law):
     )
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_singular_boxed_problems(seed):
-    problem = random_lcp(seed, m=14, rank=6)
-    solution = lv.solve(problem, "admm", tol=1e-9, max_iter=20_000)
-    assert solution.success, solution
-
-
 def test_far_from_symmetric():
     rng = np.random.default_rng(9)
     for _ in range(5):

@@ -10,7 +10,7 @@ import pytest
 from enumeration import enumerate_lcp, random_bounds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, touching
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds, touching
 from random_trees import random_general
 
 import lavender as lv
@@ -426,6 +426,34 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
             np.testing.assert_allclose(solution.slack, w, atol=1e-6)
         else:
             np.testing.assert_allclose(solution.impulse, x, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["admm", "auto", "direct", "lemke", "newton"])
+@given(seed=seeds, rank=st.integers(2, 12))
+@settings(max_examples=30)
+def test_bounded_rows_of_any_rank_are_solved(name, seed, rank):
+    more = {"max_iter": 20_000} if name == "admm" else {}
+    solution = lv.solve(random_lcp(seed, m=12, rank=rank), name, tol=1e-9, **more)
+    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR), solution
+    assert not solution.contradicted
+
+
+@pytest.mark.parametrize("name", OURS)
+@given(seed=seeds, m=st.integers(1, 6))
+@settings(max_examples=60)
+def test_any_matrix_a_claim_is_a_solution(name, seed, m):
+    """No claim that the judge contradicts, and no proof that there is none where enumeration finds a solution."""
+    rng = np.random.default_rng(seed)
+    a = np.rint(2.0 * rng.normal(size=(m, m)))
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(a, np.rint(3.0 * rng.normal(size=m)), low, high)
+    if registry.get(name).refuses(problem):
+        return
+    solution = lv.solve(problem, name, tol=1e-9)
+    assert not solution.contradicted, solution
+    assert np.isfinite(solution.impulse).all()
+    if solution.status is lv.Status.INFEASIBLE:
+        assert not enumerate_lcp(a, problem.b, low, high)
 
 
 @pytest.mark.parametrize("name", HERE)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import assume, example, given
-from random_problems import good, random_lcp, seeds, without_solution
+from random_problems import good, seeds, without_solution
 
 import lavender as lv
 from benchmarks.drawn import wild
@@ -94,13 +94,6 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
         np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
-
-
-@given(seed=seeds, rank=st.integers(2, 12))
-def test_boxed_problems_of_any_rank(seed, rank):
-    solution = lv.solve(random_lcp(seed, m=12, rank=rank), "direct", tol=1e-9)
-    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR), solution
-    assert not solution.contradicted
 
 
 @pytest.mark.parametrize("m", [90, 300])

@@ -4,7 +4,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from enumeration import enumerate_lcp, random_bounds
+from enumeration import random_bounds
 from hypothesis import given
 from random_problems import good, random_lcp, seeds
 
@@ -36,20 +36,6 @@ def test_a_compiled_path_stops_at_its_pivots_and_at_a_ray_and_splits_free_rows_i
     rows, paths = paths_of(lv.Problem.lcp([[1.0, 1.0], [-1.0, 1e-14]], [1.0, -1.0], low, [np.inf, np.inf]))
     assert paths.run(9) == DONE
     np.testing.assert_allclose(rows.best.impulse, [1.0, 0.0], atol=1e-12)
-
-
-@given(seed=seeds, m=st.integers(1, 6))
-def test_any_matrix_a_claim_is_a_solution(seed, m):
-    """No claim that the judge contradicts, and where enumeration finds nothing, no success either."""
-    rng = np.random.default_rng(seed)
-    a = np.rint(2.0 * rng.normal(size=(m, m)))
-    low, high = random_bounds(rng, m)
-    problem = lv.Problem.lcp(a, np.rint(3.0 * rng.normal(size=m)), low, high)
-    solution = lv.solve(problem, "lemke", tol=1e-9)
-    assert not solution.contradicted, solution
-    assert np.isfinite(solution.impulse).all()
-    if solution.status is lv.Status.INFEASIBLE:
-        assert not enumerate_lcp(a, problem.b, low, high)
 
 
 def test_a_saddle_point_needs_no_split():

@@ -91,15 +91,9 @@ def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
 
 
 def test_wrong_options_are_refused():
-    problem, _ = stack(3)
-    with pytest.raises(lv.UnknownName, match="against"):
-        lv.solve(problem, "nncg", restart="never")
-    for name in ("nncg", "anderson"):
-        with pytest.raises(lv.UnknownName, match="blocks"):
-            lv.solve(problem, name, sweep="block")
-    for memory in (0, 17, 2.5):
+    for memory in (0, 17):
         with pytest.raises(lv.InputError, match="memory"):
-            lv.solve(problem, "anderson", memory=memory)
+            lv.solve(stack(3)[0], "anderson", memory=memory)
     cone = random_contact_problem(1, friction="cone")
     with pytest.raises(lv.InputError, match="cone law"):
         lv.solve(cone, "nncg", sweep="pgs")
