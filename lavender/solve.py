@@ -82,7 +82,7 @@ def solve(
         Warm start. Default: `problem.guess`, otherwise zero clipped to the bounds.
     tol : float, default 1e-6
         Relative residual to reach: 0 is a solution, 1 is zero impulses (see `lavender.residuals`). `tol=0` runs exactly
-        `max_iter` iterations.
+        `max_iter` iterations; `auto` and solvers that factor end earlier where nothing is left to gain.
     max_iter : int, optional
         The most iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's spec.
     time_limit : float, optional, s

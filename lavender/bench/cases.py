@@ -83,14 +83,14 @@ def is_path(word: Source) -> bool:
 Source = str | Path | Problem | Case | Item
 
 
-def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item]:
+def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
     """Cases behind files, folders (their problem files), names or cases of the suite, problems; all of it if none.
 
     Nothing is solved, and as a rule nothing loaded yet, but every word is checked to exist.
 
     Parameters
     ----------
-    words : files, folders, names or cases of the suite, problems
+    words : files, folders, names or cases of the suite, problems; or one of them
     sequences : bool, optional
         Folders hold the steps of a simulation. If None, those do whose files differ in a number alone and
         name their blocks (`Problem.key`), as recorded steps do.
@@ -103,7 +103,7 @@ def resolve(words: Iterable[Source], sequences: bool | None = None) -> list[Item
         A case that the suite does not have.
     """
     items: list[Item] = []
-    words = list(words)
+    words = [words] if isinstance(words, Source) else list(words)
     if not words:
         from lavender import suite
 

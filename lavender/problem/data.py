@@ -283,10 +283,10 @@ class ProblemData:
 def check_problem(problem: Any) -> None:
     """Raise where what stands for a problem is none."""
     if not isinstance(problem, ProblemData):
-        raise InputError(
-            f"problem is a {type(problem).__name__}; a lavender.Problem is needed: make one by Problem.lcp(A, b), "
-            "linear, contact, from_rows or from_jacobian"
-        )
+        way = "make one by Problem.lcp(A, b), linear, contact, from_rows or from_jacobian"
+        if isinstance(getattr(problem, "problem", None), ProblemData):  # of a case, a file that was read
+            way = "give its .problem"
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed: {way}")
 
 
 def _many(n: int, what: str) -> str:

@@ -36,7 +36,7 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
     Raises
     ------
     InputError
-        The folder cannot be written.
+        Neither records nor a report; the folder cannot be written.
     """
     from lavender.report.curves import figures as figures_of
     from lavender.report.findings import Report
@@ -44,6 +44,10 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
     from lavender.report.page import page
 
     report = Report(found) if isinstance(found, Records) else found
+    if not isinstance(report, Report):
+        raise InputError(
+            f"found is a {type(found).__name__}; Records, as lavender.bench.run returns them, or a Report"
+        )
     folder = Path(folder)
     drawn = figures_of(report.records)
     try:

@@ -67,6 +67,18 @@ def test_a_record_holds_what_the_judge_says_and_what_it_cost():
     assert records.cases["stack"].structure == ("stack",)
 
 
+def test_one_case_and_one_solver_need_no_list():
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=())
+    one = bench.run("stack(n=3)", "pgs", plan)
+    assert {(r.case, r.solver) for r in one} == {("stack(n=3)", "pgs")}
+    case = lv.suite.case("stack(n=3)")
+    assert [item.name for item in bench.resolve(case)] == ["stack(n=3)"]
+    with pytest.raises(lv.InputError, match=r"give its \.problem"):
+        lv.solve(case)
+    with pytest.raises(lv.InputError, match="found is a list; Records"):
+        lv.report.write(list(one), "nowhere")
+
+
 def test_a_budget_is_exact_and_warm_starts_from_the_guess():
     p = stack(12)
     exact = lv.solve(p, "direct", tol=1e-12).impulse

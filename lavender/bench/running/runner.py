@@ -75,14 +75,15 @@ def is_foreign(spec: SolverSpec) -> bool:
     )
 
 
-def solver_names(names: Sequence[str] | None) -> list[str]:
-    """The solvers to run: those named, each of them installed; or every one that is installed.
+def solver_names(names: str | Sequence[str] | None) -> list[str]:
+    """The solvers to run: those named (or the one), each of them installed; or every one that is installed.
 
     Raises
     ------
     UnknownName, SolverUnavailable
     """
     if names:
+        names = [names] if isinstance(names, str) else names
         for name in names:
             registry.get(name)
         return list(dict.fromkeys(names))
@@ -90,8 +91,8 @@ def solver_names(names: Sequence[str] | None) -> list[str]:
 
 
 def run(
-    cases: Iterable[Source] = (),
-    solvers: Sequence[str] | None = None,
+    cases: Source | Iterable[Source] = (),
+    solvers: str | Sequence[str] | None = None,
     plan: Plan | None = None,
     store: Store | str | Path | None = None,
     *,
