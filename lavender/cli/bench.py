@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from lavender.cli.options import one_thread
-from lavender.errors import LavenderError
+from lavender.errors import InputError, LavenderError
 from lavender.io.stored import write_text
 
 __all__ = ["bench"]
@@ -22,10 +22,19 @@ def bench() -> None:
 
 @bench.command("mujoco")
 @click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--steps", default=10, show_default=True, help="Problems of each model.")
-@click.option("--every", default=20, show_default=True, help="Simulation steps between two problems.")
+@click.option(
+    "--steps", type=click.IntRange(0), default=10, show_default=True, help="Problems of each model."
+)
+@click.option(
+    "--every",
+    type=click.IntRange(1),
+    default=20,
+    show_default=True,
+    help="Simulation steps between two problems.",
+)
 @click.option(
     "--warm",
+    type=click.IntRange(0),
     default=0,
     show_default=True,
     help="Also measure this many consecutive steps of each model, warm-started.",
@@ -61,6 +70,9 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         lines += [json.dumps(asdict(s)) for s in found]
         lines += [json.dumps(asdict(w)) for w in consecutive]
         write_text(out, "\n".join(lines) + "\n")
-    click.echo(table(found))
+    if not found and not consecutive:
+        raise InputError("no step of these models had a problem to solve: more steps, or other models")
+    if found:
+        click.echo(table(found))
     if consecutive:
         click.echo(f"\n{warm_table(consecutive)}")

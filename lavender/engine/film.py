@@ -66,10 +66,11 @@ class Film:
                 else:
                     self._frames = np.concatenate([self._frames, np.zeros_like(self._frames)])
             row = self._frames[self._count]
-            row[0], row[1:LEAD] = time, observation["solver"]
             poses = row[LEAD:].reshape(-1, 7)
-            poses[:, :3], poses[:, 3:] = observation["positions"], observation["quaternions"]
-            self._count += 1
+            with np.errstate(over="ignore"):
+                row[0], row[1:LEAD] = time, observation["solver"]
+                poses[:, :3], poses[:, 3:] = observation["positions"], observation["quaternions"]
+            self._count += bool(np.isfinite(row).all())  # of a state that was lost there is no picture
 
     def frames(self, first: int = 0) -> np.ndarray:
         """Frames from `first` on, (f, 9 + 7 n) float32: a copy."""

@@ -75,7 +75,7 @@ def write(
     Returns
     -------
     list of Path
-        What was written, SHA256SUMS and `more` last.
+        What was written; SHA256SUMS, the module of npm and `more` last.
 
     Raises
     ------
@@ -96,33 +96,31 @@ def write(
         made["lavender.c"] = source()
     sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
     made["SHA256SUMS"] = sums
-    written = _put(out, {**made, **(more or {})}, replace)
-    if kind == "npm":
-        written.insert(0, _module(out / "liblavender.wasm", header))
-    return written
+    module = {"liblavender.wasm": _module(header)} if kind == "npm" else {}
+    return _put(out, {**made, **module, **(more or {})}, replace)
 
 
-def _module(out: Path, header: str) -> Path:
+def _module(header: str) -> bytes:
     """The library as a WebAssembly module: the one that came with the package, or a new one."""
-    kept, text = HERE / "js" / out.name, source()
+    kept, text = HERE / "js" / "liblavender.wasm", source()
     stamp = hashlib.sha256(text.encode()).hexdigest()
     made_of = kept.with_suffix(".sha256")
     if kept.exists() and made_of.exists() and made_of.read_text(encoding="utf-8") == stamp:
-        out.write_bytes(kept.read_bytes())
-        return out
+        return kept.read_bytes()
     with TemporaryDirectory() as folder:
         work = Path(folder)
         (work / "lavender.c").write_text(text, encoding="utf-8")
         (work / "lavender.h").write_text(header, encoding="utf-8")
         names = [name for _, name, _ in bindings.functions(header)]
         try:
-            wasm.build_library(out, work / "lavender.c", names)
+            wasm.build_library(work / kept.name, work / "lavender.c", names)
         except wasm.BuildFailed as error:
             raise LavenderError(str(error)) from None
-    with contextlib.suppress(OSError):  # a package that nobody may write into
-        kept.write_bytes(out.read_bytes())
-        made_of.write_text(stamp, encoding="utf-8")
-    return out
+        made = (work / kept.name).read_bytes()
+    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
+        write_bytes(kept, made)
+        write_text(made_of, stamp)
+    return made
 
 
 def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path]:

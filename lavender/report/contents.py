@@ -18,7 +18,7 @@ from lavender.report.findings import Report
 from lavender.report.moved import idle, speed_name
 from lavender.report.table import WORDS, Cell, Table
 from lavender.report.tables import Advice, Line
-from lavender.report.text import NONE, count, residual, seconds, share, times, who
+from lavender.report.text import NONE, count, percent, residual, seconds, share, times, who
 
 __all__ = [
     "Section",
@@ -279,7 +279,7 @@ def robustness_table(rows: Sequence[tables.Robustness], levels: Sequence[float],
             r.family,
             r.solver,
             str(r.cases),
-            *(f"{100 * r.reached[x] / r.cases:.1f} %" for x in levels),
+            *(percent(r.reached[x], r.cases, 1) for x in levels),
             str(r.wrong),
             str(r.died),
             *(", ".join(map(residual, r.budgets[n])) if n in r.budgets else NONE for n in budgets),
@@ -305,7 +305,7 @@ def claim_table(records: Records) -> Table:
     found = tables.claims(records)
     rows: Rows = [
         [
-            c.solver, str(c.runs), f"{100 * c.rate:.0f} %" if c.claims else NONE, str(c.claims),
+            c.solver, str(c.runs), percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
             f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.asked}", str(c.crashed),
         ]
         for c in found
@@ -349,7 +349,7 @@ def spread_table(spreads: Sequence[tables.Spread]) -> Table:
 
 
 def pass_table(passes: Sequence[tables.Pass]) -> Table:
-    """Sequences: residual and time of each solver, carried against cold; the gain at one budget."""
+    """Sequences: residual and time of each solver, carried against cold, and of how many steps where it was stopped."""
     starts = ("carried", "cold")
     rows: Rows = []
     for w in passes:
@@ -358,7 +358,7 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
                 w.sequence, w.solver, w.asked, str(w.steps),
                 f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
                 *(residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
-                *(seconds(w.time[s]) if s in w.time else NONE for s in starts),
+                *(seconds(w.time[s]) + share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
                 *(str(w.iterations.get(s, NONE)) for s in starts),
             ]
         )  # fmt: skip

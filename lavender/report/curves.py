@@ -119,7 +119,10 @@ def overall_figure(records: Records) -> Figure:
     """
     single = any(r.step < 0 for r in records)
     start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
-    runs = [r for r in records if (r.step < 0) == single and r.start == start and r.order == "given"]
+    runs = [
+        r for r in records
+        if (r.step < 0) == single and r.start == start and r.order == "given" and not r.turns
+    ]  # fmt: skip
     cases = sorted({r.case for r in runs})
     by: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for r in runs:

@@ -6,7 +6,7 @@ import math
 
 from lavender.bench.store import Records
 
-__all__ = ["NONE", "count", "residual", "seconds", "share", "suspicions", "times", "who"]
+__all__ = ["NONE", "count", "percent", "residual", "seconds", "share", "suspicions", "times", "who"]
 
 NONE = "–"  # where there is no number
 
@@ -37,7 +37,7 @@ def times(x: float) -> str:
     """A ratio as a word: 1.3 times, 850 times; beyond a million its power of ten, where digits say nothing."""
     if not math.isfinite(x):
         return NONE
-    return f"{x:.2g} times" if x < 100.0 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
+    return f"{x:.2g} times" if x < 99.5 else f"{x:.0f} times" if x < 1e6 else f"10^{math.log10(x):.0f} times"
 
 
 def count(n: int, what: str, plural: str = "") -> str:
@@ -56,6 +56,12 @@ def suspicions(records: Records) -> list[tuple[str, str]]:
         (f"{some[0][0]} and {count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0], some[0][1])
         for some in seen.values()
     ]
+
+
+def percent(part: int, whole: int, digits: int = 0) -> str:
+    """Part of a whole, rounded down: 100 % is all of it."""
+    tenths = 100 * 10**digits * part // whole
+    return f"{tenths / 10**digits:.{digits}f} %"
 
 
 def share(solved: int, cases: int) -> str:

@@ -235,7 +235,7 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     cdef int64_t c = size[CAP_CONTACT], p = size[CAP_PAIR], k = kj + c, m = mj + c * size[ROWS_PER_CONTACT]
     cdef int64_t frames = size[N_FRAME], nt = c if size[ROWS_PER_CONTACT] > 1 else 0
     cdef int64_t rolls = 1 if size[ROWS_PER_CONTACT] > 4 else 0
-    cdef int64_t grid = n if size[N_BUCKET] > 0 else 0
+    cdef int64_t grid = n if size[N_BUCKET] > 0 else 0, apart = size[N_EXCLUDED]
     cdef int64_t i = 0, j = 0
     e.size = size
     e.setting = reals(real, &i, N_SETTINGS)
@@ -293,7 +293,7 @@ cdef inline void bind(const int32_t* size, double* real, int32_t* index, uint64_
     e.joint_kind = ints(index, &j, kj)
     e.joint_motor = ints(index, &j, kj)
     e.joint_bodies = ints(index, &j, 2 * kj)
-    e.excluded = ints(index, &j, 2 * size[N_EXCLUDED])
+    e.excluded = ints(index, &j, 2 * apart)
     e.pair = ints(index, &j, 2 * p)
     e.pair_scratch = ints(index, &j, 2 * p)
     e.count = ints(index, &j, n + 1)

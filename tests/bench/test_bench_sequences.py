@@ -7,6 +7,7 @@ from stacks import moving_stack, stack
 import lavender as lv
 from lavender import bench
 from lavender.bench.running import runner
+from lavender.report import contents, tables
 
 
 def test_impulses_travel_by_key():
@@ -60,6 +61,8 @@ def test_a_pass_that_takes_too_long_ends_and_says_so(tmp_path, monkeypatch):
     assert [(r.step, r.start) for r in records] == [(0, "cold"), (0, "carried")]
     assert [s.case for s in records.skips] == ["load, 6 iterations, cold", "load, 6 iterations, carried"]
     assert all("after 1 of 5 steps" in s.reason for s in records.skips)
+    (row,) = contents.pass_table(tables.passes(records)).texts  # beside solvers that took all five
+    assert [cell.endswith(" (1/5)") for cell in row].count(True) == 2
     monkeypatch.setattr(runner, "measure", None)  # nothing is solved again
     assert bench.run(items, ["pgs"], plan, path).records == records.records
     (line,) = lv.report.advice(records, [1.0])

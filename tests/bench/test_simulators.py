@@ -7,6 +7,7 @@ from click.testing import CliRunner
 
 from lavender.bench import simulators
 from lavender.cli.bench import mujoco
+from lavender.errors import InputError
 from lavender.report import simulators as tables
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -57,6 +58,17 @@ def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
     assert {line["model"] for line in lines[1:]} == {"arm"}
     assert sum("kernel" in line for line in lines[1:]) == 2
     assert max(line["residual"] for line in lines[1:]) <= simulators.TARGET
+
+
+def test_without_a_problem_nothing_is_printed_but_why(tmp_path):
+    (tmp_path / "arm.xml").write_text(MODEL)
+    words = [str(tmp_path / "arm.xml"), "--steps", "0"]
+    done = CliRunner().invoke(mujoco, words)
+    assert isinstance(done.exception, InputError) and "no step of these models" in str(done.exception)
+    for bad in (["--every", "0"], ["--warm", "-1"], ["--steps", "-1"]):
+        assert CliRunner().invoke(mujoco, [*words, *bad]).exit_code == 2
+    warm = CliRunner().invoke(mujoco, [*words, "--warm", "40"])
+    assert warm.exit_code == 0 and "ours, median" in warm.output and "momentum" not in warm.output
 
 
 def test_ratios_are_geometric_means_by_the_number_of_rows():

@@ -13,6 +13,7 @@ from lavender.engine import check
 from lavender.engine.layout import HEAD
 from lavender.engine.state import KEPT, State
 from lavender.registry import specs
+from lavender_ext.engine.arrays import lengths
 
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
 
@@ -261,22 +262,22 @@ def sim_solver(scene):
     return specs()[scene.parameters.solver].load()
 
 
-@pytest.mark.parametrize("solver", ["newton", "auto"])
-def test_ctrl_c_inside_a_solver_that_returns_its_best_all_the_same(solver, monkeypatch):
+@pytest.mark.parametrize(("solver", "calls"), [("newton", "run"), ("auto", "turn")])
+def test_ctrl_c_inside_a_solver_that_returns_its_best_all_the_same(solver, calls, monkeypatch):
     # `newton` and `auto` answer Ctrl-C with the best impulses that they have: no step is made of them
     from lavender.solvers.newton import Newton
 
     scene = lv.Scene("bridge", n=30, solver=solver, substeps=2)  # too many rows for the one compiled call
     sim, twin = lv.Simulation(scene), lv.Simulation(scene)
     trajectory(sim, 3), trajectory(twin, 3)
-    original = Newton.run
+    original = getattr(Newton, calls)
 
     def interrupted(self, *a, **k):
         claim = original(self, *a, **k)
         return lv.Claim(lv.Status.INTERRUPTED, claim.iterations, claim.work, "Ctrl-C")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Newton, "run", interrupted)
+        patch.setattr(Newton, calls, interrupted)
         with pytest.raises(KeyboardInterrupt):
             trajectory(sim, 200)
     trajectory(twin, sim.steps - 3)
@@ -398,3 +399,11 @@ def test_reset_judges_nothing_and_does_not_fail():
     sim = lv.Simulation("stack", report_residual=True)
     assert "residual" in sim.step()[4]
     assert "residual" not in sim.reset()[1]
+
+
+def test_no_size_wraps_around_where_entries_are_counted():
+    size = lv.Simulation("stack").snapshot().size
+    for k in range(len(size)):
+        large = size.copy()
+        large[k] = 2**31 - 1
+        assert -1 in lengths(large), k

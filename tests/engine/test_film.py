@@ -64,6 +64,17 @@ def test_files_lead_back_and_what_is_no_film_is_refused(tmp_path):
         film.save(tmp_path / "none" / "x.film")
 
 
+def test_the_film_of_a_run_that_was_lost_can_be_read_and_drawn(tmp_path):
+    simulation = lv.Simulation("stack")
+    film = simulation.start_film()
+    simulation.step()
+    simulation.state.a["v"][2, 0] = np.inf
+    simulation.step()
+    film.save(tmp_path / "lost.film")
+    assert len(Film.load(tmp_path / "lost.film")) == len(film) == 2  # what was finite
+    assert save_picture(film, tmp_path / "lost.png").is_file()
+
+
 def test_a_long_film_drops_every_other_frame_and_keeps_its_end(monkeypatch):
     monkeypatch.setattr(films, "MOST_BYTES", 64 * 4 * (9 + 7 * 3))
     sim = lv.Simulation(lv.Scene("heavy_on_light"))

@@ -1,7 +1,10 @@
 """What is wrong comes back as a number with a text, and nothing is written where it must not be."""
 
 import ctypes as ct
+import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 
 import lavender as lv
+from lavender import export
 from lavender.export import HEADER
 from lavender.export.bindings import constants
 from lavender.export.view import ARRAYS, METHODS
@@ -214,6 +218,56 @@ def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, me
     problem.n_velocities, problem.n_entries, problem.n_mass_entries = 30, 60, 40
     assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
     assert Guarded(library, problem, options, room.value).code == 0
+
+
+SCRIPT = """
+import { readFileSync } from 'node:fs';
+const [folder, given] = [process.argv[1], JSON.parse(process.argv[2])], lav = await import(`${folder}/index.mjs`);
+const solver = (await lav.load(readFileSync(`${folder}/liblavender.wasm`))).solver(lav.LAV_PGS);
+const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
+const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
+const said = given.map(([problem, budget]) => {
+  try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
+  catch (error) { return error.message; }
+});
+console.log(JSON.stringify(said));
+"""
+
+
+def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(tmp_path):
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    try:
+        export.write("npm", tmp_path / "js")
+    except lv.LavenderError as reason:
+        pytest.skip(str(reason))
+    mistakes = [
+        ({"b": [1]}, {}, "b has 1 numbers; 3 are needed"),  # the other two stood there from the problem before
+        ({"value": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, {}, "value has 3 numbers; 9"),
+        ({"index_ptr": [0, 3, 6], "index": [0] * 9}, {}, "index_ptr has 3 numbers; 4"),
+        ({"kind": [0.7, 0, 0]}, {}, "no whole number"),
+        ({"b": {}}, {}, "an array of numbers is needed"),
+        ({"lower": True}, {}, "an array of numbers is needed"),
+        ({"n_rows": 2.5}, {}, "n_rows is 2.5"),
+        ({"rows": 3}, {}, "there is no rows"),
+        ({}, {"max_iter": 5}, "there is no max_iter"),
+        ({}, {"iterations": 1e12}, "iterations is 1000000000000"),
+        ({}, {"seconds": 1, "clock": 5}, "clock is of C alone"),
+        ({}, 5, "5 is no table of fields"),
+    ]  # fmt: skip
+    asked = [[{}, {}], *([problem, budget] for problem, budget, _ in mistakes), [{"b": [3, 2, 1, 9]}, {}]]
+    words = ["node", "--input-type=module", "-e", SCRIPT, str(tmp_path / "js"), json.dumps(asked)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, *said, last = json.loads(done.stdout)
+    assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
+    for (_, _, sign), text in zip(mistakes, said, strict=True):
+        assert isinstance(text, str) and sign in text
+    module = tmp_path / "js" / "liblavender.wasm"
+    module.write_bytes(b"mine")
+    with pytest.raises(lv.InputError, match="is there and is another"):
+        export.write("npm", tmp_path / "js")
+    assert module.read_bytes() == b"mine"
 
 
 SMALL = st.integers(-2, 9)

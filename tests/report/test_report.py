@@ -23,7 +23,7 @@ from lavender.report.engine import contestants
 from lavender.report.findings import Report
 from lavender.report.paper import write_paper
 from lavender.report.terminal import print_report
-from lavender.report.text import residual, seconds, times
+from lavender.report.text import percent, residual, seconds, times
 from lavender.report.verdict import verdict
 
 LEVELS = (1e-3, 1e-6)
@@ -364,6 +364,9 @@ def test_numbers_are_written_with_what_they_know():
     assert [seconds(t) for t in (1.0, 0.0123, 1e-3, 4.5e-5, 9e-8, 123.4, math.inf)] == [
         "1.00 s", "12.3 ms", "1.00 ms", "45.0 µs", "0.09 µs", "123 s", "–",
     ]  # fmt: skip
+    assert times(99.7) == "100 times"
+    assert [percent(n, 10_000, 1) for n in (10_000, 9_999, 1, 0)] == ["100.0 %", "99.9 %", "0.0 %", "0.0 %"]
+    assert (percent(999, 1000), percent(1, 3)) == ("99 %", "33 %")
     assert [times(x) for x in (1.34, 85.0, 1234.4, 7.3e13, math.nan)] == [
         "1.3 times", "85 times", "1234 times", "10^14 times", "–",
     ]  # fmt: skip
@@ -389,6 +392,10 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
             assert middle == sorted(reached)[3]
             assert (low, high) == (sorted(reached)[1], sorted(reached)[5])
         assert list(curve.y) == sorted(curve.y, reverse=True)
+    # Shares of a batch, and the least time of repetitions of which another left less, are no points of it.
+    more = [record("a", "pgs", 1e-9, 1e-12, turns="one", way=way, mode=mode) for way, mode in
+            (("batch", "tol"), ("call", "time"))]  # fmt: skip
+    assert overall_figure(records_of(*made, *more)) == found
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])

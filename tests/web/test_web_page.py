@@ -491,6 +491,12 @@ def test_the_address_holds_every_setting_and_is_followed(visit):
     assert v.side(0).locator(".sweeps output").text_content() == "5"
     v.js("location.hash = '#no such scene'")
     v.page.wait_for_function("lavender.scene.name === 'stack'")
+    assert v.page.text_content("#failure") == 'There is no scene "no such scene": this is stack.'
+    v.js("location.hash = '#half%'")  # that encodes nothing
+    v.page.wait_for_function("document.querySelector('#failure').textContent.includes('half%')")
+    v.js("location.hash = '#pyramid'")
+    v.page.wait_for_function("lavender.scene.name === 'pyramid'")
+    assert v.page.locator("#failure").is_hidden()
     v.js("location.hash = '#scene=stack&a=1000,x,y&b='")  # senseless values leave what was set
     v.page.wait_for_function("!lavender.playing")
     assert v.side(0).locator(".sweeps output").text_content() == "5"
@@ -572,5 +578,30 @@ def test_a_run_is_shown_live_and_again(browser, width):
         viewer.film.ended = True
         v.page.wait_for_function("document.querySelector('#live').disabled")
         assert v.js("document.documentElement.scrollWidth") <= width
+        _open_files(v, viewer.film.to_bytes())
         assert v.complaints == []
         v.context.close()
+
+
+def _open_files(v, film):
+    """A film, and what is none: that is said, and what is shown stays."""
+    head = film.index(b"{")
+    length = int.from_bytes(film[head - 8 : head], "little")
+    of = film[:head], film[head : head + length], film[head + length :]
+
+    def changed(old, new):
+        return of[0] + of[1].replace(old, new.ljust(len(old))) + of[2]
+
+    wrong = {
+        "empty": b"", "torn": film[:-2], "frame": film[:-4], "word": b"x" + film[1:], "text": changed(b'{"', b"{{"),
+        "version": changed(b'"version": 1', b'"version": 9'), "bodies": changed(b'"bodies"', b'"b"'),
+        "number": film[:-4] + np.float32(np.nan).tobytes(), "head": film[: head + 5],
+    }  # fmt: skip
+    for name, data in wrong.items():
+        v.page.set_input_files("#file", {"name": name, "mimeType": "", "buffer": data})
+        v.page.wait_for_function(
+            f"document.querySelector('#failure').textContent.startsWith('{name} is no film')"
+        )
+        assert v.js("lavender.frames.length") == 61
+    v.page.set_input_files("#file", {"name": "film", "mimeType": "", "buffer": film[: -len(of[2]) // 61]})
+    v.page.wait_for_function("document.querySelector('#failure').hidden && lavender.frames.length === 60")

@@ -1,8 +1,25 @@
 // liblavender in WebAssembly: the functions and names of lavender.h, a solver over typed arrays.
-import { LAV_BODIES, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
+import { LAV_BODIES, LAV_ERROR_COUNT, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
 export * from './header.mjs';
 
 const ARRAYS = { 'int32_t*': Int32Array, 'double*': Float64Array, 'uint64_t*': BigUint64Array };
+const MOST = 2 ** 31; // bytes of memory: places in it are 32-bit integers
+
+/** How long each array must be by the counts of its struct; the module would read on behind one that is shorter. */
+const LENGTHS = {
+  lav_problem(q, given) {
+    const [k, m, bodies, joints, speeds, held] = ['n_blocks', 'n_rows', 'n_bodies', 'n_joints', 'n_velocities', 'n_mass_entries'].map((n) => q.get(n));
+    const entries = q.get('n_entries'), c = k - joints, of = (n, names) => Object.fromEntries(names.map((name) => [name, n]));
+    return {
+      ...of(k, ['kind', 'mu', 'patch_radius', 'rolling', 'key', 'order']), ...of(m, ['lower', 'upper', 'b', 'target', 'compliance', 'impulse']),
+      ...of(entries, ['index', 'value']), ...of(held, ['mass_index', 'mass_value']), ...of(3 * c, ['normal', 'tangent', 'arm_a', 'arm_b']),
+      block_ptr: k + 1, index_ptr: m + 1, mass_ptr: speeds + 1, velocity: q.get('form') === LAV_BODIES ? 6 * bodies : speeds,
+      inv_mass: bodies, inv_inertia: 9 * bodies, joint_body: 2 * joints, contact_body: 2 * c,
+      jac: 12 * (given.block_ptr?.[joints] ?? joints),
+    };
+  },
+  lav_options: (options) => ({ turns: 2 * options.get('n_turns') }),
+};
 
 export class LavenderError extends Error {
   constructor(code, text) {
@@ -27,10 +44,10 @@ export class Library {
   }
   /** Bytes of the module's memory, which grows and is never given back. */
   take(bytes) {
-    const at = (this.top + 15) & ~15;
-    this.top = at + bytes;
-    const missing = this.top - this.c.memory.buffer.byteLength;
+    const at = Math.ceil(this.top / 16) * 16, top = at + bytes, missing = top - this.c.memory.buffer.byteLength;
+    if (!(top <= MOST)) throw new LavenderError(LAV_ERROR_ROOM, `${top} bytes are needed; a module has ${MOST} at most`);
     if (missing > 0) this.c.memory.grow(Math.ceil(missing / 65536));
+    this.top = top; // where there was memory
     return at;
   }
   view(kind, at, count) {
@@ -64,7 +81,7 @@ export class Library {
 class Struct {
   constructor(library, name, at) {
     const { size, fields } = STRUCTS[name];
-    Object.assign(this, { library, fields, size, at: at ?? library.take(size) });
+    Object.assign(this, { library, name, fields, size, at: at ?? library.take(size) });
   }
   get(field) {
     const [kind, offset] = this.fields[field];
@@ -77,6 +94,7 @@ class Struct {
     if (!(field in this.fields)) throw new TypeError(`there is no ${field}; one of ${Object.keys(this.fields).join(', ')} is needed`);
     const [kind, offset] = this.fields[field], view = new DataView(this.library.c.memory.buffer);
     if (kind === 'double') view.setFloat64(this.at + offset, value, true);
+    else if (kind === 'int32_t' && (value | 0) !== value) throw new TypeError(`${field} is ${value}; a whole number of 32 bits is needed`);
     else if (kind === 'uint64_t') view.setBigUint64(this.at + offset, BigInt(value), true);
     else view.setInt32(this.at + offset, value, true);
   }
@@ -113,13 +131,24 @@ export class Solver {
     this.rows = q.get('n_rows');
     this.speeds = q.get('form') === LAV_BODIES ? 6 * q.get('n_bodies') : q.get('n_velocities');
   }
+  /** Counts and numbers first, then arrays, whose lengths follow from them. */
   fill(struct, given) {
-    for (const [key, value] of Object.entries(given)) {
-      if (value != null) struct.set(key, typeof value === 'object' ? this.copy(key, value, struct.fields[key]?.[0]) : value);
+    if (Object(given) !== given) throw new TypeError(`${given} is no table of fields by name: { iterations: 100 }, for one, is needed`);
+    const some = Object.entries(given).filter(([, value]) => value != null);
+    const kind = ([key]) => struct.fields[key]?.[0] ?? '', isArray = (field) => kind(field) in ARRAYS;
+    for (const field of some) if (/\(\*\)|void/.test(kind(field))) throw new TypeError(`${field[0]} is of C alone: leave it out`);
+    for (const [key, value] of some.filter((field) => !isArray(field))) struct.set(key, value);
+    const lengths = LENGTHS[struct.name]?.(struct, given);
+    for (const [key, values] of some.filter(isArray)) {
+      if (typeof values !== 'object' || !Number.isInteger(values.length)) throw new TypeError(`${key} is ${values}; an array of numbers is needed`);
+      if (values.length < lengths[key]) throw new LavenderError(LAV_ERROR_COUNT, `${key} has ${values.length} numbers; ${lengths[key]} are needed by its counts`);
+      struct.set(key, this.copy(key, values, struct.fields[key][0]));
     }
   }
   copy(key, values, kind) {
-    if (!(kind in ARRAYS)) throw new TypeError(`${key} is no array of lavender.h: a number is needed, or another name`);
+    if (kind === 'int32_t*' && !(values instanceof Int32Array) && Array.prototype.some.call(values, (x) => (x | 0) !== x)) {
+      throw new TypeError(`${key} holds what is no whole number of 32 bits`);
+    }
     const bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
     let held = this.arrays.get(key);
     if (!held || held.bytes < bytes) this.arrays.set(key, (held = { at: this.library.take(2 * bytes + 8), bytes: 2 * bytes }));
@@ -133,10 +162,9 @@ export class Solver {
     this.library.check(this.c.lav_open(memory, bytes + 16n, this.problem.at, this.options.at, this.pointer));
     this.at = this.library.view('int32_t*', this.pointer, 1)[0];
   }
-  run({ iterations = 1000, tol = 1e-6 } = {}) {
-    this.library.check(this.c.lav_default_budget(this.budget.at));
-    this.budget.set('iterations', iterations);
-    this.budget.set('tol', tol);
+  run(budget = {}) {
+    this.library.check(this.c.lav_default_budget(this.budget.at)); // 1000 iterations, tol 1e-6
+    this.fill(this.budget, budget);
     this.result.set('size', STRUCTS.lav_result.size);
     this.library.check(this.c.lav_run(this.at, this.budget.at, this.result.at));
     return this.result.plain();

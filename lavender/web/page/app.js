@@ -117,7 +117,12 @@ class App {
   // -- the address: everything that is set, or the name of a preset or of a scene alone
 
   read() {
-    const words = decodeURIComponent(location.hash.slice(1));
+    let words = location.hash.slice(1);
+    try {
+      words = decodeURIComponent(words);
+    } catch {
+      // a "%" that encodes nothing: a name as it stands
+    }
     const given = new URLSearchParams(words.includes("=") ? words : "");
     const preset = this.contents.presets.find((one) => one.name === words);
     const scenes = this.contents.scenes.map((scene) => scene.name);
@@ -128,6 +133,9 @@ class App {
     }
     const name = given.get("scene") ?? words;
     this.choose(scenes.includes(name) ? name : scenes[0]);
+    if (!scenes.includes(name)) {
+      fail(`There is no scene "${name}": this is ${scenes[0]}.`);
+    }
     ["a", "b"].forEach((key, i) => {
       const [sweeps, warm, order, ...more] = (given.get(key) ?? "").split(",");
       const solver = more.find((word) => ["newton", "soft_step"].includes(word)) ?? "sweeps";

@@ -6,7 +6,29 @@ import { SOLVER_FIELDS } from "./lavender.js";
 const [PLANE, SPHERE] = [1, 2];
 const LEAD = 9; // numbers of a frame before the poses: time, then the eight solver values
 const MAGIC = "LAVENDER-FILM\n";
+const VERSION = 1;
 const POLL = 60; // ms between two questions for new frames
+
+// Header and frames of a film's bytes, all of it looked at before any of it is shown.
+function read(bytes) {
+  const start = MAGIC.length + 8, text = new TextDecoder().decode(bytes.slice(0, MAGIC.length));
+  const size = bytes.byteLength > start ? Number(new DataView(bytes).getBigUint64(MAGIC.length, true)) : 0;
+  if (text !== MAGIC || start + size > bytes.byteLength) {
+    throw new Error("it does not begin as one");
+  }
+  const header = JSON.parse(new TextDecoder().decode(bytes.slice(start, start + size)));
+  const data = new Float32Array(bytes.slice(start + size));
+  const { bodies, joints } = header;
+  const numbers = (x, count) => x.length === count && x.every(Number.isFinite);
+  const isBody = (x) => Number.isInteger(x) && x < bodies.length;
+  if (header.version !== VERSION || !Array.isArray(bodies) || !Array.isArray(joints)
+    || !bodies.every((body) => [0, 1, 2, 3].includes(body.kind) && numbers(body.shape, 4))
+    || !joints.every((joint) => isBody(joint.body) && isBody(joint.other) && joint.body >= 0 && numbers(joint.anchor, 3))
+    || data.length % (LEAD + 7 * bodies.length) || !data.every(Number.isFinite)) {
+    throw new Error("its header and its frames are not those of this version");
+  }
+  return { header, data };
+}
 
 // One frame as draw.js reads a simulation.
 class Frame {
@@ -207,19 +229,18 @@ class Player {
     if (!file) {
       return;
     }
-    const bytes = await file.arrayBuffer();
-    const text = new TextDecoder().decode(bytes.slice(0, MAGIC.length));
-    const size = bytes.byteLength > MAGIC.length + 8 ? Number(new DataView(bytes).getBigUint64(MAGIC.length, true)) : 0;
-    const start = MAGIC.length + 8;
-    if (text !== MAGIC || start + size > bytes.byteLength) {
-      fail(`${file.name} is no film`);
+    let film;
+    try {
+      film = read(await file.arrayBuffer());
+    } catch (error) {
+      fail(`${file.name} is no film that this page reads: ${error.message}`); // what is shown stays
       return;
     }
     find("failure").hidden = true;
     this.source = null;
-    this.load(JSON.parse(new TextDecoder().decode(bytes.slice(start, start + size))));
+    this.load(film.header);
     this.follow(false);
-    this.add(0, new Float32Array(bytes.slice(start + size)));
+    this.add(0, film.data);
     this.playing = true;
     find("live").disabled = true;
   }
