@@ -64,7 +64,7 @@ def read(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Stored:
         return npz.read(path, max_bytes=max_bytes)
     if start == b"\x89HDF\r\n\x1a\n":
         return fclib.read(path, max_bytes=max_bytes)
-    what = "is neither" if start else "is empty"
+    what = f"starts with {start!r}" if start else "is empty"
     needed = "an .npz archive or an HDF5 file is needed"
     if os.fspath(path).lower().endswith(".xml"):
         needed += " (of a MuJoCo model, `lavender record` writes such files)"
