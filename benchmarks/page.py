@@ -17,7 +17,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import click
-from playwright.sync_api import sync_playwright
 
 from benchmarks.output import markdown
 from lavender.errors import SolverUnavailable
@@ -54,8 +53,12 @@ def opened(address, **options):
     Raises
     ------
     SolverUnavailable
-        No Chromium.
+        No Chromium, or no playwright.
     """
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        raise SolverUnavailable("playwright is not installed: pip install 'lavender-contact[dev]'") from None
     names = ("chromium", "chromium-browser", "google-chrome")
     browser_path = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
     if browser_path is None:

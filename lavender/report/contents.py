@@ -56,9 +56,7 @@ class Section:
     note: str  # what its numbers are
     table: Table
     grouped: bool = False  # rows of one case or structure stand together
-    details: bool = (
-        False  # of single cases and sequences: a terminal shows them on request, or if they are few
-    )
+    details: bool = False  # of single cases, sequences: a terminal shows them if they are few, or on request
     empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
 
 
