@@ -2,11 +2,13 @@
 
     u <- v - sum_i gamma_i (v_i+1 - v_i),    gamma = argmin |g - sum_i gamma_i (g_i+1 - g_i)|         (1)
 
-Safeguards: where a mixed u multiplied |g| by more than 2 it is undone and the memory cleared. Where
-WINDOW evaluations have not brought the least |g| below 0.9 of what it was, as many plain ones follow.
+Safeguards: where a mixed u multiplied |g| by more than 2 it is undone and the memory cleared. Where sum |gamma_i| is
+above 1e4 nothing is mixed and the memory cleared (bounded coefficients: Toth, Kelley, Convergence analysis for Anderson
+acceleration, 2015): differences that agree to rounding send u to 1e15. Where WINDOW evaluations have not brought the
+least |g| below 0.9 of what it was, as many plain ones follow.
 All sums run in a fixed order.
 """
-from libc.math cimport sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport dot
@@ -85,12 +87,17 @@ cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const
     return used
 
 
+cdef inline double largest() noexcept nogil:
+    """Sum of |gamma| up to which something is mixed (1e3 and 1e5 do as well)."""
+    return 1e4
+
+
 cdef inline int32_t mix(const mixing_t* c, double* u) noexcept nogil:
     """u holds the last v on entry, (1) on return; 1 where something was mixed."""
     cdef int32_t kept = <int32_t>c.control[KEPT], head = <int32_t>c.control[HEAD], i, j, k
     cdef double rhs[MAX_MEMORY]
     cdef double gamma[MAX_MEMORY]
-    cdef double a
+    cdef double a, weight = 0.0
     cdef const double* x
     if kept == 0 or c.control[REST] > 0.0:
         return 0
@@ -98,6 +105,11 @@ cdef inline int32_t mix(const mixing_t* c, double* u) noexcept nogil:
         j = (head - 1 - k + 2 * c.memory) % c.memory
         rhs[j] = dot(c.dg + j * c.m, c.g, c.m)
     if least_squares(kept, head, c.memory, c.gram, rhs, gamma) == 0:
+        return 0
+    for j in range(c.memory):
+        weight += fabs(gamma[j])
+    if not weight <= largest():
+        forget(c)
         return 0
     for j in range(c.memory):
         a = gamma[j]
