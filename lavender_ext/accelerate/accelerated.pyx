@@ -198,7 +198,7 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
         for i in range(m):
             root[i] = sqrt(p.d[i])
     for s in range(n):
-        mixed = mix(&mixing, lam)
+        mixed = mix(&mixing, lam, 1.0 / 0.0)  # recorded rockfalls to 1e-10 need large ones
         if mixed:
             for i in range(p.n_blocks):
                 project_block(p, i, lam)

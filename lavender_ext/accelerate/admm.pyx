@@ -285,7 +285,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             forget(&c.mixing)
             c.mixed = 0
             return rho
-        c.mixed = mix(&c.mixing, c.u)
+        c.mixed = mix(&c.mixing, c.u, 1e4)    # (1e3 and 1e5 do as well) without: impulses of 1e15 on rows of low rank
     return 0.0
 
 

@@ -3,8 +3,8 @@
     u <- v - sum_i gamma_i (v_i+1 - v_i),    gamma = argmin |g - sum_i gamma_i (g_i+1 - g_i)|         (1)
 
 Safeguards: where a mixed u multiplied |g| by more than 2 it is undone and the memory cleared. Where sum |gamma_i| is
-above 1e4 nothing is mixed and the memory cleared (bounded coefficients: Toth, Kelley, Convergence analysis for Anderson
-acceleration, 2015): differences that agree to rounding send u to 1e15. Where WINDOW evaluations have not brought the
+above a limit of the caller's nothing is mixed and the memory cleared (bounded coefficients: Toth, Kelley, Convergence
+analysis for Anderson acceleration, 2015). Where WINDOW evaluations have not brought the
 least |g| below 0.9 of what it was, as many plain ones follow.
 All sums run in a fixed order.
 """
@@ -87,13 +87,8 @@ cdef inline int32_t least_squares(int32_t n, int32_t head, int32_t memory, const
     return used
 
 
-cdef inline double largest() noexcept nogil:
-    """Sum of |gamma| up to which something is mixed (1e3 and 1e5 do as well)."""
-    return 1e4
-
-
-cdef inline int32_t mix(const mixing_t* c, double* u) noexcept nogil:
-    """u holds the last v on entry, (1) on return; 1 where something was mixed."""
+cdef inline int32_t mix(const mixing_t* c, double* u, double most) noexcept nogil:
+    """u holds the last v on entry, (1) on return; 1 where something was mixed. `most`: sum of |gamma| up to which it is."""
     cdef int32_t kept = <int32_t>c.control[KEPT], head = <int32_t>c.control[HEAD], i, j, k
     cdef double rhs[MAX_MEMORY]
     cdef double gamma[MAX_MEMORY]
@@ -108,7 +103,7 @@ cdef inline int32_t mix(const mixing_t* c, double* u) noexcept nogil:
         return 0
     for j in range(c.memory):
         weight += fabs(gamma[j])
-    if not weight <= largest():
+    if weight > most:
         forget(c)
         return 0
     for j in range(c.memory):
