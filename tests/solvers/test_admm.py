@@ -71,6 +71,16 @@ def test_every_factorisation_gives_the_same(law):
     )
 
 
+@pytest.mark.parametrize(
+    ("seed", "m", "rank"),
+    [*((seed, 14, 6) for seed in range(6)), (22, 12, 2), (80, 12, 3), (97, 12, 4), (200, 12, 2)],
+)
+def test_singular_boxed_problems(seed, m, rank):
+    # On the last four unbounded mixing went to impulses of 1e12 to 1e15. (Seed 400, rank 2 takes more iterations.)
+    solution = lv.solve(random_lcp(seed, m=m, rank=rank), "admm", tol=1e-9, max_iter=20_000)
+    assert solution.success, solution
+
+
 def test_far_from_symmetric():
     rng = np.random.default_rng(9)
     for _ in range(5):
