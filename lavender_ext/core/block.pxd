@@ -77,11 +77,15 @@ cdef inline double norm2(double x, double y) noexcept nogil:
     return big * sqrt(1.0 + small * small)
 
 
+cdef inline double mu_r(const blocks_t* p, int32_t i) noexcept nogil:
+    return p.rolling[i] if p.kind[i] == CONTACT_ROLLING else 0.0
+
+
 cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
     """A block whose bounds depend on its own normal: else both laws are the same."""
     cdef int32_t i
     for i in range(p.n_blocks):
-        if p.kind[i] != ROW and p.ptr[i + 1] - p.ptr[i] > 1:
+        if p.kind[i] != ROW and p.ptr[i + 1] - p.ptr[i] > 1 and (p.mu[i] > 0.0 or mu_r(p, i) > 0.0):
             return True
     return False
 
@@ -109,10 +113,6 @@ cdef inline int32_t n_apart(int32_t kind, int32_t size) noexcept nogil:
 cdef inline int32_t n_turns(int32_t kind, int32_t size) noexcept nogil:
     """Rows of a contact behind its tangents, as bits and as their number: 1 spins, 2 roll, 3 is one that spins and two."""
     return 1 if kind == CONTACT_SPIN else size - 3 if kind == CONTACT_ROLLING else 0
-
-
-cdef inline double mu_r(const blocks_t* p, int32_t i) noexcept nogil:
-    return p.rolling[i] if p.kind[i] == CONTACT_ROLLING else 0.0
 
 
 cdef inline int32_t roll_at(int32_t kind, int32_t size) noexcept nogil:

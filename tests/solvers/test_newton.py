@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
+from random_problems import FORMS, as_matrix, general, good, random_contact_problem, seeds
 from twins import block_diagonal
 
 import lavender as lv
@@ -589,15 +589,25 @@ def test_rows_are_exchanged_where_an_interior_point_stops_short():
 @given(seed=seeds)
 @settings(max_examples=4)
 def test_where_nothing_rubs_the_law_has_no_slip_and_no_rounds(form, seed):
-    """mu = 0 or joints alone, rows that depend on each other: under either law the same convex problem."""
-    contacts = 0 if form == "J and M" else 25
-    p = random_contact_problem(seed, bodies=3, joints=5, contacts=contacts, tangents=2, spin=False)
+    """mu = 0, rows that depend on each other: under either law the same convex problem."""
+    p = random_contact_problem(seed, bodies=3, joints=5, contacts=25, tangents=2, spin=False)
     p = replace(p, compliance=np.zeros(p.m), cones=replace(p.cones, mu=np.zeros(p.n_blocks)))
     problem = FORMS[form](p)
     coulomb, cone = lv.solve(problem, "newton"), lv.solve(problem.relaxed("cone"), "newton")
     assert not coulomb.contradicted and "Coulomb rounds" not in coulomb.work
     assert coulomb.status == cone.status
     assert np.array_equal(coulomb.impulse, cone.impulse)
+
+
+@given(seed=seeds)
+@settings(max_examples=4)
+def test_what_rolls_or_rubs_at_one_contact_alone_is_friction(seed):
+    """Over J and M: mu = 0 but rolling, or one mu of many above 0, is no convex problem."""
+    p = random_contact_problem(seed, bodies=4, joints=1, contacts=6, spin=False, rolling=True)
+    for mu, rolling in ((0.0, 0.2), (np.eye(p.n_blocks)[-1], 0.0)):
+        cones = replace(p.cones, mu=mu + np.zeros(p.n_blocks), rolling=rolling * (p.cones.kind != ROW))
+        solution = lv.solve(general(replace(p, cones=cones)), "newton", tol=1e-9)
+        assert good(solution, 1e-9) and "Coulomb rounds" in solution.work, solution
 
 
 def test_rounds_that_gain_nothing_give_way_to_interior_points():
