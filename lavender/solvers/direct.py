@@ -37,23 +37,24 @@ from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
-from lavender_ext.pivot.direct import PASSED, SPENT
-from lavender_ext.pivot.principal import INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK
+from lavender_ext.pivot.direct import CIRCLES, PASSED, SPENT
+from lavender_ext.pivot.principal import INDEFINITE, SMALL, SOLVED, STUCK
 
 GOOD = 1e-13  # relative residual at which refinement ends, where the floor allows it
-PATIENCE = 6  # passes without halving the best residual
 BATCH = 32  # rounds between two checks of the clock and the residual
+OVER = (SOLVED, INDEFINITE, SPENT, CIRCLES)  # turns of the kernel that are the last
 
 
 @dataclass
 class DirectState:
-    """Factor of a linear system, or the rows of a boxed one; made anew before each run."""
+    """Factor of a linear system, or the rows of a boxed one; for one solve, which `run` continues."""
 
     problem: Problem
     pivot: PivotState | None = None
     general: GeneralFactor | PanelsLU | None = None
-    outcome: int = SOLVED  # of the factorisation of a linear system
     begun: int = 0  # factorisations before `general` that came to nothing
+    is_running: bool = False
+    is_over: bool = False  # the rows have nothing left to do
     note: str = ""
 
 
@@ -76,12 +77,12 @@ class Direct:
             return _unsymmetric(problem)
         state = DirectState(problem, PivotState(problem, like))
         if linear and state.pivot is not None:
-            state.outcome = state.pivot.rows.factor_all()
-            if state.outcome == INDEFINITE:
+            outcome = state.pivot.rows.factor_all()
+            if outcome == INDEFINITE:
                 return _general(problem, "A is indefinite")
             if not problem.is_symmetric:
                 state.note = "A is not symmetric"
-                if state.outcome != SOLVED:
+                if outcome != SOLVED:
                     return _general(problem, state.note)
         return state
 
@@ -164,9 +165,10 @@ class _Run:
         self.max_iter, self.tol = max_iter, tol
         self.deadline = deadline
         self.kept: measure.Judged | None = None
+        self.late = False  # no sweeps were begun, which would have ended after the deadline
         self.iterations = 0
-        self.late = False  # nothing was begun that would have ended after the deadline
         self.work: dict[str, int] = {}
+        self.told: dict[str, int] = {}  # what the rows did in the runs before
         self.notes = [state.note] if state.note else []
 
     # -- judging ---------------------------------------------------------------------------------
@@ -206,28 +208,19 @@ class _Run:
         return at_floor(self.best, self.floor)
 
     @property
-    def left(self) -> int:
-        """Rounds left in this call of the kernel."""
-        assert self.state.pivot is not None
-        return min(BATCH, self.max_iter - int(self.state.pivot.rows.n_rounds))
-
-    @property
-    def spent(self) -> bool:
-        """No rounds or no time left."""
-        return self.left <= 0 or self.out_of_time
-
-    @property
     def out_of_time(self) -> bool:
         pivot = self.state.pivot
-        late = self.late or (pivot is not None and pivot.rows.late)
-        return (late and self.deadline.is_set) or self.deadline.passed()
+        return self.late or (pivot is not None and pivot.rows.late) or self.deadline.passed()
+
+    @property
+    def pivoted(self) -> dict[str, int]:
+        """What the rows did in this run."""
+        work = {} if self.state.pivot is None else self.state.pivot.rows.work
+        return {kind: n - self.told.get(kind, 0) for kind, n in work.items() if n > self.told.get(kind, 0)}
 
     def claim(self, status: Status, **more: Any) -> Claim:
         state = self.state
-        work, form = dict(self.work), "LU"
-        if state.pivot is not None:
-            work.update(state.pivot.rows.work)
-            form = state.pivot.form
+        work, form = self.work | self.pivoted, "LU" if state.pivot is None else state.pivot.form
         return Claim(status, self.iterations, work, "; ".join(self.notes), form=form, **more)
 
     def verdict(self) -> Claim:
@@ -275,10 +268,8 @@ class _Run:
 
     def general(self, why: str) -> Claim:
         """A linear system by LU that tells the rank."""
-        before = dict(self.work)
+        before = self.work | self.pivoted
         before.pop("rank", None)  # not a count: the claim's is of a decomposition
-        if self.state.pivot is not None:
-            before.update(self.state.pivot.rows.work)
         self.state = _general(self.problem, why)
         self.notes = [self.state.note]
         assert isinstance(self.state.general, GeneralFactor)
@@ -288,81 +279,46 @@ class _Run:
 
     # -- symmetric A, and bounded rows -------------------------------------------------------------
 
-    def pivoting(self, pivot: PivotState) -> Claim:
-        """Rounds, then passes, of the kernel."""
-        rows = pivot.rows
-        rows.begin(self.impulse, self.least)
-        pivot.until(self.deadline)
-        code = self.rounds(pivot)
-        self.iterations = rows.n_rounds
-        self.keep(rows.best)
-        if rows.is_good or (code == SOLVED and rows.is_end):
-            return self.verdict()
-        if code == ROUNDS and self.spent:
-            return self.out_of_budget()
-        if code == INDEFINITE:
-            return self.indefinite()
-        if code == SMALL:
-            self.note_singular(pivot, self.patient or pivot.symmetric)
-        if not pivot.symmetric and self.problem.law == "linear":
-            return self.general("A is not symmetric")
-        if code == STUCK and not pivot.symmetric:
-            return self.circling()
-        if not self.patient and not (code == SMALL and pivot.symmetric):
-            return self.verdict()
-        rows.begin_passes(code == STUCK)
-        ended = self.passes(pivot)
-        self.iterations = rows.n_rounds
-        self.keep(rows.best)
-        return self.after_passes(pivot, ended)
-
-    def rounds(self, pivot: PivotState) -> int:
-        """All rows free, or those that sweeps leave free, then exchanges; within max_iter and the time."""
-        rows = pivot.rows
-        code: int = self.state.outcome
-        if self.problem.law == "linear":
-            return code if code != SOLVED else rows.linear()
-        self.late = pivot.too_late_to_sweep(self.deadline)
-        code = rows.first(0, 0) if self.late else rows.first(pivot.sweeps, self.left)
-        if rows.swept and not self.late:
-            self.work["sweeps"] = 2 * pivot.sweeps
-        while code == ROUNDS and not rows.is_good and not self.spent:
-            code = rows.rounds(self.left)
-        return code
-
     @np.errstate(all="ignore")  # what overflows is judged
-    def passes(self, pivot: PivotState) -> int | Claim:
-        """Passes around the last answer, and how the last of them ended; a proof that there is no solution."""
-        rows = pivot.rows
-        while not self.spent:
-            code: int = rows.one_pass(self.left)
-            if code in (SOLVED, SPENT, INDEFINITE):
-                return code
-            if code in (STUCK, SMALL) and not (self.patient and (pivot.symmetric or code == SMALL)):
-                return code
-            if code == PASSED:
-                self.iterations = rows.n_rounds
+    def pivoting(self, pivot: PivotState) -> Claim:
+        """Turns of the kernel, on from where the last run of this state has stopped."""
+        rows, before = pivot.rows, pivot.rows.n_rounds
+        pivot.until(self.deadline)
+        if self.state.is_running:
+            self.told = rows.work
+        else:
+            self.late = pivot.too_late_to_sweep(self.deadline)
+            rows.begin(self.impulse, self.least, 0 if self.late else pivot.sweeps)
+            self.state.is_running = True
+        while True:
+            code = rows.turn(0 if self.late else min(BATCH, self.max_iter - self.iterations))
+            self.iterations = rows.n_rounds - before
+            if code == SMALL and rows.passes == 0:
+                self.note_singular(pivot, self.patient or pivot.symmetric)
+            proof = self.certificate(rows.changed) if code in (PASSED, SPENT) else None
+            if proof is not None:
+                return proof
+            if code in OVER or self.gives_up(code, rows.passes > 0 or not pivot.symmetric):
                 self.keep(rows.best)
-                proof = self.certificate(rows.turn)
-                if proof is not None:
-                    return proof
-                if rows.waited >= PATIENCE or self.out_of_time:
-                    return SPENT
-        return ROUNDS
+                return self.end(pivot, code)
+            if self.iterations >= self.max_iter or self.out_of_time:
+                self.keep(rows.best)
+                return self.out_of_budget()
 
-    def after_passes(self, pivot: PivotState, code: int | Claim) -> Claim:
-        linear = self.problem.law == "linear"
-        if isinstance(code, Claim):
-            return code
-        if code == ROUNDS:
-            return self.out_of_budget()
-        if code == STUCK and not pivot.symmetric:
+    def gives_up(self, code: int, is_shifted: bool) -> bool:
+        return not self.patient and (code == STUCK or (code == SMALL and is_shifted))
+
+    def end(self, pivot: PivotState, code: int) -> Claim:
+        """What the rows deserve after the last turn."""
+        self.state.is_over = code in OVER
+        if code == CIRCLES:
             return self.circling()
-        if code == INDEFINITE and self.patient:
-            return self.general("A is indefinite") if linear else self.indefinite(pivot.symmetric)
-        if linear and not (self.best <= self.tol or self.at_floor()) and not self.out_of_time:
-            return self.general("A is indefinite")
-        return self.verdict()
+        if self.problem.law != "linear":
+            return self.indefinite(pivot.symmetric) if code == INDEFINITE else self.verdict()
+        met = self.best <= self.tol or self.at_floor() or self.out_of_time
+        if code == SOLVED or (code == SPENT and pivot.symmetric and met):
+            return self.verdict()
+        return self.general("A is indefinite" if pivot.symmetric else "A is not symmetric")
 
     def circling(self) -> Claim:
         self.notes.append(

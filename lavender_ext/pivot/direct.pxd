@@ -2,6 +2,8 @@
 
     direct_lay(&t, ...)                       arrays of the caller's, `direct_real` and `direct_index` long
     direct_begin(&t, start)
+    direct_turn(&t, n)                        until it is over: all of the below, one of them at a time
+
     direct_factor, direct_linear              where every row is free
     direct_first, then direct_rounds          else, while they say ROUNDS
     direct_begin_passes, then direct_pass     where A is singular or rounds are stuck, while they do not say SOLVED
@@ -21,7 +23,8 @@ from lavender_ext.pivot.principal cimport pivoting_t
 cpdef enum:                     # outcomes of a pass, behind those of rounds
     HALVED = 5                  # the best residual: another pass
     PASSED = 6                  # it did not: `turn` may be a certificate
-    SPENT = 7                   # all passes
+    SPENT = 7                   # all passes, or the last ones gained nothing
+    CIRCLES = 8                 # STUCK for good: A is not symmetric, so no energy to descend on
 
 
 cdef struct direct_t:
@@ -30,6 +33,7 @@ cdef struct direct_t:
     double e0                   # errors of doing nothing
     double v0
     double least                # relative residual that is good whatever the floor
+    int32_t sweeps              # symmetric ones that guess the free rows
     int32_t linear              # every row is free
     int32_t symmetric           # A is
     double* start               # (m) N s
@@ -44,6 +48,7 @@ cdef struct direct_t:
     double relative             # its relative residual,
     double floor
     double now                  # and that of x
+    int32_t stage               # of turns
     int32_t rank                # of A, all rows free, where that is singular; else 0
     int32_t solved              # exchanges came to an end without a shift
     int32_t swept
@@ -64,7 +69,6 @@ cdef int64_t direct_index(const view_t* v) noexcept nogil
 cdef void direct_lay(direct_t* t, const view_t* v, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order,
                      double tiny, double* real, int32_t* index) noexcept nogil
 cdef void direct_begin(direct_t* t, const double* start) noexcept nogil
-cdef int32_t is_good(const direct_t* t) noexcept nogil
 cdef int32_t is_end(const direct_t* t) noexcept nogil
 cdef void judge_now(direct_t* t) noexcept nogil
 cdef int32_t after_rounds(direct_t* t, int32_t code) noexcept nogil
@@ -74,6 +78,7 @@ cdef int32_t direct_first(direct_t* t, int32_t sweeps, int32_t n) noexcept nogil
 cdef int32_t direct_rounds(direct_t* t, int32_t n) noexcept nogil
 cdef void direct_begin_passes(direct_t* t, int32_t stuck) noexcept nogil
 cdef int32_t direct_pass(direct_t* t, int32_t n) noexcept nogil
+cdef int32_t direct_turn(direct_t* t, int32_t n) noexcept nogil
 
 
 cdef class Pivoting:

@@ -9,8 +9,8 @@
         x <- P(x - t A_FF^-1 w_F),  F: rows off their bounds, or whose w pushes them off                  (3)
         t = 1, 1/2, ... until phi falls by 1e-4 of what w promises                                        (4)
 
-Bertsekas 1982. (3) is monotone, so no set comes back: what pivoting lacks on a nearly singular A. A call does at most
-as many rounds as it is asked for, and the host looks at its clock in between.
+Bertsekas 1982. (3) is monotone, so no set comes back: what pivoting lacks on a nearly singular A. `direct_turn` leads
+from one to the other: a call does at most as many rounds as it is asked for, and the host looks at its clock in between.
 """
 from libc.math cimport INFINITY
 from libc.stdint cimport int32_t, int64_t
@@ -24,7 +24,7 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of
 from lavender_ext.judge.score cimport is_at_floor, relative, score_t
-from lavender_ext.pivot.direct cimport HALVED, PASSED, SPENT, direct_t
+from lavender_ext.pivot.direct cimport CIRCLES, HALVED, PASSED, SPENT, direct_t
 from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, STUCK, factor_free, pivots_solve,
                                            pivoting_t, pivots_correct, pivots_exchange, pivots_factor_all, pivots_on,
                                            pivots_renew, pivots_restart, pivots_rounds, pivots_slack, pivots_solve_free,
@@ -34,8 +34,14 @@ from lavender_ext.pivot.principal cimport (INDEFINITE, ROUNDS, SMALL, SOLVED, ST
 cdef enum:
     CORRECTIONS = 100           # refinements at a time at most; each halves the residual
     PASSES = 100
+    WAIT = 6                    # of these without halving the best residual
     SHIFTS = 5                  # of the path
     HALVINGS = 41               # step lengths tried in a line search: 1, 1/2, ... 2^-40
+
+cdef enum:                      # stages
+    BEGIN = 0
+    EXCHANGING = 1
+    PASSING = 2
 
 
 cdef int64_t direct_real(const view_t* v, int64_t band) noexcept nogil:
@@ -50,7 +56,7 @@ cdef int64_t direct_index(const view_t* v) noexcept nogil:
 
 cdef void direct_lay(direct_t* t, const view_t* v, const csr_t* a, const blocks_t* p, int32_t band, const int32_t* order,
                      double tiny, double* real, int32_t* index) noexcept nogil:
-    """All arrays; what is judged is v, what is pivoted on a, with d of p. e0, v0, least, linear are the caller's to set."""
+    """All arrays; what is judged is v, what is pivoted on a, with d of p. e0, v0, least, sweeps, linear are the caller's."""
     cdef int64_t m = p.n_rows
     t.v = v[0]
     t.x, t.best = real, real + 3 * m
@@ -67,7 +73,8 @@ cdef inline void direct_renew(direct_t* t) noexcept nogil:
     pivots_renew(&t.s)
     t.relative = INFINITY
     t.floor = 0.0
-    t.rank = t.solved = t.swept = t.refined = t.shifts = t.searches = 0
+    t.rank = t.solved = t.swept = t.refined = t.shifts = t.searches = t.passes = 0
+    t.stage = BEGIN
 
 
 cdef void direct_begin(direct_t* t, const double* start) noexcept nogil:
@@ -76,7 +83,7 @@ cdef void direct_begin(direct_t* t, const double* start) noexcept nogil:
     memcpy(t.start, start, t.s.n * sizeof(double))
 
 
-cdef int32_t is_good(const direct_t* t) noexcept nogil:
+cdef inline int32_t is_good(const direct_t* t) noexcept nogil:
     """To rounding, or to the floor where it excuses that."""
     return t.relative <= t.least or (t.relative <= t.floor and is_at_floor(t.relative, t.floor))
 
@@ -142,7 +149,8 @@ cdef int32_t after_rounds(direct_t* t, int32_t code) noexcept nogil:
 
 cdef int32_t direct_factor(direct_t* t) noexcept nogil:
     """A with all rows free: SOLVED, or SMALL or INDEFINITE after its pivots."""
-    pivots_factor_all(&t.s)
+    if not t.s.is_factored:
+        pivots_factor_all(&t.s)
     if t.s.found.negative > 0:
         return INDEFINITE
     if t.s.found.small == 0:
@@ -262,6 +270,36 @@ cdef int32_t direct_pass(direct_t* t, int32_t n) noexcept nogil:
         return HALVED
     t.waited += 1
     return PASSED
+
+
+cdef int32_t direct_turn(direct_t* t, int32_t n) noexcept nogil:
+    """What comes next, of at most n rounds.
+
+    ROUNDS, HALVED, PASSED, and SMALL and STUCK, which passes follow: another turn goes on. Else it is over: SOLVED
+    `is_end`, INDEFINITE, CIRCLES or SPENT. After PASSED and SPENT, what the pass changed may be a certificate.
+    """
+    cdef int32_t code
+    if t.stage == PASSING:
+        code = direct_pass(t, n)
+        if code == STUCK and not t.symmetric:
+            return CIRCLES
+        return SPENT if code == PASSED and t.waited >= WAIT else code
+    if t.linear:
+        code = direct_factor(t)
+        if code == SOLVED:
+            code = direct_linear(t)
+    else:
+        code = direct_first(t, t.sweeps, n) if t.stage == BEGIN else direct_rounds(t, n)
+    t.stage = EXCHANGING
+    if is_end(t):
+        return SOLVED
+    if code == ROUNDS or code == INDEFINITE:
+        return code
+    if not t.symmetric and (t.linear or code == STUCK):
+        return CIRCLES if code == STUCK else INDEFINITE if code == SMALL else SPENT
+    t.stage = PASSING
+    direct_begin_passes(t, code == STUCK)
+    return SMALL if code == SMALL else STUCK
 
 
 cdef inline bint take_sides(direct_t* t) noexcept nogil:
@@ -442,50 +480,17 @@ cdef class Pivoting:
             code = direct_factor(&self.t)
         return self.told(code)
 
-    def begin(self, const double[::1] start, double least):
-        """From start (m,) [N s]; `least` is the relative residual that is good whatever the floor."""
-        self.t.least = least
+    def begin(self, const double[::1] start, double least, int sweeps):
+        """From start (m,) [N s], with `sweeps` symmetric ones; `least`: the relative residual good whatever the floor."""
+        self.t.least, self.t.sweeps = least, sweeps
         memcpy(self.t.start, &start[0], self.t.s.n * sizeof(double))
 
-    def linear(self):
-        """All rows free, after `factor_all` that was SOLVED; refined and judged, as all that follow."""
+    def turn(self, int n):
+        """At most n rounds, refined and judged, as `direct_turn` says."""
         cdef int32_t code
         with nogil:
-            code = direct_linear(&self.t)
+            code = direct_turn(&self.t, n)
         return self.told(code)
-
-    def first(self, int sweeps, int n):
-        """A guess of the free rows by `sweeps` symmetric sweeps, then at most n rounds: SOLVED, ROUNDS, SMALL, ..."""
-        cdef int32_t code
-        with nogil:
-            code = direct_first(&self.t, sweeps, n)
-        return self.told(code)
-
-    def rounds(self, int n):
-        """At most n rounds."""
-        cdef int32_t code
-        with nogil:
-            code = direct_rounds(&self.t, n)
-        return self.told(code)
-
-    def begin_passes(self, bint stuck):
-        """Passes from the best impulse so far, along falling shifts where rounds are stuck."""
-        direct_begin_passes(&self.t, stuck)
-
-    def one_pass(self, int n):
-        """At most n rounds of a pass, as `direct_pass` says."""
-        cdef int32_t code
-        with nogil:
-            code = direct_pass(&self.t, n)
-        return self.told(code)
-
-    @property
-    def is_good(self):
-        return bool(is_good(&self.t))
-
-    @property
-    def is_end(self):
-        return bool(is_end(&self.t))
 
     @property
     def relative(self):
@@ -498,7 +503,7 @@ cdef class Pivoting:
         return self.t.floor
 
     @property
-    def turn(self):
+    def changed(self):
         """(m,) N s, what the last pass changed; a new array."""
         cdef Py_ssize_t at = 9 * <Py_ssize_t>self.t.s.n
         return self.reals[at:at + self.t.s.n].copy()
@@ -513,9 +518,9 @@ cdef class Pivoting:
         return self.t.s.n_rounds
 
     @property
-    def waited(self):
-        """Passes since the best residual was halved."""
-        return self.t.waited
+    def passes(self):
+        """So many have begun."""
+        return self.t.passes
 
     @property
     def rank(self):
@@ -523,15 +528,11 @@ cdef class Pivoting:
         return self.t.rank
 
     @property
-    def swept(self):
-        """Whether sweeps guessed the free rows."""
-        return bool(self.t.swept)
-
-    @property
     def work(self):
         """What was done, but what was not."""
-        counts = (("shifts", self.t.shifts), ("refinements", self.t.refined), ("factorisations", self.t.s.factorisations),
-                  ("pivots", self.t.s.exchanged), ("line_searches", self.t.searches))
+        counts = (("sweeps", 2 * self.t.sweeps * self.t.swept), ("shifts", self.t.shifts), ("refinements", self.t.refined),
+                  ("factorisations", self.t.s.factorisations), ("pivots", self.t.s.exchanged),
+                  ("line_searches", self.t.searches))
         return {what: count for what, count in counts if count}
 
     @property

@@ -11,6 +11,7 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender.certificates import check_certificate
 from lavender.lu import sparse_lu
+from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import direct, principal
@@ -88,8 +89,8 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
     order = rng.permutation(m).astype(np.int32)
     for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
         rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
-        rows.begin(np.zeros(m), np.inf)  # whatever is found is good: nothing is refined
-        assert rows.first(0, 1) == principal.SOLVED
+        rows.begin(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
+        assert rows.turn(1) == principal.SOLVED
         expected = np.zeros(m)
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
@@ -263,15 +264,15 @@ def test_a_prepared_factorisation_follows_symmetry(make, m):
         assert after.impulse.tobytes() == fresh.impulse.tobytes()
 
 
-@pytest.mark.parametrize("m", [3, 70])
+@pytest.mark.parametrize("m", [4, 70])
 def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a = np.eye(m)
-    a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10
+    a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10,
+    a[2:4, 2:4] = 1.0  # and without one
     state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
-    state.rows.begin(np.zeros(m), 1e-13)
-    state.rows.begin_passes(False)
-    assert state.rows.one_pass(4) == SMALL
-    assert state.rows.n_rounds == 1
+    state.rows.begin(np.zeros(m), 1e-13, 0)
+    assert [state.rows.turn(4) for _ in range(2)] == [SMALL, SMALL]
+    assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
 
 
 def test_the_first_lu_of_what_fills_is_expected_to_take_long():
@@ -344,6 +345,23 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     assert refused.status is lv.Status.TIME_LIMIT
     assert "factorisations" not in refused.work
     assert prepared.solve(lv.Problem.lcp(y @ y.T, problem.b)).success
+
+
+@given(seed=seeds, m=st.integers(2, 40), part=st.integers(1, 9))
+def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, max(1, m // 2))) * 10.0 ** rng.uniform(-2, 2, size=(m, 1))
+    problem = lv.Problem.lcp(g @ g.T, rng.normal(size=m), upper=rng.uniform(0.1, 2.0, size=m))
+    solver, claims = Direct(), []
+    whole = solver.run(solver.prepare(problem), np.zeros(m), 1000, 1e-9)
+    state, impulse = solver.prepare(problem), np.zeros(m)
+    while not claims or claims[-1].status is lv.Status.MAX_ITERATIONS:
+        claims.append(solver.run(state, impulse, part, 1e-9))
+        assert claims[-1].iterations <= part and len(claims) <= 1000
+    assert claims[-1].status is whole.status
+    rows = state.pivot.rows
+    assert sum(claim.iterations for claim in claims) == rows.n_rounds
+    assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
 
 
 def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():

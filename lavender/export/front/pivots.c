@@ -2,7 +2,7 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- direct and lemke: pivots on bounded rows ------------------------------------------------------------------------- */
 
-enum { GUESS_SWEEPS = 2, BATCH = 32, STAYING = 6 }; /* rounds or pivots between two checks of the clock; passes that gain nothing */
+enum { GUESS_SWEEPS = 2, BATCH = 32 }; /* rounds or pivots between two checks of the clock */
 static const double TINY_PIVOT = 1e-13;
 
 static int32_t prepare_pivots(lav_solver *s) {
@@ -29,6 +29,7 @@ static int32_t prepare_pivots(lav_solver *s) {
   t->e0 = s->start[0];
   t->v0 = s->start[1];
   t->least = 1e-13;
+  t->sweeps = GUESS_SWEEPS;
   pivot_direct_direct_lay(t, &s->read, &s->a, &s->q, band, NULL, TINY_PIVOT, real, index);
   if (whole) pivot_lemke_lemke_lay(&s->lemke, t, s->table, whole);
   return LAV_OK;
@@ -40,53 +41,15 @@ static int32_t rounds_left(const lav_solver *s, const lav_budget *budget) {
   return left < BATCH ? left : BATCH;
 }
 
-static int32_t is_spent(const lav_solver *s, const lav_budget *budget) {
-  return rounds_left(s, budget) <= 0 || is_late(s, budget);
-}
-
-static int32_t out_of_budget(const lav_solver *s, const lav_budget *budget) {
-  return rounds_left(s, budget) <= 0 ? LAV_MAX_ITERATIONS : LAV_TIME_LIMIT;
-}
-
-/* Rounds of solving and exchanging, until no sign is wrong or the budget is used up. */
-static int32_t go_on(lav_solver *s, const lav_budget *budget, int32_t code) {
-  while (code == pivot_principal_ROUNDS && !pivot_direct_is_good(&s->direct) && !is_spent(s, budget))
-    code = pivot_direct_direct_rounds(&s->direct, rounds_left(s, budget));
-  return code;
-}
-
-/* Passes around the last answer, where A is singular or exchanges are stuck. */
-static int32_t proximal(lav_solver *s, const lav_budget *budget, int32_t stuck) {
+static int32_t pivot_all(lav_solver *s, const lav_budget *budget) {
   int32_t code;
-  pivot_direct_direct_begin_passes(&s->direct, stuck);
-  while (!is_spent(s, budget)) {
-    code = pivot_direct_direct_pass(&s->direct, rounds_left(s, budget));
+  do {
+    code = pivot_direct_direct_turn(&s->direct, rounds_left(s, budget));
     if (code == pivot_principal_SOLVED) return LAV_CONVERGED;
-    if (code == pivot_principal_INDEFINITE) return LAV_FAILED;
-    if (code == pivot_direct_SPENT || s->direct.waited >= STAYING) return LAV_STALLED;
-    if (code == pivot_principal_STUCK && !s->direct.symmetric) return LAV_STALLED;
-  }
-  return out_of_budget(s, budget);
-}
-
-static int32_t pivot_all(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  struct pivot_direct_direct_t *t = &s->direct;
-  int32_t code;
-  if (t->linear) {
-    code = pivot_direct_direct_factor(t);
-    if (code == pivot_principal_SOLVED) code = pivot_direct_direct_linear(t);
     if (code == pivot_principal_INDEFINITE) return LAV_FAILED; /* the package goes on with LAPACK */
-    if (pivot_direct_is_end(t)) return LAV_CONVERGED;
-    if (!t->symmetric) return code == pivot_principal_SMALL ? LAV_FAILED : LAV_STALLED;
-    return proximal(s, budget, 0);
-  }
-  code = go_on(s, budget, pivot_direct_direct_first(t, GUESS_SWEEPS, rounds_left(s, budget)));
-  out->sweeps = 2 * GUESS_SWEEPS * t->swept;
-  if (pivot_direct_is_good(t)) return LAV_CONVERGED;
-  if (code == pivot_principal_ROUNDS) return out_of_budget(s, budget);
-  if (code == pivot_principal_INDEFINITE) return LAV_FAILED;
-  if (code == pivot_principal_STUCK && !t->symmetric) return LAV_STALLED; /* no energy to descend on; see lemke */
-  return proximal(s, budget, code == pivot_principal_STUCK);
+    if (code == pivot_direct_SPENT || code == pivot_direct_CIRCLES) return LAV_STALLED;
+  } while (rounds_left(s, budget) > 0 && !is_late(s, budget));
+  return rounds_left(s, budget) <= 0 ? LAV_MAX_ITERATIONS : LAV_TIME_LIMIT;
 }
 
 static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
@@ -105,7 +68,7 @@ static int32_t follow_paths(lav_solver *s, const lav_budget *budget) {
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct pivot_direct_direct_t *t = &s->direct;
   pivot_direct_direct_begin(t, s->impulse);
-  out->outcome = s->options.method == LAV_LEMKE ? follow_paths(s, budget) : pivot_all(s, budget, out);
+  out->outcome = s->options.method == LAV_LEMKE ? follow_paths(s, budget) : pivot_all(s, budget);
   if (t->relative < INFINITY) COPY(s->impulse, t->best, s->p.n_rows);
   if (out->outcome == LAV_CONVERGED || out->outcome == LAV_STALLED)
     out->outcome = t->relative <= budget->tol || (budget->tol == 0.0 && pivot_direct_is_end(t)) ? LAV_CONVERGED
@@ -113,5 +76,6 @@ static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out)
                                                                                                 : LAV_STALLED;
   out->iterations = s->options.method == LAV_LEMKE ? s->lemke.pivots : t->s.n_rounds;
   out->restarts = t->s.factorisations;
+  out->sweeps = 2 * GUESS_SWEEPS * t->swept;
 }
 #endif
