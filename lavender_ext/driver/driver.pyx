@@ -5,7 +5,6 @@ from libc.string cimport memset
 import numpy as np
 
 from lavender_ext.core.arrays cimport address
-from lavender_ext.core.block cimport has_friction
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, UNFIT, options_t, room_t, said_t
@@ -60,10 +59,10 @@ cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogi
 
 
 cdef inline void rows_need(const view_t* v, room_t* r) noexcept nogil:
-    """More than enough: as if every row moved, in contacts of six rows."""
+    """More than enough, whatever the numbers: as if every row moved, in contacts of six rows that rub."""
     cdef int64_t m = v.p.n_rows
     r.n_index = own_index(m)
-    r.n_real = begun_room(v) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, has_friction(&v.p)) + 8
+    r.n_real = begun_room(v) + own_room(m, 6 * m) + 2 * m * m + dense_room(m, True) + 8
 
 
 cdef inline int32_t start_rows(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
