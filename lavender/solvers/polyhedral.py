@@ -170,9 +170,22 @@ class ThroughRows:
     def run(
         self, held: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
-        """Run at most n iterations; the claim refers to the original problem."""
+        """Run at most n iterations; the claim refers to the original problem, at no worse an impulse than the start."""
         if not isinstance(held, Held):
             return self.solver.run(held, impulse, max_iter, tol, time_limit)
+        given = impulse.copy()
+        claim = self._through(held, impulse, max_iter, tol, time_limit)
+        if claim.status in (Status.CONVERGED, Status.FLOOR):
+            return claim
+        room = np.empty_like(given), np.empty_like(given)
+        before, after = (quick(held.form.problem, x, *room)[0] for x in (given, impulse))
+        if before < after:
+            impulse[:] = given
+        return replace(claim, status=Status.CONVERGED, certificate=None) if before <= tol else claim
+
+    def _through(
+        self, held: Held, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+    ) -> Claim:
         form = held.form
         z, deadline = form.start(impulse), Deadline(time_limit)
         claim: Claim = self.solver.run(held.state, z, max_iter, tol, time_limit)

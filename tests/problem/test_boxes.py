@@ -3,14 +3,16 @@
 import itertools
 from dataclasses import replace
 
+import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, dragged, seeds
+from random_problems import as_matrix, dragged, random_boxes, seeds
 
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
+from lavender.cones import project
 from lavender.solvers.polyhedral import as_rows
 
 LAWS = ("coulomb", "cone")
@@ -129,6 +131,23 @@ def test_pivoting_ends_on_every_problem(seed, name):
     solution = lv.solve(problem, name, tol=1e-10)
     assert solution.status is lv.Status.CONVERGED, solution
     assert not solution.contradicted
+
+
+@pytest.mark.parametrize("name", ["lemke", "direct"])
+@pytest.mark.parametrize("law", LAWS)
+@given(seed=seeds, iterations=st.sampled_from([1, 2, 1000]))
+@settings(max_examples=15)
+def test_pivoting_ends_nowhere_worse_than_it_starts(law, name, seed, iterations):
+    """Rows that depend on each other, which many impulses or none can meet; from near the best that `auto` finds."""
+    problem = random_boxes(seed, law, bodies=3, joints=4, contacts=8)
+    problem = replace(problem, compliance=np.zeros(problem.m))
+    found = lv.solve(problem, "auto", tol=1e-8).impulse
+    near = found + 1e-6 * np.random.default_rng(seed).normal(size=problem.m)
+    start = project(problem.cones, near)
+    end = lv.solve(problem, name, impulse=start, tol=1e-8, max_iter=iterations)
+    # a solution at the floor of rounding may be as far above zero as the start
+    bound = max(lv.residual(problem, start).relative, 1e-8, 2.0 * end.residual.floor)
+    assert end.residual.relative <= bound, end
 
 
 def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
