@@ -30,9 +30,9 @@ from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget,
 from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_apart, n_tangents,
                                       norm2, rolling_section, round_group, round_section, round_share)
 from lavender_ext.core.contact_map cimport section
-from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.blocks cimport sparse_t
+from lavender_ext.factor.dense cimport dense_cholesky_solve
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.supernodal cimport sparse_solve
 
@@ -50,7 +50,7 @@ cdef enum:
 cdef struct factor_t:           # of B + rho, or of the body form
     int32_t kind
     int32_t n                   # its order
-    const double* dense         # (n, n) Cholesky, row by row, lower
+    const double* dense         # of factor/dense.pxd, for a host without panels
     const sparse_t* panels
     const int32_t* k_ptr        # K by rows (BODIES)
     const int32_t* k_col
@@ -78,30 +78,12 @@ cdef struct admm_t:
     mixing_t mixing
 
 
-cdef inline void solve_dense(const factor_t* f, double* x) noexcept nogil:
-    # x (n) <- matrix^-1 x
-    cdef int32_t i, j, n = f.n
-    cdef double s
-    cdef const double* row
-    for i in range(n):
-        row = f.dense + <int64_t>n * i
-        x[i] = (x[i] - dot(row, x, i)) / row[i]
-    i = n - 1
-    while i >= 0:
-        row = f.dense + <int64_t>n * i
-        s = x[i] / row[i]
-        x[i] = s
-        for j in range(i):
-            x[j] -= row[j] * s
-        i -= 1
-
-
 cdef inline void solve_shifted(const factor_t* f, int32_t m, double* x, double* t) noexcept nogil:
     # (1): x (m) <- (B + rho)^-1 x; t (n) is scratch of BODIES
     cdef int32_t i, k
     cdef double s
     if f.kind == DENSE:
-        solve_dense(f, x)
+        dense_cholesky_solve(m, f.dense, x)
         return
     if f.kind == PANELS:
         sparse_solve(f.panels, x, x)
@@ -345,27 +327,22 @@ cdef class Splitting:
     def run(self, double[::1] lam, int n, factor):
         """At most `n` iterations in place, GIL released: how many. `rho` may be another then, and asks for a factor.
 
-        factor: (kind, order, arrays) with the arrays that `factor_t` names, in its order; None where a kind has none.
+        factor: (PANELS or BODIES, order, arrays) with the arrays that `factor_t` names, in its order.
         """
         cdef factor_t f
         cdef int32_t left = n
         cdef double wanted
         cdef double[::1] work
-        cdef const double[:, ::1] dense
         cdef const double[::1] k_val, e
         cdef const int32_t[::1] k_ptr, k_col
         cdef SparsePanels panels
         f.kind = factor[0]
         f.n = factor[1]
-        if f.kind == DENSE:
-            dense = factor[2][0]
-            f.dense = &dense[0, 0]
-        else:
-            panels = factor[2][0]
-            f.panels = &panels.f
-            if f.kind == BODIES:
-                k_ptr, k_col, k_val, e = factor[2][1:]
-                f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
+        panels = factor[2][0]
+        f.panels = &panels.f
+        if f.kind == BODIES:
+            k_ptr, k_col, k_val, e = factor[2][1:]
+            f.k_ptr, f.k_col, f.k_val, f.e = &k_ptr[0], &k_col[0], &k_val[0], &e[0]
         work = np.empty(f.n + 1)
         self.c.work = &work[0]
         with nogil:

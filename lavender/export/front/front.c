@@ -56,7 +56,7 @@ struct lav_solver {
   blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
   struct pivot_direct_direct_t direct;
   struct pivot_lemke_lemke_t lemke;
-  double *table;               /* Lemke's dictionary, or the factor of admm */
+  double *table;               /* Lemke's dictionary, or the matrix of admm and its factor */
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
   int32_t factors, is_broken;

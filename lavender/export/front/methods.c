@@ -149,27 +149,20 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
 
 static const double FIRST_RHO = 0.1, RELAXATION = 1.6;
 
-/* L L^T = D^-1/2 A D^-1/2 + rho, row by row; 0 where a pivot is not positive. */
+/* L L^T = D^-1/2 A D^-1/2 + rho, behind that matrix; 0 where a pivot is not positive. */
 static int32_t factor_shifted(lav_solver *s) {
   const int32_t m = s->p.n_rows;
   const double *root = s->splitting.root;
-  int32_t i, j, q;
+  int32_t i, q;
   s->factors += 1;
+  memset(s->table, 0, (size_t)m * m * sizeof(double));
   for (i = 0; i < m; i++) {
     double *row = s->table + (int64_t)i * m;
-    memset(row, 0, (size_t)(i + 1) * sizeof(double));
     for (q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
-      if (s->a.indices[q] <= i) row[s->a.indices[q]] += s->a.data[q] / (root[i] * root[s->a.indices[q]]);
+      row[s->a.indices[q]] = s->a.data[q] / (root[i] * root[s->a.indices[q]]);
     row[i] += s->splitting.rho;
-    for (j = 0; j < i; j++) {
-      const double *to = s->table + (int64_t)j * m;
-      row[j] = (row[j] - core_generalized_dot(row, to, j)) / to[j];
-    }
-    row[i] -= core_generalized_dot(row, row, i);
-    if (!(row[i] > 0.0)) return 0;
-    row[i] = sqrt(row[i]);
   }
-  return 1;
+  return factor_dense_dense_cholesky(LAVENDER_HAS_WIDE(), m, s->table, s->table + (int64_t)m * m);
 }
 
 static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
@@ -196,7 +189,7 @@ static int32_t prepare_admm(lav_solver *s) {
   GIVE_BACK(form_matrix(s));
   if (m > 0 && s->a.indptr[m] > 0 && core_csr_scan_entries(&s->a, s->p.d, (int32_t)m, s->marks, bands) > 1e-14)
     return LAV_ERROR_UNSUPPORTED; /* L L^T alone: A is not symmetric */
-  s->table = TAKE(s, double, m * m);
+  s->table = TAKE(s, double, m * m + factor_dense_cholesky_room(s->p.n_rows));
   x = TAKE(s, double, numbers);
   if (s->is_short) return LAV_ERROR_ROOM;
   memset(x, 0, (size_t)numbers * sizeof(double));
@@ -204,7 +197,7 @@ static int32_t prepare_admm(lav_solver *s) {
   memset(&s->factor, 0, sizeof s->factor);
   s->factor.kind = accelerate_admm_DENSE;
   s->factor.n = (int32_t)m;
-  s->factor.dense = s->table;
+  s->factor.dense = s->table + m * m;
   s->factors = 0;
   s->is_broken = !factor_shifted(s);
   s->context = s;

@@ -273,7 +273,8 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
   }
   if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 22 * m + (bodies ? 12 * n : 0) + m * (m < band ? m : band);
   if (method == LAV_LEMKE) numbers += 4 * m * m + 9 * m; /* two places in the dictionary for each row */
-  if (method == LAV_ADMM) numbers = m * m + (10 + 2 * memory) * m + CONTROL + GRAM;
+  if (method == LAV_ADMM)
+    numbers = m * m + factor_dense_cholesky_room(q->n_rows) + (int64_t)k_admm_room(q->n_rows, o->memory);
   return numbers + (bodies ? 90 * m + 6 * k + n : 0) + 64;
 }
 #endif
