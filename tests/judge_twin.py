@@ -2,7 +2,8 @@
 
 With w = A lambda - b and d as docs/concepts.md defines them, E = sqrt(sum d e^2), V = max sqrt(nu d) |e|, and
 
-    relative = max(E / E0, V / V0),   floor = 2^-53 (|A| |lambda| + |b|) in the same two norms.
+    relative = max(E / E0, V / V0),   floor = 2^-53 (|A| |lambda| + |b|) in the same two norms, at least
+                                                2^-53 (d |lambda| + |b|) where a pair is cut to its bound.
 
 Long double has 11 more bits and 2^14 instead of 2^10 as its largest exponent, so nothing here overflows, and what
 it rounds is far below what float64 may round. `Judgement.allowed` is what float64 may add: each of the m + 20
@@ -374,8 +375,10 @@ class Problem:
 
     def _judge(self, lam):
         w = self.slack(lam)
-        size = self.size @ np.abs(lam) + self.b_size
-        energy, velocity = self.norms(self.error(lam, w))
+        error = self.error(lam, w)
+        size = self.size @ np.abs(lam)
+        size = np.maximum(size, self._own(error, lam, w)) + self.b_size
+        energy, velocity = self.norms(error)
         start = np.where(self._bounded(), np.clip(ZERO, self._low(), self._high()), ZERO).astype(L)
         energy0, velocity0 = self.norms(self.error(start, self.slack(start)))
         rhs_energy, rhs_velocity = self.norms(self.b / self.d)
@@ -407,6 +410,13 @@ class Problem:
             nothing,
             span,
         )
+
+    def _own(self, e, lam, w):
+        """(m,) d |lambda| of pairs whose norm is cut to its bound."""
+        out = np.zeros(self.m, L)
+        for at in (at for k in range(len(self.cones["kind"])) for at in self.pairs(k)):
+            out[at] = np.where(e[at] != w[at] / self.d[at], self.d[at] * np.abs(lam[at]), 0)
+        return out
 
     def _floor(self, f):
         return np.sqrt((f * f / self.d).sum()), (f * np.sqrt(self.nu / self.d)).max(initial=ZERO)

@@ -1,6 +1,7 @@
 """The judge's pass: w = A lam - b formed anew, error e of every block, their sums (score.pxd) and what rounding leaves.
 
-    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|
+    F_i = 2^-53 (|A| |lam| + |b|)_i             [m/s]; factored: |J| |M^-1| |J|^T |lam| + c |lam| for |A| |lam|;
+                                                at least d_i |lam_i| where a pair is cut to its bound
     floor energy sqrt(sum F^2 / d), floor velocity max F sqrt(nu / d)
 
 A row's products serve w and F: A is read once. Factored, core/velocity.pxd forms M^-1 J^T lam, and a second loop reads
@@ -9,7 +10,7 @@ J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.block cimport ROW, block_error, blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
@@ -17,8 +18,8 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.score cimport (add_floor, are_numbers, floor_ends, floor_t, no_floor, norms_of_rhs, relative,
-                                       score_rows, score_t)
+from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_ends, floor_t, no_floor, norms_of_rhs,
+                                       nothing, relative, score_from, score_rows, score_t, tally_block, tally_t)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -30,22 +31,40 @@ cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam,
         w[i] = csr_dot(a, i, lam) - p.b[i]
 
 
+cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
+                           const bint scaled, tally_t* s, floor_t* f) noexcept nogil:
+    """w, e and floor of every block, or, scaled, the floor alone from these."""
+    cdef int32_t i, j, k
+    cdef double size[6]
+    for i in range(p.n_blocks):
+        j = p.ptr[i]
+        for k in range(j, p.ptr[i + 1]):
+            if scaled:
+                size[0 if p.kind[i] == ROW else k - j] = csr_abs_dot(a, k, lam)
+            else:
+                w[k] = csr_dot_size(a, k, lam, size + (0 if p.kind[i] == ROW else k - j)) - p.b[k]
+            if p.kind[i] == ROW:                        # of any number
+                add_floor(p, k, size[0], scaled, f)
+        if not scaled:
+            block_error(p, i, lam, w, e)
+            tally_block(p, i, e, s)
+        if p.kind[i] != ROW:
+            add_block_floor(p, i, lam, w, e, size, scaled, f)
+
+
 cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
                            score_t* out) noexcept nogil:
-    cdef int32_t k
-    cdef double size
+    cdef tally_t s = nothing()
     cdef floor_t f = no_floor()
     if not floor:
         csr_slack(p, a, lam, w)
-    else:
-        for k in range(p.n_rows):
-            w[k] = csr_dot_size(a, k, lam, &size) - p.b[k]
-            add_floor(p, k, size, 0, &f)
-        if not floor_ends(&f, 0, out):
-            for k in range(p.n_rows):
-                add_floor(p, k, csr_abs_dot(a, k, lam), 1, &f)
-            floor_ends(&f, 1, out)
-    score_rows(p, lam, w, e, out)
+        score_rows(p, lam, w, e, out)
+        return
+    csr_floor(p, a, lam, w, e, 0, &s, &f)
+    score_from(p, e, &s, out)
+    if not floor_ends(&f, 0, out):
+        csr_floor(p, a, lam, w, e, 1, &s, &f)
+        floor_ends(&f, 1, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
@@ -220,10 +239,10 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
                 out[roll + 1] += fabs(t2[k]) * x[3 + k]
 
 
-cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* sizes,
-                            const bint scaled, floor_t* f) noexcept nogil:
+cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, const double* e,
+                            const double* sizes, const bint scaled, floor_t* f) noexcept nogil:
     # (|J| |M^-1| |J|^T |lam| + c |lam|) of every row; sizes of `velocity_size`
-    cdef int32_t i, j, c, n, nt, turns, a, b
+    cdef int32_t i, j, k, c, n, nt, turns, a, b
     cdef double size[6]
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
@@ -242,8 +261,9 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
             contact_sizes(r, c, 2, 0, sizes, size)
         else:
             contact_sizes(r, c, 0, 0, sizes, size)
-        for i in range(n):
-            add_floor(p, j + i, r.compliance[j + i] * fabs(lam[j + i]) + size[i], scaled, f)
+        for k in range(n):
+            size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
+        add_block_floor(p, i, lam, w, e, size, scaled, f)
 
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
@@ -256,9 +276,9 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
     if not floor:
         return
     velocity_size(p, r, lam, sizes)
-    rows_floor(p, r, lam, sizes, 0, &f)
+    rows_floor(p, r, lam, w, e, sizes, 0, &f)
     if not floor_ends(&f, 0, out):
-        rows_floor(p, r, lam, sizes, 1, &f)
+        rows_floor(p, r, lam, w, e, sizes, 1, &f)
         floor_ends(&f, 1, out)
 
 
@@ -293,10 +313,11 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
         panel_size(g, i, x, size)
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
-        add_floor(p, i, size[i], 0, &f)
+    for i in range(p.n_blocks):
+        add_block_floor(p, i, lam, w, e, size + p.ptr[i], 0, &f)
     if not floor_ends(&f, 0, out):
-        for i in range(p.n_rows):
-            add_floor(p, i, size[i], 1, &f)
+        for i in range(p.n_blocks):
+            add_block_floor(p, i, lam, w, e, size + p.ptr[i], 1, &f)
         floor_ends(&f, 1, out)
 
 

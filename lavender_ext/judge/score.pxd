@@ -11,7 +11,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, norm2,
-                                      roll_at)
+                                      quotient, roll_at)
 
 
 cdef struct score_t:
@@ -266,6 +266,24 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint
     t = p.nu[k] * t * f
     if t > s.fast:
         s.fast = t
+
+
+cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
+                                 const double* size, const bint scaled, floor_t* s) noexcept nogil:
+    """`add_floor` of a block's rows; size from its first row on, of at least |A_kk| |lam_k|.
+
+    Where the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
+    velocity; d_k, of both rows, may be far above A_kk.
+    """
+    cdef int32_t k, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef int32_t nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], n), roll = roll_at(p.kind[i], n)
+    cdef double x, own
+    for k in range(n):
+        x = size[k]
+        if (is_pair(nt, roll, k) or is_pair(nt, roll, k - 1)) and e[j + k] != quotient(w[j + k], p.d[j + k]):
+            own = p.d[j + k] * fabs(lam[j + k])
+            x = own if own > x else x
+        add_floor(p, j + k, x, scaled, s)
 
 
 cdef inline bint floor_ends(const floor_t* s, const bint scaled, score_t* out) noexcept nogil:

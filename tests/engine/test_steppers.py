@@ -1,6 +1,7 @@
 """Ways to step: laws that each keeps, twins in NumPy, snapshots, refusals. Tolerances of laws are first order in h."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -295,6 +296,19 @@ def test_a_snapshot_goes_on_with_the_same_bits(name, scene, tmp_path):
     again = [other.step() for _ in range(20)][-1][0]
     for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
         assert end[key].tobytes() == again[key].tobytes(), key
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("scene", ["card_house", "bridge", "chain"])
+def test_the_unit_of_mass_changes_no_bit_of_the_motion(name, scene):
+    own, other = lv.Scene(scene, stepper=name), lv.Scene(scene, stepper=name)
+    other.bodies[:] = [replace(b, mass=4096.0 * b.mass, inertia=4096.0 * b.inertia) for b in other.bodies]
+    own, other = lv.Simulation(own), lv.Simulation(other)
+    for _ in range(20):
+        seen, scaled = own.step()[0], other.step()[0]
+    for key in ("positions", "quaternions", "velocities"):
+        assert seen[key].tobytes() == scaled[key].tobytes(), key
+    assert (4096.0 * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
 
 
 @pytest.mark.parametrize("name", OTHERS)

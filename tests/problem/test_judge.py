@@ -238,6 +238,25 @@ def test_floor_bounds_the_rounded_exact_solution(seed):
     assert judged.floor <= 1e-6
 
 
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@given(seed=seeds)
+def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(friction, seed):
+    """It slides along the light one: A lambda says nothing of the impulse's own rounding, which d makes a velocity."""
+    rng = np.random.default_rng(seed)
+    normal, light, mu, b = rng.uniform(0.5, 2.0, 4).astype(np.longdouble)
+    d = np.diag([normal, 10.0 ** rng.uniform(0.0, 12.0), light]).astype(float)
+    push = 4.0 * mu * b * light / normal  # four times what the contact holds
+    x = b / normal if friction == "coulomb" else (b + mu * push) / (normal + mu * mu * light)
+    problem = lv.Problem.contact(d, np.array([b, 0.0, push], float), [float(mu)], friction=friction)
+    exact = np.array([x, 0.0, mu * x], float)
+    judged = lv.residual(problem, exact)
+    # A disk: both lambda_t and mu lambda_n are rounded. The projection on a cone rounds in five more operations.
+    assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.floor
+    if friction == "coulomb":  # a wide cone's nearest point follows the tangents
+        off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
+        assert off.relative > 2.0 * off.floor
+
+
 def arms_along_axes(problem):
     """Its contacts with arms along one axis each: |arm x n| has one product a component, as the floor counts them."""
     rows, keep = problem.rows, np.eye(3)[np.arange(problem.rows.n_contacts) % 3]
@@ -251,7 +270,7 @@ def arms_along_axes(problem):
     "kind", ["four_bar(tilt=0.3)", "ring(n=8)", *(k for k in CONTACTS if k != "ellipses")]
 )
 def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
-    """F = 2^-53 (|J| |M^-1| |J|^T |lam| + c |lam| + |b|), by dense matrices; squares of e beyond float64, too."""
+    """F = 2^-53 (max(|J| |M^-1| |J|^T |lam| + c |lam|, d |lam|) + |b|), by dense matrices; squares beyond float64."""
     problem = arms_along_axes(CONTACTS[kind](3)) if kind in CONTACTS else suite.case(kind).problem
     rows = problem.rows
     inv_mass = block_diag(
@@ -264,7 +283,10 @@ def test_floor_over_bodies_is_that_of_the_formula(kind, scale):
     scaled = dataclasses.replace(problem, b=problem.b * 2.0**scale, rows=moved, cones=cones)
     for lam in np.diag(100.0 * np.abs(problem.b).max() / problem.d):  # each row once is the one that counts
         size = jac @ (np.abs(inv_mass) @ (jac.T @ lam))
-        f = 2.0**-53 * (size + problem.compliance * lam + np.abs(problem.b))
+        size = np.maximum(
+            size + problem.compliance * lam, problem.d * lam
+        )  # a tangent alone is cut; else d is A_kk
+        f = 2.0**-53 * (size + np.abs(problem.b))
         start = lv.residual(problem, lam)
         energy = np.sqrt(np.sum(f**2 / problem.d)) / start.energy_start
         velocity = np.max(f * problem.metric.weight / problem.d) / start.velocity_start
