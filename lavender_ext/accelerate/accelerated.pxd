@@ -1,7 +1,8 @@
 """What an accelerated sweep runs over, and its step for a loop under a watch."""
-from libc.stdint cimport int32_t
+from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY
+from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.sweep.serial cimport context_t
 
 
@@ -15,6 +16,22 @@ cdef struct sweep_data_t:
     double* control             # (CONTROL) of accelerate/mixing.pxd
     double* gram                # (MAX_MEMORY, MAX_MEMORY)
     double* work                # nncg 3 (m + n_v); anderson (4 + 2 memory) m
+
+
+cdef inline int64_t accelerated_room(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
+    """Numbers of a run."""
+    return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
+
+
+cdef inline void lay_accelerated(sweep_data_t* c, context_t* sweeps, int32_t memory, int32_t convex, int32_t keeps,
+                                 double* room) noexcept nogil:
+    """A run before its first iteration, in room (`accelerated_room`, zeroed)."""
+    c.sweeps, c.cone = sweeps, sweeps.blocks[0]
+    c.cone.law = CONE
+    c.memory, c.convex, c.keeps, c.turn = memory, convex, keeps, 0
+    c.work = room
+    c.gram = room + 3 * (sweeps.blocks.n_rows + sweeps.n_v) + (1 + 2 * <int64_t>memory) * sweeps.blocks.n_rows
+    c.control = c.gram + MAX_MEMORY * MAX_MEMORY
 
 
 cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil

@@ -19,9 +19,9 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.accelerate.accelerated cimport sweep_data_t
+from lavender_ext.accelerate.accelerated cimport accelerated_room, lay_accelerated, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, clip, n_apart, n_tangents, norm2
+from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, clip, n_apart, n_tangents, norm2
 from lavender_ext.core.order cimport RANDOM, SYMMETRIC
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again, sweep_t
@@ -236,37 +236,27 @@ def sweeps_of(Data p, int32_t[::1] order, int split, int mode, rng, bint exact=F
 
 
 def allocate(Sweeps x, int memory):
-    """Zeroed (control, gram, work) for a run; memory 0 is nncg."""
-    cdef Py_ssize_t m = x.c.blocks.n_rows
+    """Zeroed numbers for a run; memory 0 is nncg."""
     if not 0 <= memory <= MAX_MEMORY:
         raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return (np.zeros(CONTROL), np.zeros(MAX_MEMORY * MAX_MEMORY),
-            np.zeros(3 * (m + x.c.n_v) + (1 + 2 * memory) * m + 1))
+    return np.zeros(accelerated_room(x.c.blocks.n_rows, x.c.n_v, memory))
 
 
-def run(Sweeps x, Watch watch, double[::1] lam, int n, double tol, int memory, int convex, space, bint keeps=False):
+def run(Sweeps x, Watch watch, double[::1] lam, int n, double tol, int memory, int convex,
+        double[::1] space, bint keeps=False):
     """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
 
     Blocks of x are prepared where they are exact or `convex` is not 0. space comes from `allocate`.
     """
     cdef sweep_data_t c
     cdef int32_t status, done = 0, more = 0
-    cdef double[::1] control = space[0], gram = space[1], work = space[2]
     cdef sweep_t step = lav_nncg if memory == 0 else lav_anderson
     if lam.shape[0] == 0:
         if tol > 0.0:
             return CONVERGED, 0, 0, 0
         return RUNNING, n, n, 0
-    c.sweeps = &x.c
-    c.cone = x.c.blocks[0]
-    c.cone.law = CONE
-    c.convex = convex
+    lay_accelerated(&c, &x.c, memory, convex, keeps, &space[0])
     c.turn = watch.state.total
-    c.memory = memory
-    c.keeps = keeps
-    c.control = &control[0]
-    c.gram = &gram[0]
-    c.work = &work[0]
     x.make_room(c.turn + <int64_t>n)
     with nogil:
         if c.turn == 0:
@@ -277,4 +267,4 @@ def run(Sweeps x, Watch watch, double[::1] lam, int n, double tol, int memory, i
             forget_all(&c, &lam[0])
             status = watch.run(step, &c, &lam[0], n - done, tol, &more)
             done += more
-    return status, done, done * (2 if x.c.mode == SYMMETRIC else 1), int(control[RESTARTS if memory == 0 else UNDONE])
+    return status, done, done * (2 if x.c.mode == SYMMETRIC else 1), int(c.control[RESTARTS if memory == 0 else UNDONE])

@@ -7,7 +7,7 @@ typedef struct core_generalized_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
-enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64, CONTROL = 9, GRAM = 256 };
+enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64 };
 enum { MOST_TURNS = 16, FEW_ROWS = 600 }; /* of auto, and up to which it forms dense matrices */
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
 enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */

@@ -255,7 +255,7 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
   csr_t none = {NULL, NULL, NULL};
   switch (method) {
     case LAV_ANDERSON: case LAV_NNCG:
-      numbers = CONTROL + GRAM + 3 * (m + n_v) + (1 + 2 * memory) * m + 64;
+      numbers = accelerate_accelerated_accelerated_room(m, n_v, memory) + 64;
       return numbers + (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE ? prepared : o->convex > 0 ? pairs + prepared : pairs);
     case LAV_SEQUENTIAL_IMPULSES: return pairs;
     case LAV_BLOCK_GAUSS_SEIDEL: return prepared;
