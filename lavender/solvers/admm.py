@@ -31,14 +31,12 @@ from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
-from lavender.solvers.newton_systems.systems import factor_cost
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
-from lavender_ext.factor import symbolic
-from lavender_ext.factor.graph import body_pattern
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import scaled_entries
+from lavender_ext.newton.solve import Layout
 
 _PANELS, _BODIES = 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
@@ -116,8 +114,8 @@ class AdmmState:
         problem, m = self.problem, self.problem.m
         if self.kind == _BODIES:
             assert problem.rows is not None
-            nptr, nind = body_pattern(problem.rows.block_bodies, problem.rows.n_bodies)[:2]
-            return _PANELS_WORK * factor_cost(symbolic.factor_pattern(nptr, nind)[0], 6)
+            rows = problem.rows
+            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).cost)
         return _PANELS_WORK * self.panels.work if m else 0.0
 
     @property

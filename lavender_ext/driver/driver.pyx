@@ -16,7 +16,7 @@ from lavender_ext.generalized.newton cimport SPENT as G_SPENT
 from lavender_ext.generalized.newton cimport descend_all
 from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport judge_nothing
-from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
+from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_bodies, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, REACHED, SPENT, STUCK, newton_start, newton_step
 from lavender_ext.newton.run cimport (aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t, own_index,
                                       own_room, proof_of)
@@ -86,7 +86,7 @@ cdef inline int32_t start_bodies(const view_t* v, const options_t* o, room_t* r,
     cdef newton_t* n = &(<state_t*>r.real).n
     cdef double* x = begin(v, o, r)
     cdef pattern_t a
-    lay_pattern(n, &a, r.index, &v.p, v.r)
+    lay_bodies(n, &a, r.index, &v.p, v.r)
     find_elements(&n.sc, &v.p, NULL, v.r)
     make_pattern(&n.sc, &a, v.r)
     if not grant(r, index_room(&v.p, v.r), begun_room(v) + body_room(n, &a, &v.p, v.r)):

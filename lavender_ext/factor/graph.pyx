@@ -10,7 +10,7 @@ import numpy as np
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.graph cimport eliminate_bodies, order_graph, order_room, pattern_room
+from lavender_ext.factor.graph cimport order_graph, order_room
 
 
 cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
@@ -148,23 +148,6 @@ cdef public int32_t lav_body_pairs(int32_t k, const int32_t* body, int32_t n_bod
                 count += 1
             i = following[i]
     return count
-
-
-def body_pattern(const int32_t[:, ::1] body, int n):
-    """(nptr, nind, node, slot, turned) of the normal matrix over n bodies, blocks between bodies (k, 2)."""
-    cdef int32_t k = <int32_t>body.shape[0]
-    cdef double[::1] scratch = np.empty(pattern_room(n, k) // 2 + 1)
-    cdef int32_t[::1] parent = np.empty(n + 1, np.int32)
-    nptr_array, nind_array = np.zeros(n + 1, np.int32), np.empty(n + k + 1, np.int32)
-    node_array, slot_array = np.empty((k, 2), np.int32), np.empty((k, 3), np.int32)
-    turned_array = np.empty(k, np.int32)
-    cdef int32_t[::1] nptr = nptr_array, nind = nind_array, turned = turned_array
-    cdef int32_t[:, ::1] node = node_array, slot = slot_array
-    if k and n:
-        with nogil:
-            eliminate_bodies(k, &body[0, 0], n, <int32_t*>&scratch[0], &parent[0], &nptr[0], &nind[0], &node[0, 0],
-                             &slot[0, 0], &turned[0])
-    return nptr_array, nind_array[:nptr_array[n]].copy(), node_array, slot_array, turned_array
 
 
 def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):

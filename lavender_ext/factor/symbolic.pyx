@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t, int64_t
 import numpy as np
 
 from lavender_ext.factor.minimum_degree cimport degree_order
-from lavender_ext.factor.symbolic cimport block_pattern, block_tree, column_pattern, postordered
+from lavender_ext.factor.symbolic cimport block_tree, column_pattern, postordered
 
 
 cdef enum:
@@ -181,30 +181,6 @@ cdef public void lav_panel_rows(int32_t n, int32_t count, int32_t panels, const 
     first[panels] = n
 
 
-def factor_pattern(const int32_t[::1] nptr, const int32_t[::1] nind):
-    """(lptr, lind, rptr, rind) of the factor of a lower block pattern; nptr (n + 1), diagonal last in each row."""
-    cdef int32_t n = <int32_t>nptr.shape[0] - 1
-    cdef int32_t[::1] parent = np.empty(n + 1, np.int32), mark = np.empty(n + 1, np.int32)
-    cdef int32_t[::1] row_count = np.empty(n + 1, np.int32), column_count = np.empty(n + 1, np.int32)
-    lptr_array, rptr_array = np.empty(n + 1, np.int32), np.empty(n + 1, np.int32)
-    cdef int32_t[::1] lptr = lptr_array, rptr = rptr_array
-    cdef int64_t total = 0
-    cdef int32_t i
-    block_tree(n, &nptr[0], &nind[0], &parent[0], &mark[0], &row_count[0], &column_count[0])
-    for i in range(n):
-        total += column_count[i]
-    if total >= 2**31:
-        raise OverflowError("the factor has 2^31 blocks or more")
-    lptr[0] = rptr[0] = 0
-    for i in range(n):
-        lptr[i + 1] = lptr[i] + column_count[i]
-        rptr[i + 1] = rptr[i] + row_count[i]
-    lind_array, rind_array = np.empty(lptr[n] + 1, np.int32), np.empty(lptr[n] + 1, np.int32)
-    cdef int32_t[::1] lind = lind_array, rind = rind_array
-    block_pattern(n, &nptr[0], &nind[0], &parent[0], &mark[0], &lptr[0], &rptr[0], &row_count[0], &lind[0], &rind[0])
-    return lptr_array, lind_array, rptr_array, rind_array
-
-
 def analysed(indptr, indices):
     """(numbers, places in the values, work of L L^T) of `sparse_t`, for a matrix whose pattern is symmetric."""
     cdef int32_t n = <int32_t>len(indptr) - 1, nnz = <int32_t>len(indices), count, k, room = nnz + nnz // 4 + n + 1
@@ -248,7 +224,7 @@ def block_panels(const int32_t[::1] nptr, const int32_t[::1] nind, const int32_t
                  int few, double share):
     """As `analysed` of a lower block pattern as it stands, blocks of s rows; before it the place of each block in the values.
 
-    lptr, lind are from `factor_pattern`; few: blocks.
+    lptr, lind: the blocks of its factor by columns; few: blocks.
     """
     cdef int32_t n = <int32_t>nptr.shape[0] - 1, i, j, q, k, p, below = 0
     cdef int32_t[::1] group = np.empty(n + 1, np.int32), one = np.ones(n + 1, np.int32), whole

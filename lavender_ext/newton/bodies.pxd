@@ -1,7 +1,8 @@
 """What Newton's method over bodies factors, from a problem's own arrays: an order of elimination and a panel, in given room.
 
 First what the pattern needs (`index_room`, `lay_pattern`, `make_pattern`), then, with it, the numbers (`body_room`,
-`furnish_bodies`). Six columns stand for a body.
+`furnish_bodies`), six columns for a body. A host that allocates in between gives the factor's pattern its room after
+`order_bodies`, and its numbers theirs, of fewer columns, by `factor_room` and `furnish_factor`.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
@@ -9,6 +10,7 @@ from libc.string cimport memset
 
 from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
 from lavender_ext.newton.elements cimport elements_t
@@ -20,6 +22,7 @@ from lavender_ext.newton.system cimport BODIES
 
 cdef enum:
     MOST_BODIES = 1500          # whose factor has room as if it were full
+    PARTS = 8                   # arrays of numbers of a factor
 
 
 cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogil:
@@ -27,11 +30,18 @@ cdef inline int64_t index_room(const blocks_t* p, const rows_t* r) noexcept nogi
     cdef int64_t k = p.n_rows, n = r.n_bodies
     if n == 0 or n > MOST_BODIES or k == 0 or not is_known(p):
         return 0
-    # scratch of an order, six vectors of bodies and their pivots, the pattern of N and of L, elements
-    return pattern_room(n, k) + 12 * (n + 1) + (n + k + 1) + n * (n - 1) + 2 + 9 * (k + 1) + own_index(k)
+    return order_index(n, k) + n * (n - 1) + 2 + own_index(k)
+
+
+cdef inline int64_t order_index(int64_t n, int64_t k) noexcept nogil:
+    """Of that what `order_bodies` takes for n bodies and k elements."""
+    # scratch of an order, six vectors of bodies and their pivots, the pattern of N, elements
+    return pattern_room(n, k) + 12 * (n + 1) + (n + k + 1) + 9 * (k + 1)
 
 
 cdef struct pattern_t:
+    int32_t n                   # bodies
+    int32_t k                   # elements
     int32_t* scratch            # `pattern_room`
     int32_t* parent
     int32_t* mark
@@ -50,9 +60,9 @@ cdef struct pattern_t:
     int32_t* turned
 
 
-cdef inline void lay_pattern(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
-    """Places in index (`index_room`), which begins at a multiple of 8 bytes."""
-    cdef int64_t n = r.n_bodies, k = p.n_rows
+cdef inline int32_t* lay_pattern(pattern_t* a, int32_t* index, int64_t n, int64_t k, int64_t most) noexcept nogil:
+    """Places in index, a multiple of 8 bytes, for k elements, and for `most` blocks of L; where the next begins."""
+    a.n, a.k = <int32_t>n, <int32_t>k
     a.scratch = index
     a.parent = index + pattern_room(n, k)
     a.mark = a.parent + n + 1
@@ -62,41 +72,68 @@ cdef inline void lay_pattern(newton_t* s, pattern_t* a, int32_t* index, const bl
     a.next = a.rptr + n + 1
     a.pivot = a.next + n + 1
     a.nind = a.pivot + 6 * n + 1
-    a.lind = a.nind + n + k + 1
-    a.rind = a.lind + n * (n - 1) // 2 + 1
-    a.group = a.rind + n * (n - 1) // 2 + 1
+    a.group = a.nind + n + k + 1
     a.body = a.group + k + 1
     a.node = a.body + 2 * k
     a.slot = a.node + 2 * k
     a.turned = a.slot + 3 * k
-    lay_index(s, k, a.turned + k)
+    a.lind = a.turned + k
+    a.rind = a.lind + most + 1
+    return a.rind + most + 1
+
+
+cdef inline void lay_bodies(newton_t* s, pattern_t* a, int32_t* index, const blocks_t* p, const rows_t* r) noexcept nogil:
+    """Places in index (`index_room`) for s and a."""
+    cdef int64_t n = r.n_bodies
+    lay_index(s, p.n_rows, lay_pattern(a, index, n, p.n_rows, n * (n - 1) // 2))
+
+
+cdef inline int64_t order_bodies(pattern_t* a) noexcept nogil:
+    """An elimination order of the bodies of a.body (k, 2), and the blocks of N; how many its factor has below."""
+    cdef int32_t i
+    cdef int64_t below = 0
+    eliminate_bodies(a.k, a.body, a.n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.turned)
+    block_tree(a.n, a.nptr, a.nind, a.parent, a.mark, a.rptr + 1, a.lptr + 1)
+    a.lptr[0] = 0
+    a.rptr[0] = 0
+    for i in range(a.n):
+        below += a.lptr[i + 1]
+        if below <= 2147483647:
+            a.lptr[i + 1] += a.lptr[i]
+            a.rptr[i + 1] += a.rptr[i]
+    return below
 
 
 cdef inline void make_pattern(const scaled_t* s, pattern_t* a, const rows_t* r) noexcept nogil:
     """An elimination order of the bodies, the blocks of N and of its factor, of elements that were found."""
-    cdef int32_t i, c, k, n = r.n_bodies
+    cdef int32_t i, c
     cdef const int32_t* body
-    k = s.e.n
-    for i in range(k):
+    a.k = s.e.n
+    for i in range(a.k):
         c = s.block[i] - r.n_joints
         body = r.joint_body + 2 * s.block[i] if c < 0 else r.contact_body + 2 * c
         a.body[2 * i] = body[0]
         a.body[2 * i + 1] = body[1]
-    eliminate_bodies(k, a.body, n, a.scratch, a.parent, a.nptr, a.nind, a.node, a.slot, a.turned)
-    block_tree(n, a.nptr, a.nind, a.parent, a.mark, a.rptr + 1, a.lptr + 1)
-    a.lptr[0] = 0
-    a.rptr[0] = 0
-    for i in range(n):
-        a.lptr[i + 1] += a.lptr[i]
-        a.rptr[i + 1] += a.rptr[i]
-    block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
+    order_bodies(a)
+    block_pattern(a.n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
+
+
+cdef inline int64_t factor_room(const pattern_t* a, int32_t s, bint lu, bint panels, int64_t* size) noexcept nogil:
+    """Doubles of the PARTS that `furnish_factor` takes, and of all; lu: L U may be asked for; panels: L stands in some."""
+    cdef int64_t i, b = s * s, n = a.n, below = a.lptr[n] * b, all_ = 0
+    size[0], size[1], size[2] = n * s, a.nptr[n] * b, a.nptr[n] * b * lu
+    size[3], size[4], size[5] = 0 if panels else below, below * lu, n * b
+    size[6], size[7] = n * b, n * b * lu
+    for i in range(PARTS):
+        all_ += size[i]
+    return all_
 
 
 cdef inline int64_t body_room(const newton_t* s, const pattern_t* a, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Doubles that `furnish_bodies` hands out, after `make_pattern`."""
-    cdef int64_t n = r.n_bodies
-    return (12 * <int64_t>p.n_rows + 16 * n + own_room(p.n_rows, s.sc.small)
-            + 36 * (2 * <int64_t>a.nptr[n] + 2 * <int64_t>a.lptr[n] + 3 * n))
+    cdef int64_t size[PARTS]
+    return (12 * <int64_t>p.n_rows + 10 * <int64_t>r.n_bodies + own_room(p.n_rows, s.sc.small)
+            + factor_room(a, 6, 1, 0, size))
 
 
 cdef inline int32_t find_groups(elements_t* e, int32_t* group) noexcept nogil:
@@ -137,37 +174,35 @@ cdef inline void panel_of(const blocks_t* p, const rows_t* r, double* root, doub
     fill_panel(p, r, root, root + 9 * <int64_t>n, panel)
 
 
+cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
+                                bint lu, const sparse_t* super, const int64_t* spot, double** x) noexcept nogil:
+    """Panel (rows, 12), of each body these columns alone, and the factor in PARTS of zeros; super: its panels."""
+    cdef factor_t* f = &s.blocks
+    if s.sc.e.m:
+        narrow_panel(&s.sc, a.turned, column, size, panel)
+    s.s.form, s.s.symmetric, s.s.y = BODIES, 1, x[0]
+    s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = size, panel, a.node, a.slot
+    find_groups(&s.sc.e, a.group)
+    f.n, f.s, f.super, f.spot = a.n, size, super, spot
+    f.nptr, f.nind, f.rptr, f.rind, f.lptr, f.lind = a.nptr, a.nind, a.rptr, a.rind, a.lptr, a.lind
+    f.pivot, f.next = a.pivot, a.next
+    f.nval, f.mval, f.lval, f.uval, f.dval, f.work, f.work2 = x[1], x[2], x[3], x[4], x[5], x[6], x[7]
+
+
 cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const blocks_t* p, const rows_t* r) noexcept nogil:
     """Everything of s in real (`body_room`): what every form has, then panel and factor."""
-    cdef int32_t i, n = r.n_bodies
-    cdef int64_t b = 36 * <int64_t>a.nptr[n]
+    cdef int32_t i
     cdef int32_t column[6]
+    cdef int64_t size[PARTS]
+    cdef double* part[PARTS]
     cdef double* panel = furnish(s, NULL, r, real)
-    cdef double* x = panel + 12 * <int64_t>p.n_rows + 10 * n
+    cdef double* x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i
-    panel_of(p, r, x - 10 * n, panel)
-    narrow_panel(&s.sc, a.turned, column, 6, panel)
-    s.s.form, s.s.symmetric, s.s.y = BODIES, 1, x
-    s.sc.e.s, s.sc.e.panel, s.sc.e.node, s.sc.e.slot = 6, panel, a.node, a.slot
-    find_groups(&s.sc.e, a.group)
-    x += 6 * n
-    s.blocks.n = n
-    s.blocks.s = 6
-    s.blocks.nptr = a.nptr
-    s.blocks.nind = a.nind
-    s.blocks.rptr = a.rptr
-    s.blocks.rind = a.rind
-    s.blocks.lptr = a.lptr
-    s.blocks.lind = a.lind
-    s.blocks.nval = x
-    s.blocks.mval = s.blocks.nval + b
-    s.blocks.lval = s.blocks.mval + b
-    s.blocks.uval = s.blocks.lval + 36 * <int64_t>a.lptr[n]
-    s.blocks.dval = s.blocks.uval + 36 * <int64_t>a.lptr[n]
-    s.blocks.work = s.blocks.dval + 36 * n
-    s.blocks.work2 = s.blocks.work + 36 * n
-    s.blocks.pivot = a.pivot
-    s.blocks.next = a.next
-    s.blocks.super = NULL
-    memset(x, 0, (2 * b + 72 * <int64_t>a.lptr[n] + 108 * <int64_t>n) * sizeof(double))
+    panel_of(p, r, x, panel)
+    x += 10 * <int64_t>r.n_bodies
+    memset(x, 0, factor_room(a, 6, 1, 0, size) * sizeof(double))
+    for i in range(PARTS):
+        part[i] = x
+        x += size[i]
+    furnish_factor(s, a, panel, column, 6, 1, NULL, NULL, part)

@@ -2,8 +2,19 @@
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.problem cimport Data
+from lavender_ext.newton.bodies cimport pattern_t
 from lavender_ext.newton.run cimport newton_t
 from lavender_ext.newton.system cimport others_t
+
+
+cdef class Layout:
+    cdef pattern_t a
+    cdef object index, filled
+    cdef readonly object body, node, turned             # (k, 2) bodies, block columns, and (k,) which were changed over
+    cdef readonly object nptr, lptr                     # (n + 1) blocks of N by rows, and of L by columns
+    cdef readonly object panels                         # of `symbolic.block_panels`, or None
+    cdef readonly int n, s
+    cdef readonly double cost                           # multiply-adds of a factor
 
 
 cdef class Solve:
@@ -15,5 +26,3 @@ cdef class Solve:
     cdef readonly object keep, block, ptr, kind, wptr, fixed, scale, theta, g, lower, upper, a_t, a_s
     cdef readonly object v, einv, p, pair, bt           # small matrices of every element
     cdef readonly int m
-    cdef _real(self, const double* at, Py_ssize_t n)
-    cdef _whole(self, const int32_t* at, Py_ssize_t n)

@@ -1,16 +1,21 @@
 """Newton's method on one scaled problem for Python: `plan.pxd` turn by turn, and its systems one by one for tests."""
 from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcpy
 
 import numpy as np
+
+from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.factor.blocks cimport factor_t
+from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
+from lavender_ext.factor.symbolic cimport block_pattern
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.newton.bodies cimport find_groups, narrow_panel, panel_of
+from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay_pattern, order_bodies, order_index,
+                                         panel_of, pattern_t)
 from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport (CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK, newton_start, newton_step)
@@ -19,7 +24,7 @@ from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N
                                       own_index, own_room, proof_of, relative_at)
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
-from lavender_ext.newton.system cimport (BODIES, DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
+from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
                                          system_natural, system_solve, system_times)
 
@@ -73,6 +78,51 @@ cdef void call_solve(void* at, int32_t augmented, double* x) noexcept with gil:
         view[:] = np.nan
 
 
+cdef inline object part(object array, const void* at, Py_ssize_t n):
+    cdef Py_ssize_t i = (<const char*>at - <const char*>address(array)) // <Py_ssize_t>array.itemsize
+    return array[i:i + n]
+
+
+cdef class Layout:
+    """An order of elimination of n bodies, s unknowns each, and the pattern of a factor; kept between problems.
+
+    body (k, 2) are those of each element, -1 static. A factor of `least` multiply-adds stands in dense panels, by few and
+    share of `symbolic.block_panels`.
+    """
+
+    def __init__(self, const int32_t[:, ::1] body, int n, int s, double least=float("inf"), int few=1, double share=0.0):
+        cdef pattern_t* a = &self.a
+        cdef int64_t k = body.shape[0], below
+        cdef int32_t i
+        self.index = np.empty(order_index(n, k) + 2, np.int32)
+        lay_pattern(a, <int32_t*>address(self.index), n, k, 0)
+        if k:
+            memcpy(a.body, &body[0, 0], 2 * k * sizeof(int32_t))
+        with nogil:
+            below = order_bodies(a)
+        if below >= 2**31:
+            raise OverflowError("the factor has 2^31 blocks or more")
+        self.filled = np.empty(2 * below + 1, np.int32)
+        a.lind = <int32_t*>address(self.filled)
+        a.rind = a.lind + below
+        with nogil:
+            block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
+        self.n, self.s = n, s
+        for i in range(n):
+            self.cost += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
+        self.cost = s**3 * (self.cost + below + n)
+        self.body, self.node = part(self.index, a.body, 2 * k).reshape(k, 2), part(self.index, a.node, 2 * k).reshape(k, 2)
+        self.turned = part(self.index, a.turned, k)
+        self.nptr, self.lptr = part(self.index, a.nptr, n + 1), part(self.index, a.lptr, n + 1)
+        if self.cost >= least:
+            nind = part(self.index, a.nind, a.nptr[n])
+            self.panels = block_panels(self.nptr, nind, self.lptr, self.filled[:below + 1], s, few, share)
+
+    def serves(self, body, int n, int s):
+        """Whether it is that of n bodies, s unknowns each, with these elements (k, 2)."""
+        return self.n == n and self.s == s and np.array_equal(self.body, body)
+
+
 cdef class Solve:
     """A problem as Newton's method has it, and what factors it by one of `over_...`; `start`, then `step` after `step`.
 
@@ -115,24 +165,17 @@ cdef class Solve:
         furnish(n, a, r, <double*>address(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
-        self.keep, self.block, self.ptr = self._whole(n.sc.keep, m), self._whole(n.sc.block, k), self._whole(n.sc.e.ptr, k + 1)
-        self.kind, self.wptr = self._whole(n.sc.e.kind, k), self._whole(n.sc.e.wptr, k + 1)
-        self.fixed, self.scale = self._real(n.sc.fixed, rows), self._real(n.sc.scale, m)
-        self.theta, self.g = self._real(n.sc.e.theta, m), self._real(n.sc.e.g, m)
-        self.lower, self.upper = self._real(n.sc.e.lower, m), self._real(n.sc.e.upper, m)
-        self.a_t, self.a_s = self._real(n.sc.e.at, k), self._real(n.sc.e.as_, k)
-        self.v, self.einv = self._real(n.s.v, n.sc.small), self._real(n.s.einv, n.sc.small)
-        self.p, self.pair = self._real(n.s.p, n.sc.small), self._real(n.s.pair, n.sc.small)
-        self.bt = self._real(n.s.bt, n.sc.small) if n.s.bt != NULL else None
+        self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)
+        self.ptr = part(self.index, n.sc.e.ptr, k + 1)
+        self.kind, self.wptr = part(self.index, n.sc.e.kind, k), part(self.index, n.sc.e.wptr, k + 1)
+        self.fixed, self.scale = part(self.real, n.sc.fixed, rows), part(self.real, n.sc.scale, m)
+        self.theta, self.g = part(self.real, n.sc.e.theta, m), part(self.real, n.sc.e.g, m)
+        self.lower, self.upper = part(self.real, n.sc.e.lower, m), part(self.real, n.sc.e.upper, m)
+        self.a_t, self.a_s = part(self.real, n.sc.e.at, k), part(self.real, n.sc.e.as_, k)
+        self.v, self.einv = part(self.real, n.s.v, n.sc.small), part(self.real, n.s.einv, n.sc.small)
+        self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
+        self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
         self.calls = others_t(<void*>self, call_factor, call_solve)
-
-    cdef _real(self, const double* at, Py_ssize_t n):
-        cdef Py_ssize_t i = at - <double*>address(self.real)
-        return self.real[i:i + n]
-
-    cdef _whole(self, const int32_t* at, Py_ssize_t n):
-        cdef Py_ssize_t i = at - <int32_t*>address(self.index)
-        return self.index[i:i + n]
 
     @property
     def whole(self):
@@ -165,71 +208,53 @@ cdef class Solve:
         self.n.s.a.data = <double*>address(values)
 
     def jacobian(self):
-        """K = D^-1/2 J M^-1/2 (rows, 12) of the bodies, and the columns that hold anything, of a body's six, as bits.
+        """K = D^-1/2 J M^-1/2 (rows, 12) of the bodies, and which of a body's six columns are kept: 1, 2, 3 or 6.
 
         What is at most 1e-9 (spheres turned by the rounding of their arms) is nothing: H = K K^T + theta has a unit
         diagonal, and feels 1e-18 of it.
         """
         cdef const rows_t* r = &self.data.rows
-        cdef int64_t i
-        cdef int32_t used = 0, c
-        panel = np.zeros((self.data.blocks.n_rows, 12))
-        cdef double[:, ::1] k = panel
+        cdef int64_t i, rows = self.data.blocks.n_rows
+        cdef int32_t used = 0
+        panel = np.zeros((rows, 12))
+        cdef double* k = <double*>address(panel)
         cdef double[::1] root = np.empty(10 * r.n_bodies + 1)
-        if r.n_bodies == 0 or k.shape[0] == 0:
-            return panel, 0
         with nogil:
-            panel_of(&self.data.blocks, r, &root[0], &k[0, 0])
-            for i in range(k.shape[0]):
-                for c in range(12):
-                    if not -1e-9 <= k[i, c] <= 1e-9:
-                        used = used | (1 << (c if c < 6 else c - 6))
-                if used == 63:
-                    break
-        return panel, used
+            if r.n_bodies:
+                panel_of(&self.data.blocks, r, &root[0], k)
+            for i in range(12 * rows):
+                if not -1e-9 <= k[i] <= 1e-9:
+                    used = used | (1 << (i % 6))
+                    if used == 63:
+                        break
+        columns = [c for c in range(6) if used >> c & 1] or [0]
+        return panel, np.array(columns if len(columns) <= 3 else range(6), np.int32)
 
-    def over_bodies(self, double[:, ::1] panel, const int32_t[::1] columns, pattern, structure, bint lu, panels, bint wide):
-        """K of `jacobian`, in place: of each body these columns.
-
-        pattern: node, slot and turned, of each element; structure: (nptr, nind, lptr, lind, rptr, rind), the pattern of N
-        and of its factor; lu: L U may be asked for; panels: what `symbolic.block_panels` gives, for a factor by dense
-        panels, which L U has none of.
-        """
-        cdef newton_t* n = &self.n
-        cdef factor_t* f = &n.blocks
-        cdef int32_t s = <int32_t>columns.shape[0]
+    def over_bodies(self, panel, const int32_t[::1] columns, Layout layout, bint lu, bint wide):
+        """K of `jacobian`, in place: of each body these columns; lu: L U may be asked for, which panels are not for."""
+        cdef pattern_t a = layout.a
+        cdef int32_t i, s = layout.s
+        cdef int64_t size[PARTS]
+        cdef double* x[PARTS]
         cdef SparsePanels held
         cdef const int64_t[::1] spot
-        node, slot, turned = pattern
-        nptr, nind, lptr, lind, rptr, rind = structure
-        count, blocks = len(nptr) - 1, s * s
-        panels = None if lu else panels
-        group, y = np.empty(len(self.kind) + 1, np.int32), np.zeros(count * s + 1)
-        below = int(lptr[count]) * blocks
-        values = [np.zeros(size + 1) for size in (
-            len(nind) * blocks, len(nind) * blocks * lu, below * (panels is None), below * lu, count * blocks, count * blocks,
-            count * blocks * lu)]
-        pivot, following = np.zeros(count * s + 1, np.int32), np.zeros(count + 1, np.int32)
-        self.held += [panel, pattern, structure, group, y, values, pivot, following]
-        if self.m:
-            narrow_panel(&n.sc, <int32_t*>address(turned), &columns[0], s, &panel[0, 0])
-        n.sc.e.s, n.sc.e.panel = s, &panel[0, 0] if panel.shape[0] else NULL
-        n.sc.e.node, n.sc.e.slot = <int32_t*>address(node), <int32_t*>address(slot)
-        find_groups(&n.sc.e, <int32_t*>address(group))
-        f.n, f.s, f.super = count, s, NULL
-        f.nptr, f.nind = <int32_t*>address(nptr), <int32_t*>address(nind)
-        f.lptr, f.lind = <int32_t*>address(lptr), <int32_t*>address(lind)
-        f.rptr, f.rind = <int32_t*>address(rptr), <int32_t*>address(rind)
-        f.nval, f.mval = <double*>address(values[0]), <double*>address(values[1])
-        f.lval, f.uval, f.dval = <double*>address(values[2]), <double*>address(values[3]), <double*>address(values[4])
-        f.work, f.work2 = <double*>address(values[5]), <double*>address(values[6])
-        f.pivot, f.next = <int32_t*>address(pivot), <int32_t*>address(following)
-        if panels is not None:
-            held = SparsePanels.of_blocks(panels[1:], count * s, wide)
-            spot = panels[0]
-            self.held += [held, panels[0]]
-            f.super, f.spot = &held.f, &spot[0]
-        n.s.form, n.s.symmetric, n.s.y = BODIES, True, <double*>address(y)
+        cdef const sparse_t* super_ = NULL
+        cdef const int64_t* places = NULL
+        own = np.zeros(a.n * (s + 1) + len(self.kind) + 2, np.int32)
+        a.pivot = <int32_t*>address(own)                # what a factor writes belongs to this one alone
+        a.next = a.pivot + a.n * s
+        a.group = a.next + a.n + 1
+        if layout.panels is not None and not lu:
+            spot = layout.panels[0]
+            held = SparsePanels.of_blocks(layout.panels[1:], a.n * s, wide)
+            super_, places = &held.f, &spot[0]
+            self.held.append(held)
+        factor_room(&a, s, lu, super_ != NULL, size)
+        values = [np.zeros(size[i] + 1) for i in range(PARTS)]
+        for i in range(PARTS):
+            x[i] = <double*>address(values[i])
+        self.held += [panel, layout, own, values]
+        furnish_factor(&self.n, &a, <double*>address(panel), &columns[0], s, lu, super_, places, x)
 
     # -- turns -------------------------------------------------------------------------------------
 

@@ -18,7 +18,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_pattern, make_pattern, pattern_t
+from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_bodies, make_pattern, pattern_t
 from lavender_ext.newton.plan cimport CERTIFICATE, MORE, newton_start, newton_step
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.run cimport aim, impulse_of, judge_room, lay_judge, newton_t
@@ -62,7 +62,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
     room = room_of(&p, &r, scratch[0]) + p.n_rows
     if scratch[1] > 0:
-        lay_pattern(&n, &a, scratch + HEAD, &p, &r)
+        lay_bodies(&n, &a, scratch + HEAD, &p, &r)
         find_elements(&n.sc, &p, NULL, &r)
         make_pattern(&n.sc, &a, &r)
         room += judge_room(&p, &r, NULL) + body_room(&n, &a, &p, &r)
@@ -104,7 +104,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     if not scratch[1]:
         return UNDECIDED
-    lay_pattern(&n, &a, scratch + HEAD, p, r)
+    lay_bodies(&n, &a, scratch + HEAD, p, r)
     find_elements(&n.sc, p, NULL, r)                    # the pattern stands from `lav_newton_plan`
     aim(&n, p, NULL, r, NULL)
     furnish_bodies(&n, &a, lay_judge(&n, room), p, r)

@@ -6,7 +6,6 @@ import scipy.sparse as sp
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lavender_ext.factor import symbolic
 from lavender_ext.factor.graph import least_degree
 from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import SparsePanels
@@ -72,8 +71,14 @@ def test_a_star_is_sorted_by_a_heap():
 
 
 def factor_of(matrix, order):
-    """Columns and rows of the blocks of the factor when the vertices are eliminated in that order."""
-    return symbolic.factor_pattern(*raw(sp.tril(matrix[order][:, order] + sp.eye_array(len(order)))))[:2]
+    """Columns and rows of the factor when the vertices are eliminated in that order, a column at a time."""
+    a = matrix[order][:, order]
+    below = [{int(i) for i in a.indices[a.indptr[j] : a.indptr[j + 1]] if i > j} for j in range(len(order))]
+    for rows in below:
+        if rows:
+            parent = min(rows)
+            below[parent] |= rows - {parent}
+    return np.cumsum([0, *map(len, below)]), np.array([i for rows in below for i in sorted(rows)])
 
 
 def grid(side):

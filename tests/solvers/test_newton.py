@@ -18,10 +18,8 @@ from lavender.solvers.newton import SPEC, Newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
-from lavender_ext.factor import symbolic
-from lavender_ext.factor.graph import body_pattern
 from lavender_ext.factor.sparse import SparsePanels
-from lavender_ext.newton.solve import Solve
+from lavender_ext.newton.solve import Layout, Solve
 
 
 def dense_h(problem):
@@ -310,15 +308,14 @@ def test_a_narrow_matrix_is_factored_by_panels_that_do_not_fill():
     assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
 
 
-def on_bodies(k, s, node, slot, structure, lu, panels=None, wide=True):
-    """Newton's method whose H is K K^T, K (rows, 2, s) of the bodies `node`, on rows of any problem."""
-    m = len(k)
+def on_bodies(k, layout, lu, wide=True):
+    """Newton's method whose H is K K^T, K (rows, 2, s) of the bodies `layout.node`, on rows of any problem."""
+    m, s = len(k), layout.s
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))
     solve = Solve(problem.metric, problem.csr_data)
-    panel = np.zeros((m, 12))
-    panel[:, :s], panel[:, 6 : 6 + s] = k[:, 0], k[:, 1]
-    turned = np.zeros(m, np.int32)
-    solve.over_bodies(panel, np.arange(s, dtype=np.int32), (node, slot, turned), structure, lu, panels, wide)
+    panel = np.zeros((m, 2, 6))
+    panel[:, :, :s] = np.where(layout.turned[:, None, None] > 0, k[:, ::-1], k)
+    solve.over_bodies(panel.reshape(m, 12), np.arange(s, dtype=np.int32), layout, lu, wide)
     return solve
 
 
@@ -343,28 +340,26 @@ def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, few, s
     body = rng.integers(-1, n, (m, 2))
     body = np.ascontiguousarray(body[body[:, 0] != body[:, 1]], np.int32)
     m = len(body)
-    nptr, nind, node, slot, turned = body_pattern(body, n)
-    assert (node[:, 0] > node[:, 1]).all() and 0 < turned.sum() < len(body)
-    structure = nptr, nind, *symbolic.factor_pattern(nptr, nind)
-    panels = symbolic.block_panels(*structure[:4], s, few, share)
-    assert len(panels[2]) // 2 - 1 < n
-    k, whole = random_columns(rng, node, n, s)
+    panels, blocks = Layout(body, n, s, 0.0, few, share), Layout(body, n, s)
+    assert (panels.node[:, 0] > panels.node[:, 1]).all() and 0 < panels.turned.sum() < len(body)
+    assert len(panels.panels[2]) // 2 - 1 < n and blocks.panels is None
+    k, whole = random_columns(rng, panels.node, n, s)
     v, r = rng.uniform(0.1, 10.0, m), rng.normal(size=m)
     expected = np.linalg.solve(np.diag(1.0 / v) + whole @ whole.T, r)
     outs = set()
-    for what, wide, given_panels in (
+    for what, wide, layout in (
         ("barrier", True, panels),
         ("barrier", False, panels),
-        ("barrier", True, None),
-        ("pair", True, None),
+        ("barrier", True, blocks),
+        ("pair", True, panels),  # of which there is no L U by panels
     ):
-        solve = on_bodies(k, s, node, slot, structure, what == "pair", given_panels, wide)
+        solve = on_bodies(k, layout, what == "pair", wide)
         solve.v[:] = v
         for _ in range(2):  # what a factor leaves behind does not reach the next
             assert solve.factor(what)
             out = solve.solve(what, r)
             np.testing.assert_allclose(out, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-            if given_panels is not None:
+            if what == "barrier" and layout is panels:
                 outs.add(out.tobytes())
     assert len(outs) == 1
 
@@ -375,7 +370,7 @@ def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
     assert rows is not None and rows.inv_inertia.any()
     system = make_system(problem, "velocity")
     solution = lv.solve(problem, "newton", tol=1e-10)
-    assert system.s == 3
+    assert system.layout.s == 3
     assert good(solution, 1e-10), solution
 
 
@@ -387,8 +382,8 @@ def test_a_chain_of_bodies_does_not_fill_in():
     body[::2] = body[::2, ::-1]
     body[3::9, 1] = -1
     body[5::9, 0] = -1
-    nptr, nind, *_ = body_pattern(np.ascontiguousarray(body, np.int32), n)
-    assert symbolic.factor_pattern(nptr, nind)[0][-1] == nptr[n] - n
+    layout = Layout(np.ascontiguousarray(body, np.int32), n, 1)
+    assert layout.lptr[n] == layout.nptr[n] - n
 
 
 # -- answers ------------------------------------------------------------------------------------------

@@ -15,17 +15,14 @@ redundant ones, refinement takes it away again (Bjorck 1996, section 2.4.4). An 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
 from lavender.lu import sparse_lu
-from lavender_ext.newton.solve import WHATS
-
-if TYPE_CHECKING:
-    from lavender.solvers.newton_systems.systems import VelocitySystem
+from lavender_ext.newton.solve import WHATS, Layout, Solve
 
 __all__ = ["Augmented"]
 
@@ -33,14 +30,14 @@ __all__ = ["Augmented"]
 class Augmented:
     """Who factors (1) and (2) for `Solve`; K is made when it is first asked for."""
 
-    def __init__(self, system: VelocitySystem) -> None:
-        self.system = system
+    def __init__(self, of: Solve, layout: Layout) -> None:
+        self.of, self.layout = of, layout
         self.k: Any = None
         self.lu: Any = None
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Factor (1) for the P of the last natural map, eps added to theta, or (2); whether there is a factor."""
-        s = self.system.solve
+        s = self.of
         if self.k is None:
             self._make()
         if what == WHATS["natural"]:
@@ -62,10 +59,10 @@ class Augmented:
         return np.ascontiguousarray(x[n:])
 
     def _make(self) -> None:
-        sc, n = self.system.solve, self.system.n
+        sc, n = self.of, self.layout.n
         panel, _ = sc.jacobian()
         size, m = np.diff(sc.ptr), sc.m
-        body = np.repeat(self.system.bodies, size, axis=0)
+        body = np.repeat(self.layout.body, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)
         row = np.broadcast_to(np.arange(m)[:, None, None], values.shape)
         column = np.maximum(body, 0)[:, :, None] * 6 + np.arange(6)
@@ -78,7 +75,7 @@ class Augmented:
         self.small = base + inner // square, base + inner % square
 
     def _small(self, values: FloatArray) -> Any:
-        return sp.csr_array((values, self.small), shape=(self.system.solve.m,) * 2)
+        return sp.csr_array((values, self.small), shape=(self.of.m,) * 2)
 
     def _factor(self, left: Any, right: Any, own: Any) -> bool:
         upper = self.k if right is None else right @ self.k

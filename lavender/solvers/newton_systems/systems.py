@@ -8,19 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from lavender._arrays import IntArray
 from lavender._later import sparse as sp
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solvers._factor import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
-from lavender_ext.factor import symbolic
-from lavender_ext.factor.graph import body_pattern
 from lavender_ext.newton.coupled import scaled_entries
-from lavender_ext.newton.solve import Solve
+from lavender_ext.newton.solve import Layout, Solve
 
 DENSE_ROWS = 150  # below: a dense factor beats sparse bookkeeping
 # Nonzero share s of A above which a dense factor is there sooner: of one full block of s^1/2 m rows, whose
@@ -35,12 +30,6 @@ PANELS, FEW_COLUMNS, ZEROS = 2e6, 6, 0.1
 def is_full(nnz: int, m: int, cones: bool) -> bool:
     """Whether a dense factor of m rows and nnz entries is there sooner than panels; `cones`: of the cone law."""
     return nnz > (DENSE_FILL if cones else EARLY_FILL) * m * m
-
-
-def factor_cost(lptr: IntArray, s: int) -> float:
-    """Multiply-adds of a factor over bodies of s unknowns each, by its block columns."""
-    of_column = np.diff(lptr).astype(float)
-    return float(s**3 * (0.5 * float(of_column @ of_column) + float(lptr[-1]) + len(of_column)))
 
 
 class System:
@@ -67,46 +56,19 @@ class VelocitySystem(System):
 
     form = "velocity"
     pace = 0.5e-9
-    panels: tuple[Any, ...] | None = None  # of a large factor
-    structure: tuple[Any, ...]
-    pattern: tuple[IntArray, ...]  # the elements' bodies (k, 2), their places, slots, and which were turned
 
     def __init__(self, problem: Problem, like: System | None = None) -> None:
-        """`like`: an earlier system, whose order of elimination and pattern serve again between the same bodies."""
+        """`like`: an earlier system, whose layout serves again between the same bodies."""
         super().__init__(problem, Solve(problem.metric))
         rows, solve = problem.rows, self.solve
         assert rows is not None
-        self.bodies = np.ascontiguousarray(rows.block_bodies[solve.block], np.int32)
-        panel, used = solve.jacobian()
-        columns = [c for c in range(6) if used >> c & 1]
-        s = next(k for k in (1, 2, 3, 6) if k >= len(columns))
-        columns = sorted((columns + [c for c in range(6) if not used >> c & 1])[:s])
-        self.s, self.n = s, rows.n_bodies
-        if isinstance(like, VelocitySystem) and like.serves(s, rows.n_bodies, self.bodies):
-            self.cost, self.panels = like.cost, like.panels
-            self.pattern, self.structure = like.pattern, like.structure
-        else:
-            self._analyse(rows.n_bodies, self.bodies)
-        lu = solve.has_friction and problem.law == "coulomb"
-        solve.over_bodies(
-            panel, np.array(columns, np.int32), self.pattern[1:], self.structure, lu, self.panels, WIDE
-        )
-        solve.ask(Augmented(self))
-
-    def serves(self, s: int, n: int, bodies: IntArray) -> bool:
-        """Whether the analysis of this system is that of n bodies of s unknowns with these elements (k, 2)."""
-        return self.s == s and self.n == n and np.array_equal(self.pattern[0], bodies)
-
-    def _analyse(self, n: int, bodies: IntArray) -> None:
-        """Order of elimination and pattern of the factor."""
-        s = self.s
-        nptr, nind, node, slot, turned = body_pattern(bodies, n)
-        structure = symbolic.factor_pattern(nptr, nind)
-        self.cost = factor_cost(structure[0], s)
-        if self.cost >= PANELS:
-            self.panels = symbolic.block_panels(nptr, nind, *structure[:2], s, FEW_COLUMNS, ZEROS)
-        self.structure = (nptr, nind, *structure)
-        self.pattern = (bodies, node, slot, turned)
+        panel, columns = solve.jacobian()
+        of = rows.block_bodies[solve.block], rows.n_bodies, len(columns)
+        kept = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*of) else None
+        self.layout: Layout = kept or Layout(*of, PANELS, FEW_COLUMNS, ZEROS)
+        self.cost = self.layout.cost
+        solve.over_bodies(panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", WIDE)
+        solve.ask(Augmented(solve, self.layout))
 
 
 class MatrixSystem(System):
