@@ -251,7 +251,6 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
   struct driver_driver_options_t newton;
   struct driver_driver_room_t room;
   int64_t numbers = 0, band = q->form == LAV_MATRIX && m > 0 && q->n_entries / m > 64 ? q->n_entries / m : 64;
-  const double rubs = 1.0;
   csr_t none = {NULL, NULL, NULL};
   switch (method) {
     case LAV_ANDERSON: case LAV_NNCG:
@@ -264,8 +263,7 @@ static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t me
       if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * n + 2048;
       memset(&view, 0, sizeof view);
       memset(&newton, 0, sizeof newton);
-      view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.a = &none;
-      view.p.kind = &one, view.p.ptr = ends, view.p.mu = &rubs;
+      view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
       newton.method = driver_driver_NEWTON;
       k_room(&view, &newton, &room);
       return room.n_index / 2 + room.n_real + 16;
