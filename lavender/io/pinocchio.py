@@ -4,8 +4,9 @@
 
 M is `crba`'s, J each constraint's own Jacobian, rows in the order of the constraint models. In one step of dt
 
-    anchors (point, frame)   all rows free,           target = -correction error / dt
-    point contacts           Coulomb's cone, z first, target = -gap / dt along z, `correction` of it where gap < 0
+    anchors (point, frame)   all rows free,           target = -correction error / dt + their desired velocity
+    point contacts           Coulomb's cone, z first, target = -gap / dt along z, `correction` of it where gap < 0,
+                             + its desired velocity
     joint limits             lambda >= 0,             the same with the distance to the limit
     joint friction           |lambda| <= dt times the model's limits, target = 0
 
@@ -98,6 +99,7 @@ def from_pinocchio(
     with told("Pinocchio", OTHER_MODEL):
         pin.forwardKinematics(model, data, q, v)
         pin.computeJointJacobians(model, data, q)
+        data.q_in = q  # where joint limits are measured; no algorithm sets it
     pairs = zip(constraint_models, constraint_datas, strict=True)
     rows, target, cones, names = _constraints(model, data, pairs, dt, correction)
     return Problem.from_jacobian(
@@ -129,6 +131,8 @@ def _constraints(
             model_of.calc(model, data, data_of)
             jac = np.array(model_of.jacobian(model, data, data_of)).reshape(-1, nv)
         more, target, order = _constraint(model_of, data_of, len(jac), dt, correction)
+        if hasattr(model_of, "desired_constraint_velocity"):
+            target = target + np.array(model_of.desired_constraint_velocity)[order]
         rows.append(jac[order])
         targets.append(target)
         cones = cones + more
@@ -153,7 +157,7 @@ def _mass_and_acceleration(pin: Any, model: Any, data: Any, q: Any, v: Any, tau:
         upper = np.triu(np.array(pin.crba(model, data, q)))
     mass = upper + np.triu(upper, 1).T
     if np.abs(mass @ a - force).max(initial=0.0) > UNSEEN * float(
-        (np.abs(mass) @ np.abs(a) + np.abs(force)).max()
+        (np.abs(mass) @ np.abs(a) + np.abs(force)).max(initial=0.0)
     ):
         raise CapabilityError(
             "M aba(q, v, tau) differs from tau - nle(q, v): these are not accelerations of this M"
@@ -179,6 +183,10 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a pinocchio.Model and its Data are needed"
         )
+    if len(model.mimicking_joints):
+        raise CapabilityError(
+            f"{len(model.mimicking_joints)} joints mimic others, of which Pinocchio's aba knows nothing"
+        )
     n, nv, nq = int(model.njoints), int(model.nv), int(model.nq)
     lists = ("joints", "parents", "idx_vs", "nvs", "idx_qs", "nqs", "inertias", "jointPlacements")
     short = [name for name in lists if len(getattr(model, name)) != n]
@@ -197,11 +205,18 @@ def _check_model(pin: Any, model: Any, data: Any) -> None:
                 f"joint {i} has parent {model.parents[i]} and (idx_v, nv, idx_q, nq) = {places}; a parent before it "
                 f"and ({at_v}, {joint.nv}, {at_q}, {joint.nq}) are needed. {OTHER_MODEL}"
             )
+        if not _is_rotation(model.jointPlacements[i].rotation):
+            raise InputError(f"the placement of joint {i} holds a rotation that is none")
         at_v, at_q = at_v + joint.nv, at_q + joint.nq
     sizes = {len(data.oMi), len(data.v), len(data.f)}
-    if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv) or not model.check(data):
+    if (at_v, at_q) != (nv, nq) or sizes != {n} or np.shape(data.M) != (nv, nv):
         raise InputError(
             f"the data hold {len(data.oMi)} joints, the model {n} of {nv} velocities. {OTHER_MODEL}"
+        )
+    if not model.check(data):
+        raise InputError(
+            "Pinocchio's own check of the model and its data fails: the joints of a subtree must follow one another. "
+            f"{OTHER_MODEL}"
         )
 
 
@@ -212,6 +227,13 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
         raise InputError(f"constraint model {i} is a {kind}; one of Pinocchio's is needed")
     if type(data).__name__ != kind.replace("Model", "Data"):
         raise InputError(f"constraint data {i} are {type(data).__name__}; those of a {kind} are needed")
+    for name in ("joint1_placement", "joint2_placement"):
+        if hasattr(constraint, name) and not _is_rotation(getattr(constraint, name).rotation):
+            raise InputError(f"constraint {i}, a {kind}: {name} holds a rotation that is none")
+    if kind == "FrameAnchorConstraintModel" and np.any(constraint.desired_constraint_offset):
+        raise CapabilityError(
+            f"constraint {i}, a {kind}, has a desired offset, which Pinocchio does not read: put it into a placement"
+        )
     joints = [getattr(constraint, name) for name in ("joint1_id", "joint2_id") if hasattr(constraint, name)]
     for name in ("getSelectedJoints", "getActiveJoints"):
         if hasattr(constraint, name):
@@ -227,6 +249,10 @@ def _check_constraint(i: int, model: Any, constraint: Any, data: Any) -> None:
             f"constraint {i}, a {kind}, is of joints {joints} and {of} velocities; the model has {model.njoints} and "
             f"{model.nv}. {OTHER_MODEL}"
         )
+
+
+def _is_rotation(r: Any) -> bool:
+    return bool(np.abs(r @ r.T - np.eye(3)).max() <= UNIT and np.linalg.det(r) > 0.0)
 
 
 def _plain(given: Any) -> Any:

@@ -138,6 +138,14 @@ def test_what_is_not_known_is_refused():
         lv.io.from_drake(plant, context, correction=2.0)
 
 
+def test_locked_joints_are_refused():
+    """Drake leaves their velocities out of its step, and dies of a signal where they carry a contact."""
+    _, _, plant, context = robot()
+    plant.GetJointByName("hinge").Lock(context)
+    with pytest.raises(lv.CapabilityError, match="locked joints are not known here: hinge"):
+        lv.io.from_drake(plant, context)
+
+
 def test_velocities_that_do_not_add_up_are_refused(monkeypatch):
     _, _, plant, context = robot()
     honest = drake.free_motion

@@ -88,6 +88,71 @@ def test_a_step_under_the_solution_keeps_every_constraint():
     assert abs(solution.impulse[-1]) <= 0.7 * dt * (1.0 + 1e-12)
 
 
+def test_joint_limits_are_measured_at_q():
+    """q away from zero: gaps by hand, J by differences of them."""
+    model, _, q, v = robot()
+    model.lowerPositionLimit[:], model.upperPositionLimit[:] = -0.3, 0.4
+    q = pin.integrate(model, q, np.array([0.1, -0.2, 0.1, 0.2, 0.3, -0.1, 0.25]))
+
+    def gaps(q):
+        p = problem_of(model, [pin.JointLimitConstraintModel(model, [1, 2])], q, v, correction=1.0)
+        return p, 0.01 * -(p.b + p.jacobian @ p.generalized.v_free)
+
+    problem, found = gaps(q)
+    measured = np.append(q[:3], q[-1])  # no limits of the quaternion's four numbers
+    np.testing.assert_allclose(found, np.concatenate([measured + 0.3, 0.4 - measured]))
+    for k, step in enumerate(1e-6 * np.eye(model.nv)):
+        ahead, behind = (gaps(pin.integrate(model, q, x))[1] for x in (step, -step))
+        np.testing.assert_allclose(problem.jacobian.toarray()[:, k], (ahead - behind) / 2e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["contact", "anchor"])
+def test_a_desired_velocity_is_the_targets(kind):
+    model, models, q, v = robot()
+    one = models[1 if kind == "contact" else 0]
+    without = problem_of(model, [one], q, v).b
+    one.desired_constraint_velocity = np.array([1.0, 2.0, 3.0])
+    added = [3.0, 1.0, 2.0] if kind == "contact" else [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(problem_of(model, [one], q, v).b - without, added)
+
+
+def test_what_pinocchio_leaves_out_itself_is_refused():
+    model, _, q, v = robot()
+    frame = pin.FrameAnchorConstraintModel(model, 0, pin.SE3.Identity(), 2, pin.SE3.Identity())
+    assert problem_of(model, [frame], q, v).m == 6
+    frame.desired_constraint_offset = np.full(6, 0.1)
+    with pytest.raises(lv.CapabilityError, match="offset"):
+        problem_of(model, [frame], q, v)
+    hinges = chain(3)
+    mimic = pin.transformJointIntoMimic(hinges, 1, 3, 2.0, 0.1)
+    with pytest.raises(lv.CapabilityError, match="mimic"):
+        problem_of(mimic, [], np.zeros(2), np.zeros(2))
+
+
+@pytest.mark.parametrize("where", ["joint", "constraint"])
+@pytest.mark.parametrize("rotation", [2.0 * np.eye(3), np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan)])
+def test_a_placement_that_does_not_rotate_is_refused(where, rotation):
+    model, _, q, v = robot()
+    placement = pin.SE3(rotation, np.zeros(3))
+    if where == "joint":
+        model.jointPlacements[2] = placement
+        models = []
+    else:
+        models = [pin.PointContactConstraintModel(model, 0, pin.SE3.Identity(), 1, placement)]
+    with pytest.raises(lv.InputError, match="rotation"):
+        problem_of(model, models, q, v)
+
+
+def test_a_model_of_nothing_and_one_out_of_order():
+    assert problem_of(pin.Model(), [], np.zeros(0), np.zeros(0)).m == 0
+    model = pin.Model()
+    for i, parent in enumerate([0, 0, 1]):  # the child of the first comes after the second
+        joint = model.addJoint(parent, pin.JointModelRX(), pin.SE3.Identity(), f"joint {i}")
+        model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
+    with pytest.raises(lv.InputError, match="follow one another"):
+        problem_of(model, [], np.zeros(3), np.zeros(3))
+
+
 def test_what_does_not_fit_is_said():
     model, models, q, v = robot()
     with pytest.raises(lv.errors.InputError, match="one for each"):
