@@ -303,7 +303,7 @@ def describe(item: Item, run: str) -> CaseInfo:
 
 
 def fingerprint(problem: Problem) -> str:
-    """Hash of the numbers of a problem; what bodies' v* is to it stands in b."""
+    """Hash of the numbers of a problem and the keys of its blocks; what bodies' v* is to it stands in b."""
     digest = hashlib.sha256(problem.friction.encode())
     c, r, g = problem.cones, problem.rows, problem.generalized
     arrays: list[Any] = [problem.b, problem.guess, c.ptr, c.kind, c.lower, c.upper, c.mu, c.patch_radius]
@@ -319,6 +319,8 @@ def fingerprint(problem: Problem) -> str:
         digest.update(b"-" if x is None else np.ascontiguousarray(x).tobytes() + b"|")
     if problem.precision != "float64":
         digest.update(problem.precision.encode())
+    if problem.key is not None:
+        digest.update(b"key" + problem.key.tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -49,6 +49,7 @@ def check(
     read, or --precision finds no stored solution.
     """
     from lavender import bench
+    from lavender._arrays import number
     from lavender.check import cross_check
     from lavender.residuals import AT_FLOOR
 
@@ -60,7 +61,8 @@ def check(
         out.print(str(submission), highlight=False, markup=False, soft_wrap=True)
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
     contradicted = unread = missing = answers = unmet = 0
-    bench.solver_names(solvers)
+    bench.solver_names([*(solvers or ()), reference])
+    number("tol", tol, low=0.0)
     for item in bench.resolve(files):
         try:
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)

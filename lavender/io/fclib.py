@@ -545,37 +545,44 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
 
 def _write_file(out: Any, file: Contents) -> None:
     group = out.create_group(file.group)
-    group["spacedim"] = np.array([file.spacedim], np.int32)
+    _put(group, "spacedim", np.array([file.spacedim], np.int32))
     vectors = group.create_group("vectors")
     for name, shape in PARTS[LOCAL if file.form == "local" else GLOBAL].items():
         part = getattr(file, name)
         if part is not None and len(shape) == 2:
             _write_matrix(group.create_group(name), part)
         elif part is not None:
-            vectors[name] = part
+            _put(vectors, name, part)
     if any(file.info.values()):
         info = group.create_group("info")
         for name in ("title", "description", "math_info"):
             text = file.info.get(name, "").encode()
-            info[name] = np.array(text, f"S{len(text) + 1}")  # FCLIB reads strings up to their NUL
+            _put(info, name, np.array(text, f"S{len(text) + 1}"))  # FCLIB reads strings up to their NUL
     if file.solution:
         _write_point(out.create_group("solution"), file.solution)
     if file.guesses:
         guesses = out.create_group("guesses")
-        guesses["number_of_guesses"] = np.array([len(file.guesses)], np.int32)
+        _put(guesses, "number_of_guesses", np.array([len(file.guesses)], np.int32))
         for i, guess in enumerate(file.guesses):
             _write_point(guesses.create_group(str(i + 1)), guess)
 
 
 def _write_matrix(group: Any, a: sp.csr_array) -> None:
     for name, value in (("nzmax", a.nnz), ("m", a.shape[0]), ("n", a.shape[1]), ("nz", -2)):
-        group[name] = np.array([value], np.int32)
-    group["p"], group["i"], group["x"] = a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data
+        _put(group, name, np.array([value], np.int32))
+    for name, array in (("p", a.indptr.astype(np.int32)), ("i", a.indices.astype(np.int32)), ("x", a.data)):
+        _put(group, name, array)
 
 
 def _write_point(group: Any, point: Mapping[str, FloatArray]) -> None:
     for name, value in point.items():
-        group[name] = value
+        _put(group, name, value)
+
+
+def _put(group: Any, name: str, value: Any) -> None:
+    """Write an array with a checksum, by which a damaged file is no other problem; HDF5 has none for a scalar."""
+    value = np.asarray(value)
+    group.create_dataset(name, data=value, fletcher32=bool(value.ndim and value.size))
 
 
 def _h5py() -> Any:

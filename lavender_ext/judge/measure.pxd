@@ -18,8 +18,9 @@ from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_ends, floor_t, no_floor, norms_of_rhs,
-                                       nothing, relative, score_from, score_rows, score_t, tally_block, tally_t)
+from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_ends, floor_t, hides, no_floor,
+                                       norms_of_rhs, nothing, relative, score_from, score_rows, score_t, tally_block,
+                                       tally_t)
 
 
 # -- A in compressed rows ----------------------------------------------------------------------------
@@ -401,7 +402,7 @@ cdef inline double relative_of(const score_t* s, const double* w, int32_t m, dou
         return relative(1.0 / 0.0, 1.0 / 0.0, start_energy, start_velocity)
     found = relative(s.energy, s.velocity, start_energy, start_velocity)
     floor = relative(s.floor_energy, s.floor_velocity, start_energy, start_velocity)
-    return floor if 1e-3 <= floor < 1.0 / 0.0 and floor > found else found
+    return floor if hides(floor) and floor < 1.0 / 0.0 and floor > found else found
 
 
 cdef class Judged:

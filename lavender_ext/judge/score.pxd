@@ -238,14 +238,19 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
     velocity[0] = big
 
 
+cdef inline bint hides(double floor) noexcept nogil:
+    """Whether rounding hides a thousandth of what doing nothing leaves: then the floor is the residual."""
+    return floor >= 1e-3
+
+
 cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
-    """Whether a relative residual is within twice its floor, both finite, and at most 1e-5.
+    """Whether a relative residual is within twice its floor, and at most 1e-5; no floor hides it (`hides`).
 
     The floor grows with the impulse, so one that runs away, as where there is no solution, excuses any residual: it
     says nothing of the problem. At 1e-5 A lambda is made of terms 1e11 times as large as what they leave; problems
     with an M of condition 1e16 end below 1e-5.
     """
-    return relative <= 2.0 * floor < 1.0 / 0.0 and relative <= 1e-5
+    return relative <= 2.0 * floor and relative <= 1e-5 and not hides(floor)
 
 
 cdef inline floor_t no_floor() noexcept nogil:

@@ -365,6 +365,7 @@ def test_a_fingerprint_sees_every_number():
     for s in (1.0, 2.0):  # one A and one b
         variants.append(lv.Problem.from_jacobian(s * jac, s * s * mass, v / s, cones=cones))
     variants.append(dataclasses.replace(variants[-1], precision="float32"))
+    variants += [dataclasses.replace(p, key=np.arange(5, dtype=np.uint64) + k) for k in (0, 1)]
     prints = [bench_cases.fingerprint(v) for v in variants]
     assert len(set(prints)) == len(variants)
     assert bench_cases.fingerprint(stack(5, "renamed")) == prints[0]

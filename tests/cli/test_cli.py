@@ -112,6 +112,16 @@ def test_the_package_runs_as_a_module():
     assert lv.__version__ in subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.parametrize(
+    "wrong", [("--tol", "nan"), ("--tol", "inf"), ("--tol=-1",), ("--reference", "nobody")]
+)
+def test_check_refuses_its_options_before_it_looks_at_a_folder(lavender, path, wrong):
+    code, out, err = lavender("check", path.parent, "--solvers", "pgs", *wrong)
+    assert code == cli.EXIT_BAD_INPUT
+    assert "tol is" in err or "unknown solver 'nobody'" in err
+    assert not out
+
+
 def test_check_passes_honest_solvers(lavender, path):
     code, out, _ = lavender("check", path, "--solvers", "pgs", "direct")
     assert code == 0
