@@ -55,16 +55,18 @@ class Lock:
             if not _lock(descriptor):
                 raise self._refusal(*_holder(descriptor))
             key = _identity(os.fstat(descriptor))
+            there = None
             with contextlib.suppress(OSError):
-                if _identity(os.stat(self.path)) == key:
-                    pid, host = _holder(descriptor)
-                    if host and host != socket.gethostname():
-                        raise self._refusal(pid, host)
-                    # Of a process of this host that died, or of nobody.
-                    _write(descriptor, {"pid": os.getpid(), "host": socket.gethostname()})
-                    self._descriptor, self._key = descriptor, key
-                    _held.add(key)
-                    return True
+                there = _identity(os.stat(self.path))
+            if there == key:
+                pid, host = _holder(descriptor)
+                if host and host != socket.gethostname():
+                    raise self._refusal(pid, host)
+                # Of a process of this host that died, or of nobody.
+                _write(descriptor, {"pid": os.getpid(), "host": socket.gethostname()})
+                self._descriptor, self._key = descriptor, key
+                _held.add(key)
+                return True
         except BaseException:
             os.close(descriptor)
             raise

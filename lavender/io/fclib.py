@@ -27,7 +27,7 @@ from lavender.errors import CapabilityError, InputError
 from lavender.generalized import Generalized
 from lavender.io.condensed import ENTRY, condensed
 from lavender.io.npz import compressed
-from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
+from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_bytes
 from lavender.problem import Problem
 
 __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
@@ -535,12 +535,12 @@ def write_contents(file: Contents, path: str | os.PathLike[str]) -> None:
         The path cannot be written, or h5py is not installed.
     """
     h5py = _h5py()
-
-    def write_to(temporary: Path) -> None:
-        with h5py.File(temporary, "w-") as out:
-            _write_file(out, file)
-
-    write_atomically(path, write_to)
+    # In memory: where a disk is full, HDF5 ends the process by a signal.
+    with h5py.File("in memory", "w", driver="core", backing_store=False) as out:
+        _write_file(out, file)
+        out.flush()
+        image = out.id.get_file_image()
+    write_bytes(path, image)
 
 
 def _write_file(out: Any, file: Contents) -> None:

@@ -128,6 +128,36 @@ def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_p
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+@pytest.mark.parametrize("room", [1, 4096, 16384, 24576])
+def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, room):
+    """HDF5 itself ends the process by a signal where a write fails that is not its first."""
+    pytest.importorskip("h5py")
+    path = tmp_path / "p.hdf5"
+    lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5).save(path)
+    before = path.read_bytes()
+    a = np.random.default_rng(0).normal(size=(60, 60))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+        with pytest.raises(lv.InputError, match="cannot write"):
+            lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["p.hdf5"]
+
+
+def test_a_lock_without_room_says_so(tmp_path, monkeypatch):
+    from lavender.bench import lock
+
+    def full(descriptor, what):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(lock, "_write", full)
+    with pytest.raises(lv.InputError, match="No space left"):
+        Store(tmp_path / "records.jsonl")
+
+
 def test_a_name_as_long_as_any_may_be_is_written_and_who_may_read_a_file_stays(made, tmp_path):
     for name in ("n" * 251 + ".npz", "\N{GREEK SMALL LETTER LAMDA}" * 125 + ".npz"):
         io.save(made["problem"], tmp_path / name)
