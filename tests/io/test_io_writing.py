@@ -147,15 +147,14 @@ def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, room):
     assert os.listdir(tmp_path) == ["p.hdf5"]
 
 
-def test_a_lock_without_room_says_so(tmp_path, monkeypatch):
-    from lavender.bench import lock
-
-    def full(descriptor, what):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(lock, "_write", full)
-    with pytest.raises(lv.InputError, match="No space left"):
-        Store(tmp_path / "records.jsonl")
+def test_a_lock_without_room_says_so(tmp_path):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
+        with pytest.raises(lv.InputError, match="cannot write"):
+            Store(tmp_path / "records.jsonl")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 def test_a_name_as_long_as_any_may_be_is_written_and_who_may_read_a_file_stays(made, tmp_path):
