@@ -32,9 +32,10 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 ISLAND = 150
 SWEPT = 32  # the most sweeps of a part before its first factorisation
 FACTORED = 0.05  # ns per multiply-add of the factorisations of parts
-# Counted cost [ns] of Newton's method over generalised velocities up to which `auto` tries it first (less under
-# Coulomb's law, where sweeps often converge sooner); and MOST, up to which the clock is not read in between.
-AT_ONCE = {"linear": 4e6, "lcp": 4e6, "cone": 4e6, "coulomb": 5e5}
+# Counted cost [ns] of Newton's method over generalised velocities up to which `auto` tries it first (less where others
+# often converge sooner: sweeps under Coulomb's law; on bounded rows `direct`, since steps take up to three times their
+# count); and MOST, up to which the clock is not read in between.
+AT_ONCE = {"linear": 1e6, "lcp": 1e6, "cone": 4e6, "coulomb": 5e5}
 MOST = 1e7
 
 
@@ -46,13 +47,11 @@ def velocities_cost(problem: Problem, largest: int) -> float:
     return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
 
 
-def limits(most: float, most_coulomb: float) -> Limits:
-    """Limits of the compiled call: the most counted cost [ns], and that under Coulomb's law."""
-    v = rates()["velocities"]
-    count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
-    return Limits(
-        np.array([v["step"], v["entry"], v["work"], READ, *count, most, most_coulomb, general.ROOM])
-    )
+def limits(most: Mapping[str, float]) -> Limits:
+    """Limits of the compiled call: the most counted cost [ns] by law."""
+    v, laws = rates()["velocities"], ("lcp", "coulomb", "cone")
+    count, cost = (of_law(v["count"], law) for law in laws), (most[law] for law in laws)
+    return Limits(np.array([v["step"], v["entry"], v["work"], READ, *count, *cost, general.ROOM]))
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
@@ -231,6 +230,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(AT_ONCE["cone"], AT_ONCE["coulomb"]), True, True)
+AUTO = SmallCall("auto", limits(AT_ONCE), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", limits(MOST, MOST), False)
+NEWTON = SmallCall("newton", limits(dict.fromkeys(AT_ONCE, MOST)), False)

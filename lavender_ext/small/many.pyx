@@ -39,8 +39,9 @@ cdef struct limits_t:           # as `velocities_cost` of lavender/solvers/small
     double bounded              # iterations by law
     double coulomb
     double cone
-    double most                 # what all may cost to be asked at all, and
-    double most_coulomb         # under Coulomb's law
+    double most_bounded         # what all may cost to be asked at all, by law
+    double most_coulomb
+    double most_cone
     double values               # of one island's N
 
 
@@ -66,10 +67,10 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
 
 
 cdef inline bint is_cheap(const job_t* j, const limits_t* limits, double largest) noexcept nogil:
-    cdef double flops = j.g.n * (largest * largest) / 6.0, count = limits.bounded, most = limits.most
+    cdef double flops = j.g.n * (largest * largest) / 6.0, count = limits.bounded, most = limits.most_bounded
     cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
     if has_friction(&j.p):
-        count = limits.cone
+        count, most = limits.cone, limits.most_cone
         if j.p.law == COULOMB:
             count, most, flops = limits.coulomb, limits.most_coulomb, 2.0 * flops
     return limits.entry * limits.read * sweep + count * (limits.step + limits.entry * sweep + limits.work * flops) <= most
@@ -151,7 +152,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (10,)."""
+    """Of the numbers of a `limits_t` (11,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):

@@ -22,7 +22,7 @@ from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
 from lavender.solvers.costs import candidates
 from lavender.solvers.newton_systems import general
-from lavender.solvers.small import AT_ONCE, AUTO, ISLAND, SmallCall, call_ends_within, velocities_cost
+from lavender.solvers.small import AT_ONCE, AUTO, ISLAND, SmallCall, call_ends_within, limits, velocities_cost
 from lavender.solvers.structure import Structure
 from lavender_ext.small.many import solve_first
 
@@ -234,11 +234,16 @@ def test_the_compiled_limits_let_in_what_is_counted_to_cost_little(seed):
     """`velocities_cost` and the limits of the compiled loops say the same of each law."""
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
-    n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60))
+    n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60)) if seed % 3 else 0
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
-    found = solve_first(problem.metric, None, np.inf, AUTO.limits)
     cost = velocities_cost(problem, general.prepare(problem).largest)
-    assert (found is not None) == (cost <= AT_ONCE[problem.law])
+
+    def lets_in(most):
+        return solve_first(problem.metric, None, np.inf, limits(most)) is not None
+
+    assert lets_in(AT_ONCE) == (cost <= AT_ONCE[problem.law])
+    assert lets_in(dict.fromkeys(AT_ONCE, 0.0) | {problem.law: 1.01 * cost}), "no other law's limit counts"
+    assert not lets_in(dict.fromkeys(AT_ONCE, np.inf) | {problem.law: 0.99 * cost})
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
