@@ -32,7 +32,6 @@ PROBE = 0.5  # share of the time left that iterations of unknown pace may take
 class Candidate:
     """A candidate on the problem of a log; its cost is a lower bound until it is counted."""
 
-    again = False  # begins anew in each turn
     is_finite = False  # factors
     patient = False  # may have another turn although the last ended by itself above the tolerance
     others = np.inf  # least remaining cost of the others [ns]
@@ -55,17 +54,17 @@ class Candidate:
 
     def steps(self, work: float) -> int:
         """Iterations of a turn of so much work; 0 if not even the first would end in time."""
-        begun = self.spent > 0.0 and not self.again
-        setup = 0.0 if begun else self.cost.setup
+        setup = 0.0 if self.spent > 0.0 else self.cost.setup
         n = max(1, int((work - setup) / self.cost.each))
-        left = max(self.cost.total - self.spent * begun, 0.0)
+        left = max(self.cost.total - self.spent, 0.0)
         if self.is_finite and self.log.ends_late(self.costs.sure * left):
             return 0  # what it achieves before its end is seldom worth its time
-        return min(n, self.log.left, self.spec.max_iter if self.again else n)
+        return min(n, self.log.left)
 
     def run(self, work: float, others: float) -> bool:
         self.others = others
-        n = self.steps(self.stretch * work)
+        # What factors has little to show before its end.
+        n = self.steps(BELIEVED * work if self.is_finite else work)
         if n <= 0:
             return False
         before = self.log.best
@@ -73,22 +72,13 @@ class Candidate:
         self.log.note(self.shown, claim, before)
         return self.has_done(claim)
 
-    @property
-    def stretch(self) -> float:
-        """The longest turn, relative to the remaining cost: what factors has little to show before its end."""
-        if not self.is_finite:
-            return 1.0
-        return self.costs.sure if self.again else BELIEVED
-
     def has_done(self, claim: Claim) -> bool:
         """Count what a turn took and what is left; return whether it may have another."""
         last = max(claim.iterations, 1) * self.cost.each
-        if self.again or self.spent == 0.0:
+        if self.spent == 0.0:
             last += self.cost.setup
         self.spent += last
-        self.rest = 2.0 * last if self.again else remainder(self.spent, self.promise())
-        if self.again and claim.iterations >= self.spec.max_iter:
-            return False  # it would have no more the next time
+        self.rest = remainder(self.spent, self.promise())
         return claim.status is Status.MAX_ITERATIONS or self.patient
 
     def turn(self, n: int) -> Claim:
@@ -337,9 +327,9 @@ class Newton(Candidate):
 
 
 class Direct(Candidate):
-    """Begins anew in each turn, from the best impulse; a linear system is solved no closer than tol."""
+    """Continued where its rounds were used up; a linear system is solved no closer than tol."""
 
-    again = is_finite = True
+    is_finite = True
 
     def turn(self, n: int) -> Claim:
         log = self.log
@@ -348,13 +338,16 @@ class Direct(Candidate):
             solver = Enough()
         elif self.spent == 0.0:
             solver = Impatient()
-        impulse = log.impulse.copy()
-        # after a turn the state's rows are those of the end; the problem keeps their order
-        claim: Claim = solver.run(solver.prepare(log.problem), impulse, n, log.tol, log.time_left)
-        _offer(log, impulse)
-        # Stuck, or singular where rows are free: with more shifts and descent it takes far longer.
-        self.patient = self.spent == 0.0 and log.problem.law == "lcp" and claim.status is Status.STALLED
+        if self.state is None:
+            self.state, self.impulse = solver.prepare(log.problem), log.impulse.copy()
+        claim: Claim = solver.run(self.state, self.impulse, n, log.tol, log.time_left)
+        _offer(log, self.impulse)
+        self.patient = claim.status is Status.STALLED and not self.state.is_over
         return claim
+
+    def promise(self) -> float:
+        # Stuck, or singular where rows are free: with more shifts and descent it takes far longer.
+        return np.inf if self.patient else 0.0
 
 
 def _offer(log: SolveLog, impulse: FloatArray) -> None:

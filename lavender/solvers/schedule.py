@@ -12,8 +12,7 @@ If method j would converge after c_j, and every method continues where it stoppe
 because r_j <= max(e_j, BELIEVED s_j) at all times, the last turn of any other method began with r_i <= r_j and was no
 longer, and by (1) it had spent at most r_i before. Without predictions BELIEVED is 1 in (2). A method that has little
 to show before its end may have longer turns, up to BELIEVED r_i, so that it is rarely interrupted; in (2) it counts
-for 1 + BELIEVED where others count for 2. If it also begins anew in each turn, r_i is twice its last run in place of
-s_i, which is at least all that it has spent.
+for 1 + BELIEVED where others count for 2.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from typing import Any, Protocol
 
 __all__ = ["BELIEVED", "Method", "first", "race", "remainder"]
 
-# The largest prediction, relative to what a method has spent; and the longest turn of Newton's method, relative to its
-# remaining cost. Arbitrary: half or twice as much changes regret by at most 0.01, for either.
+# The largest prediction, relative to what a method has spent; and the longest turn of a method that factors, relative
+# to its remaining cost. Arbitrary: half or twice as much changes regret by at most 0.01, for either.
 BELIEVED = 8.0
 
 
@@ -65,5 +64,5 @@ def first(methods: list[Any]) -> Any:
 
 
 def remainder(spent: float, promised: float) -> float:
-    """(1) for a method that continues where it stopped."""
+    """(1)."""
     return max(spent, min(promised, BELIEVED * spent))
