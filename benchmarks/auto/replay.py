@@ -36,7 +36,6 @@ class Replayed(Candidate):
         self.tape: Any = log
         self.curve, self.level = curve, level
         self.is_finite = not self.spec.resumable
-        self.again = self.name == "direct"
         self.done, self.seconds, self.relative, self.rest_of = 0, 0.0, 1.0, math.inf
 
     def at(self, n: int) -> tuple[float, float]:
@@ -54,8 +53,8 @@ class Replayed(Candidate):
     def turn(self, n: int) -> Claim:
         end = self.curve.iterations(self.level)
         last = self.curve.points[-1][0] if self.curve.points else 0
-        begun = 0 if self.again else self.done
-        spent = 0.0 if self.again else self.at(begun)[0] if begun else 0.0
+        begun = self.done
+        spent = self.at(begun)[0] if begun else 0.0
         total, now = begun + n, begun
         while now < total:
             now = min(total, now + max(now // 2, FIRST)) if self.name == "anderson" else total
