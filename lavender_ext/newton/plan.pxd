@@ -5,7 +5,7 @@ decades. Cones: interior points with two weights. What these leave: the augmente
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
 interior point with two shares of phi's derivative, ended by rounds; closed loops of joints through the augmented system;
-rounds from the answer of the convex relaxation; the first rounds for what is left of the budget.
+rounds from the answer of the convex relaxation, then from nothing; the first rounds for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -270,7 +270,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
     n.at += 1
     if at > 0 and over(n):
-        at = 5
+        at = 6
     if at == 0:
         take(n, n.aside_z, n.best_z)
         begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
@@ -282,7 +282,12 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
             begin_de_saxce(n, 1)
     elif at == 3:
         begin_relaxed(n)
-    elif at == 4:
+    elif at == 4:                                       # a start that is near no solution may be worse than none
+        if not n.cold:
+            memset(n.trial, 0, n.s.e.m * sizeof(double))
+            begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
+            pursue(n, 0, FIRST, 2.0 * first_gain())
+    elif at == 5:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
         enter_rounds(n, 0, LIMITLESS)
     else:
