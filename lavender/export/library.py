@@ -101,12 +101,11 @@ def write(
 
 
 def _module(header: str) -> bytes:
-    """The library as a WebAssembly module: the one that came with the package, or a new one."""
+    """The library as a WebAssembly module: the one made of this source before, or a new one, kept beside it."""
     kept, text = HERE / "js" / "liblavender.wasm", source()
-    stamp = hashlib.sha256(text.encode()).hexdigest()
-    made_of = kept.with_suffix(".sha256")
-    if kept.exists() and made_of.exists() and made_of.read_text(encoding="utf-8") == stamp:
-        return kept.read_bytes()
+    stamp = wasm.section(wasm.SECTION, hashlib.sha256(text.encode()).hexdigest().encode())
+    if kept.exists() and (made := kept.read_bytes()).endswith(stamp):
+        return made
     with TemporaryDirectory() as folder:
         work = Path(folder)
         (work / "lavender.c").write_text(text, encoding="utf-8")
@@ -116,10 +115,9 @@ def _module(header: str) -> bytes:
             wasm.build_library(work / kept.name, work / "lavender.c", names)
         except wasm.BuildFailed as error:
             raise LavenderError(str(error)) from None
-        made = (work / kept.name).read_bytes()
+        made = (work / kept.name).read_bytes() + stamp
     with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
         write_bytes(kept, made)
-        write_text(made_of, stamp)
     return made
 
 

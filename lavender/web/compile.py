@@ -40,11 +40,14 @@ __all__ = [
     "LARGEST",
     "MODULES",
     "PARTS",
+    "SECTION",
     "BuildFailed",
     "Built",
     "Part",
     "build",
+    "build_library",
     "is_current",
+    "section",
     "source_hash",
     "why_not",
 ]
@@ -243,7 +246,7 @@ def _check(module: bytes, largest: int) -> None:
 
 
 def section(name: str, content: bytes) -> bytes:
-    # A custom section; lengths below 128 are one byte in LEB128.
+    """A custom section of a module, to be appended; lengths below 128 are one byte in LEB128."""
     body = bytes([len(name)]) + name.encode() + content
     if len(body) >= 128:
         raise ValueError("a custom section longer than 127 bytes")
