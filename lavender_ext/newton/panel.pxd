@@ -7,7 +7,20 @@ from lavender_ext.core.rows cimport contact_jacobian, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
 
-cdef inline void to_bodies_of_size(const elements_t* e, int32_t n, const double* x, double* y, const int32_t s) noexcept nogil:
+cdef extern from *:
+    """
+    #ifdef __GNUC__
+    #define LAVENDER_FOR_EACH_SIZE __attribute__((always_inline)) void
+    #else
+    #define LAVENDER_FOR_EACH_SIZE void
+    #endif
+    """
+    # Return type of a function that is inlined for each constant size, however much the module has grown by inlining.
+    ctypedef void for_each_size "LAVENDER_FOR_EACH_SIZE"
+
+
+cdef inline for_each_size to_bodies_of_size(const elements_t* e, int32_t n, const double* x, double* y,
+                                            const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, c, first, second
     cdef const double *p
     cdef double u
@@ -34,7 +47,7 @@ cdef inline void to_bodies_of_size(const elements_t* e, int32_t n, const double*
                 y[second * s + c] += sum[s + c]
 
 
-cdef inline void to_rows_of_size(const elements_t* e, const double* y, double* x, const int32_t s) noexcept nogil:
+cdef inline for_each_size to_rows_of_size(const elements_t* e, const double* y, double* x, const int32_t s) noexcept nogil:
     cdef int32_t h, i, j, c, first, second
     cdef const double *p
     cdef double t, u
