@@ -34,6 +34,7 @@ MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
 WASM = runpy.run_path("lavender/web/compile.py")
+put = WASM["put"]
 LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
@@ -87,8 +88,23 @@ class BuildKernels(build_ext):
         how = json.dumps(
             [Cython.__version__, SHARED, DIRECTIVES, COMPILE_ARGS, LINK_ARGS, INLINE, LIMITS, WHOLE, COLD]
         )
-        if not (stamp.exists() and stamp.read_text() == how):
+        current = stamp.exists() and stamp.read_text() == how
+        if not current:
             self.force = True  # file times do not tell
+        # A build that is killed leaves torn files, newer than their sources; and who reads translations while they are
+        # written makes his own (lavender/web/cut.py).
+        stamp.unlink(missing_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
+        try:
+            self.make(out)
+        except Exception:  # it was told; what could not be made is not there
+            if current:
+                put(stamp, how.encode())
+            raise
+        put(stamp, how.encode())
+
+    def make(self, out):
+        """Translate into a folder, then compile."""
         workers = os.cpu_count() or 1
         forks = multiprocessing.get_start_method() == "fork"  # elsewhere workers would run this file anew
         gc.disable()  # trees of nodes that live to the end: looking through them is two fifths of the translation
@@ -108,8 +124,6 @@ class BuildKernels(build_ext):
         self.extensions.sort(key=lambda module: -os.path.getsize(module.sources[0]))
         self.parallel = self.parallel or workers
         super().run()
-        stamp.parent.mkdir(parents=True, exist_ok=True)
-        stamp.write_text(how)
 
 
 class BuildWasm(Command):
@@ -177,7 +191,7 @@ class BuildLibrary(Command):
         if self.editable_mode:
             return  # `lavender export` makes it when it is first needed
         for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
-            if path.is_file() and path.suffix not in (".py", ".pyc") and "target" not in path.parts:
+            if path.is_file() and path.suffix not in (".py", ".pyc", ".part") and "target" not in path.parts:
                 out = Path(self.build_lib, path)
                 out.parent.mkdir(parents=True, exist_ok=True)
                 out.write_bytes(path.read_bytes())
@@ -200,7 +214,7 @@ def make_library():
     """lavender/export/c/lavender.c of the kernels as they are, its path."""
     out = Path("lavender", "export", "c", "lavender.c")
     if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
-        out.write_text(LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")), encoding="utf-8")
+        put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
     return out
 
 

@@ -19,6 +19,7 @@ from lavender.bench import machine
 from lavender.bench import seeds as from_seeds
 from lavender.bench.cases import resolve
 from lavender.errors import InputError
+from lavender.io.stored import write_text
 from lavender.problem import Problem
 
 __all__ = ["command"]
@@ -86,7 +87,7 @@ def command(
         text = json.dumps(found_rates, indent=1) + "\n"
         click.echo(text if out is None else f"{count_rates(found_rates)} rates written to {out}")
         if out is not None:
-            out.write_text(text, encoding="utf-8")
+            write_text(out, text)
         return
     first, colon, last = seeds.partition(":")
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):

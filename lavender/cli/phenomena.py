@@ -10,6 +10,7 @@ import click
 
 from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
+from lavender.io.stored import write_text
 from lavender.phenomena import WAYS, Record, chosen, run
 from lavender.phenomena import table as tables
 from lavender.phenomena.engines import versions_of_node
@@ -78,7 +79,7 @@ def phenomena(
         found.append(record)
         click.echo(tables.line(record), err=True)
         if out is not None:
-            out.write_text(json.dumps(_told(found), indent=1) + "\n", encoding="utf-8")
+            write_text(out, json.dumps(_told(found), indent=1) + "\n")
 
     run(
         names,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -115,15 +116,8 @@ def solve(
 
 
 def _check_writable(path: Path) -> None:
-    # Opened for appending: what is there stays, and nothing is left where nothing was.
+    # Nothing is opened or made: another process may be writing there.
     target = destination(path)
-    existed = target.exists()
-    try:
-        with target.open("ab"):
-            pass
-    except OSError as error:
-        raise InputError(
-            f"cannot write {path} ({error.strerror or error}): give a path that you may write to"
-        ) from None
-    if not existed:
-        target.unlink()
+    needed = [target.parent, target] if target.exists() else [target.parent]
+    if not all(os.access(place, os.W_OK) for place in needed):
+        raise InputError(f"cannot write {path}: give a path that you may write to")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -88,22 +89,22 @@ def run(
     """
     steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
     recorded = 0
-    folder = None if record is None else folder_for_steps(record, replace)
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0
-    while done < steps and not lost:
-        if folder is not None and done >= skip:
-            recorded += simulation.write_problem(folder, 6) is not None
-        start = perf_counter()
-        observation, _, _, _, info = simulation.step()
-        cost[done] = perf_counter() - start
-        solver[done] = observation["solver"]
-        depth[done] = observation["contacts"]["depth"].max(initial=0.0)
-        time[done] = info["time"]
-        lost = info.get("lost_body", "")
-        done += 1
-        if watch is not None:
-            watch(done, observation, info)
+    with nullcontext() if record is None else folder_for_steps(record, replace) as folder:
+        while done < steps and not lost:
+            if folder is not None and done >= skip:
+                recorded += simulation.write_problem(folder, 6) is not None
+            start = perf_counter()
+            observation, _, _, _, info = simulation.step()
+            cost[done] = perf_counter() - start
+            solver[done] = observation["solver"]
+            depth[done] = observation["contacts"]["depth"].max(initial=0.0)
+            time[done] = info["time"]
+            lost = info.get("lost_body", "")
+            done += 1
+            if watch is not None:
+                watch(done, observation, info)
     scene = simulation.scene
     order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
     return Trace(

@@ -142,13 +142,13 @@ class Simulation(Stepping):
             raise UnknownName("form", form, ("npz", "fclib"))
         steps = whole_number("steps", steps, 1)
         folder = Path(folder)
-        if folder.resolve() != self._recorded:
-            self._recorded = folder_for_steps(folder).resolve()
         digits, written = len(str(self._steps + steps)), []
-        for _ in range(steps):
-            written.append(self.write_problem(folder, digits, form))
-            if self.step()[2]:
-                break
+        with folder_for_steps(folder, continued=folder.resolve() == self._recorded):
+            self._recorded = folder.resolve()
+            for _ in range(steps):
+                written.append(self.write_problem(folder, digits, form))
+                if self.step()[2]:
+                    break
         return [path for path in written if path is not None]
 
     def write_problem(self, folder: Path, digits: int, form: str = "npz") -> Path | None:

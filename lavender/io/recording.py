@@ -96,32 +96,32 @@ def record(
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = drive_of(model, control, seed)
-    folder = folder_for_steps(folder, replace)
     kept: list[dict[str, Any]] = []
     left_out: list[str] = []
     without = 0
     width = len(str(steps))
-    for step in range(steps):
-        ctrl = drive(data, step)
-        if ctrl is not None:
-            data.ctrl[:] = ctrl
-        mj.mj_step(model, data)
-        if (step + 1) % every:
-            continue
-        mj.mj_forward(model, data)
-        file = folder / f"step_{step + 1:0{width}d}.npz"
-        try:
-            found = _solved(mj, model, data, f"step {step + 1}", precision)
-        except LavenderError as error:
-            left_out.append(f"step {step + 1}: {error}")
-            continue
-        if found is None:
-            without += 1
-            continue
-        problem, own, told = found
-        npz.write(problem, file, impulse=own)
-        kept.append({"file": file.name, "step": step + 1, **told})
-    write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in kept))
+    with folder_for_steps(folder, replace) as folder:
+        for step in range(steps):
+            ctrl = drive(data, step)
+            if ctrl is not None:
+                data.ctrl[:] = ctrl
+            mj.mj_step(model, data)
+            if (step + 1) % every:
+                continue
+            mj.mj_forward(model, data)
+            file = folder / f"step_{step + 1:0{width}d}.npz"
+            try:
+                found = _solved(mj, model, data, f"step {step + 1}", precision)
+            except LavenderError as error:
+                left_out.append(f"step {step + 1}: {error}")
+                continue
+            if found is None:
+                without += 1
+                continue
+            problem, own, told = found
+            npz.write(problem, file, impulse=own)
+            kept.append({"file": file.name, "step": step + 1, **told})
+        write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in kept))
     return Recording(folder, tuple(line["file"] for line in kept), without, tuple(left_out))
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import stat
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from threading import get_native_id
 from types import MappingProxyType
@@ -26,6 +29,8 @@ ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
+PART = re.compile(r"\..*\.\d+\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
+FORGOTTEN = 86400.0  # s, after which a part is of a writer that was killed: none takes that long
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,25 +49,49 @@ class Stored:
         object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
 
 
-def folder_for_steps(path: str | os.PathLike[str], replace: bool = False) -> Path:
+@contextlib.contextmanager
+def folder_for_steps(
+    path: str | os.PathLike[str], replace: bool = False, continued: bool = False
+) -> Iterator[Path]:
     """A folder, made where it is not, that holds no problem file: steps of two recordings are no sequence.
 
-    `replace` takes the problem files out that it holds. What an engine said of others goes in either case.
+    `replace` takes the problem files out that it holds; those of a recording that is `continued` stay. What an engine
+    said of others goes in either case. Whoever records into it meanwhile is refused.
     """
     folder, replace = as_path(path), flag("replace", replace)
+    with contextlib.ExitStack() as held:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            _hold(folder, held)
+            old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+            if old and not replace and not continued:
+                raise InputError(
+                    f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one "
+                    "sequence: give another folder, or have them replaced (replace=True, --replace)"
+                )
+            for file in () if continued else (*old, folder / ENGINE):
+                file.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"cannot make or clear the folder {str(folder)!r}: {error.strerror}") from None
+        yield folder
+
+
+def _hold(folder: Path, held: contextlib.ExitStack) -> None:
+    """Lock a folder where the system can, until `held` ends; a process that dies holds nothing."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
-        if old and not replace:
-            raise InputError(
-                f"{folder} holds {len(old)} problem files, and steps of two recordings would be read as one sequence: "
-                "give another folder, or have them replaced (replace=True, --replace)"
-            )
-        for file in (*old, folder / ENGINE):
-            file.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make or clear the folder {str(folder)!r}: {error.strerror}") from None
-    return folder
+        import fcntl
+    except ImportError:  # not on Windows
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    held.callback(os.close, descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InputError(
+            f"another recording is being written into {folder}: wait for it, or give another folder"
+        ) from None
+    except OSError:
+        pass  # a file system without locks
 
 
 def destination(path: str | os.PathLike[str]) -> Path:
@@ -96,6 +125,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     target = destination(path)
     short = target.name[:PART_OF_NAME]  # the whole could leave no room for the rest
     temporary = target.with_name(f".{short}.{os.getpid()}.{get_native_id()}.part")
+    _clear(target.parent)
     try:
         write(temporary)
         with contextlib.suppress(OSError):  # of no file yet, or where modes mean nothing
@@ -109,6 +139,15 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@lru_cache
+def _clear(folder: Path) -> None:
+    """Remove what writers that were killed have left in a folder; once in a process, since folders can be large."""
+    with contextlib.suppress(OSError):
+        for entry in os.scandir(folder):
+            if PART.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > FORGOTTEN:
+                os.unlink(entry)
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

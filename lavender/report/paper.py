@@ -16,6 +16,7 @@ from pathlib import Path
 from lavender.bench.record import file_name, level_name
 from lavender.bench.store import Records
 from lavender.errors import InputError
+from lavender.io.stored import write_figure, write_text
 from lavender.report import contents, tables
 from lavender.report.curves import LINES, Figure, figures
 from lavender.report.draw import matplotlib_figure
@@ -65,9 +66,9 @@ def write_paper(report: Report, folder: str | Path) -> Path:
         for figure in some:
             canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
             path = folder / (file_name(figure.name.replace(" ", "-")) + ".pdf")
-            canvas.savefig(path, metadata={"CreationDate": None, "Producer": None})
-        (folder / "tables.tex").write_text(_tables(report), encoding="utf-8")
-        (folder / "method.tex").write_text(_method(found), encoding="utf-8")
+            write_figure(canvas, path, metadata={"CreationDate": None, "Producer": None})
+        write_text(folder / "tables.tex", _tables(report))
+        write_text(folder / "method.tex", _method(found))
     except OSError as error:
         raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
     return folder

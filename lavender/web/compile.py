@@ -34,6 +34,7 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from threading import get_native_id
 from typing import Any
 
 __all__ = [
@@ -47,6 +48,7 @@ __all__ = [
     "build",
     "build_library",
     "is_current",
+    "put",
     "section",
     "source_hash",
     "why_not",
@@ -162,18 +164,24 @@ def build(
         data = _compiled(source, names, ["--import-memory"] if beside else [])
     _check(data, LARGEST if largest is None else largest)
     data += section(SECTION, source_hash(root, modules).encode())
-    # Moved into place in one step: whoever reads `out` at the same time sees the old file or the new one.
     out = out.resolve()  # a link stays, what is behind it is replaced
-    part = out.with_name(out.name + f".{os.getpid()}")
     if out.exists() and not out.is_file():
         raise BuildFailed(f"cannot write {out}: it is no file, and is not replaced; give the name of a file")
     try:
-        part.write_bytes(data)
-        part.replace(out)
+        put(out, data)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise BuildFailed(f"cannot write {out}: {error.strerror or error}") from None
     return Built(len(data), tuple(sorted(names)), shlex.join(_tools()[0]))
+
+
+def put(path: Path, data: bytes) -> None:
+    """Write a file in one step: whoever reads it at the same time sees the old one or the new one."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.{get_native_id()}.part")
+    try:
+        part.write_bytes(data)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _compiled(source: Path, names: Iterable[str], more: Iterable[str] = ()) -> bytes:

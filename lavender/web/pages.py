@@ -66,7 +66,7 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
-        shutil.copytree(HERE / "page", folder, dirs_exist_ok=True)
+        shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
         for name, data in modules.items():
             write_bytes(folder / f"{name}.wasm", data)
         text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
@@ -74,6 +74,10 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     except (OSError, shutil.Error) as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"
+
+
+def _copy(source: str, target: str) -> None:
+    write_bytes(target, Path(source).read_bytes())
 
 
 class Handler(SimpleHTTPRequestHandler):

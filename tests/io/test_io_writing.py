@@ -2,10 +2,12 @@
 
 import errno
 import os
+import signal
 import stat
 
 import numpy as np
 import pytest
+from worked import python
 
 import lavender as lv
 import lavender.cli
@@ -13,7 +15,7 @@ from lavender import bench, io
 from lavender.bench.store import Records, Store
 from lavender.engine import run
 from lavender.engine.picture import save_picture
-from lavender.io.stored import folder_for_steps, write_atomically, write_text
+from lavender.io.stored import PART, folder_for_steps, write_atomically, write_text
 
 resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
@@ -169,8 +171,9 @@ def test_a_name_as_long_as_any_may_be_is_written_and_who_may_read_a_file_stays(m
 def test_what_an_engine_said_of_a_recording_goes_with_it(tmp_path):
     for name in ("engine.jsonl", "step_1.npz"):
         (tmp_path / name).write_text("of before")
-    assert folder_for_steps(tmp_path, replace=True) == tmp_path
-    assert not list(tmp_path.iterdir())
+    with folder_for_steps(tmp_path, replace=True) as folder:
+        assert folder == tmp_path
+        assert not list(tmp_path.iterdir())
 
 
 def test_the_path_of_an_open_descriptor_is_no_name(tmp_path):
@@ -221,3 +224,101 @@ def test_threads_that_write_one_path_do_not_share_their_parts(tmp_path):
         thread.join()
     assert len(set(parts)) == 2
     assert (tmp_path / "a").read_text() in map(str, parts)
+
+
+COMMANDS = [
+    ("report", "stack(n=2)", "--solvers", "pgs,direct", "--levels", "1e-3", "--budgets", "4", "--repeats", "1",
+     "--out", "report", "--paper"),
+    ("run", "stack", "--steps", "3", "--record", "steps", "--trace", "t.csv", "--plot", "t.svg", "--film", "t.gif"),
+    ("solve", "stack(n=2)", "--output", "solution.npz"),
+    ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
+    ("export", "c", "c", "--for", "report"),
+    ("export", "rust", "rust"),
+    ("web", "page", "page"),
+]  # fmt: skip
+
+
+def test_every_command_writes_files_under_other_names_first(tmp_path):
+    """A reader, or what a full disk or a signal leaves, is the old file or the new one; records are added to."""
+    script = """if True:
+        import os, sys
+        from lavender import cli
+        from lavender.io.stored import PART
+        from lavender.web import pages
+        pages.module = lambda say, name: b"a module"
+        here, opened = os.getcwd(), set()
+
+        def watch(event, given):
+            if event == "open" and isinstance(given[0], (str, os.PathLike)) and given[2] & (os.O_WRONLY | os.O_RDWR):
+                path = os.path.abspath(given[0])
+                if path.startswith(here) and not PART.fullmatch(os.path.basename(path)):
+                    opened.add(os.path.relpath(path, here))
+
+        sys.addaudithook(watch)
+        for words in COMMANDS:
+            try:
+                cli.main(list(words))
+            except SystemExit as end:
+                assert not end.code, (words, end.code)
+        print("OPENED", sorted(opened))"""
+    done = python("-c", script.replace("COMMANDS", repr(COMMANDS)), cwd=tmp_path)
+    files = {p.relative_to(tmp_path).parts[0] for p in tmp_path.rglob("*") if p.is_file()}
+    assert files >= {
+        "report",
+        "steps",
+        "t.csv",
+        "t.gif",
+        "c",
+        "rust",
+        "page",
+        "phenomena.json",
+    }
+    assert done.stdout.splitlines()[-1] == "OPENED ['report/records.jsonl', 'report/records.jsonl.lock']"
+
+
+WRITE_AND_DIE = """if True:
+    import os, signal, sys
+    from pathlib import Path
+    from lavender.io.stored import write_atomically
+    from lavender.web import compile
+
+    def write(part):
+        Path(part).write_bytes(b"half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if sys.argv[1] == "module":
+        Path.replace = lambda part, target: os.kill(os.getpid(), signal.SIGKILL)
+        compile.put(Path("a.txt"), b"half")
+    write_atomically("a.txt", write)"""
+
+
+@pytest.mark.parametrize("kind", ["file", "module"])
+def test_what_a_killed_writer_leaves_is_no_file_of_ours_and_goes_in_time(kind, tmp_path):
+    (tmp_path / "a.txt").write_bytes(BEFORE)
+    python("-c", WRITE_AND_DIE, kind, cwd=tmp_path, status=-signal.SIGKILL)
+    assert (tmp_path / "a.txt").read_bytes() == BEFORE
+    (left,) = (p for p in tmp_path.iterdir() if p.name != "a.txt")
+    assert PART.fullmatch(left.name)
+    again = "from lavender.io.stored import write_text; write_text('a.txt', 'of another')"
+    python("-c", again, cwd=tmp_path)
+    assert left.exists()  # its writer may live, on another machine
+    os.utime(left, (0.0, 0.0))
+    python("-c", again, cwd=tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_two_recordings_are_not_written_into_one_folder_at_a_time(tmp_path):
+    pytest.importorskip("fcntl")
+    with folder_for_steps(tmp_path):
+        for replace in (False, True):
+            with pytest.raises(lv.InputError, match="another recording is being written"):
+                run(lv.Simulation("stack"), 3, record=tmp_path, replace=replace)
+        with pytest.raises(lv.InputError, match="another recording is being written"):
+            lv.Simulation("stack").record(tmp_path, 3)
+    holder = "import os, signal, lavender.io.stored as s; s.folder_for_steps('.').__enter__(); os.kill(os.getpid(), 9)"
+    python("-c", holder, cwd=tmp_path, status=-signal.SIGKILL)
+    simulation = lv.Simulation("stack")
+    assert len(simulation.record(tmp_path, 2)) == 2
+    assert len(simulation.record(tmp_path, 2)) == 2  # which goes on
+    with pytest.raises(lv.InputError, match="holds 4 problem files"):
+        lv.Simulation("stack").record(tmp_path, 2)

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -20,6 +21,7 @@ else:
 
 import lavender
 import lavender_ext
+from lavender.io.stored import write_atomically
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
@@ -312,3 +314,47 @@ def test_debug_build_differs_in_checks_alone():
     assert differ == {"boundscheck", "initializedcheck"}
     assert "-ffp-contract=off" in COMPILE_FLAGS
     assert not any("march" in flag or "fast-math" in flag for flag in COMPILE_FLAGS)
+
+
+def test_what_is_being_written_is_in_no_distribution(tmp_path):
+    # The names that both writers use, beside files of the package.
+    names = []
+    write_atomically(tmp_path / "a.c", lambda part: part.write_text(names.append(part.name) or ""))
+    code = "from pathlib import Path; from lavender.web import compile; Path.write_bytes = lambda *what: print(*what); "
+    done = python(
+        "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.put(Path('a.wasm'), b'')"
+    )
+    names += [done.stdout.split()[0], "a.h", "a.wasm"]
+    for folder in ("lavender/web", "docs"):
+        (tmp_path / folder).mkdir(parents=True)
+        for name in names:
+            (tmp_path / folder / name).write_text("")
+    rules = [
+        line for line in (ROOT / "MANIFEST.in").read_text("utf-8").splitlines() if line and line[0] != "#"
+    ]
+    code = "from setuptools.command.egg_info import FileList; files = FileList(); "
+    code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
+    done = python("-c", code, cwd=tmp_path)
+    assert done.stdout.split() == ["docs/a.h", "docs/a.wasm", "lavender/web/a.h", "lavender/web/a.wasm"]
+
+
+def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_path):
+    for folder in ("lavender", "lavender_ext"):
+        (tmp_path / folder).symlink_to(ROOT / folder)
+    for name in ("setup.py", "pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, tmp_path)
+    stamp = tmp_path / "build" / "cython" / "how.json"
+    stamp.parent.mkdir(parents=True)
+    code = """if True:
+        import os, signal, runpy, sys
+        import Cython.Build
+
+        def cythonize(*_, **__):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+        Cython.Build.cythonize = cythonize
+        sys.argv = ["setup.py", "-q", "build_ext"]
+        runpy.run_path("setup.py", run_name="__main__")"""
+    stamp.write_text("as it is asked for now")
+    python("-c", code, cwd=tmp_path, status=-signal.SIGKILL)
+    assert not stamp.exists()
