@@ -10,7 +10,6 @@ that fills in less; see `lavender_ext/core/generalized.pxd`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from lavender._arrays import (
     read_only,
     words_for,
 )
+from lavender._derived import cached_property
 from lavender._later import issparse
 from lavender._later import sparse as sp
 from lavender.errors import InputError

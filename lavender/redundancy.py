@@ -13,13 +13,13 @@ known, what is new in J alone counts, too: beside a body that is 1e13 times heav
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lavender._arrays import FloatArray, IntArray, number
+from lavender._derived import cached_property
 from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import Cones

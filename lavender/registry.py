@@ -19,10 +19,11 @@ import importlib.util
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache, cached_property
+from functools import cache
 from typing import Any, Protocol
 
 from lavender._arrays import FloatArray
+from lavender._derived import cached_property
 from lavender.errors import InputError, SolverUnavailable, UnknownName
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.solution import Claim

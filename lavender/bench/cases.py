@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender._arrays import FloatArray
+from lavender._derived import cached_property
 from lavender.bench.record import CaseInfo, file_name, printable
 from lavender.cones import ROW
 from lavender.errors import InputError

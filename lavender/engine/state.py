@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from lavender._derived import cached_property
 from lavender.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
 from lavender.errors import InputError
 from lavender.scene import Box, Plane, Scene, Sphere, arithmetic

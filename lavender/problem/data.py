@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from lavender._arrays import (
     whole_number,
     words_for,
 )
-from lavender._derived import Derived
+from lavender._derived import Derived, cached_property
 from lavender._later import issparse
 from lavender.cones import ROUND, ROW, Cones
 from lavender.errors import InputError

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
-from lavender._derived import once
+from lavender._derived import cached_property, once
 from lavender._later import issparse
 from lavender._later import sparse as sp
 from lavender.errors import CapabilityError, InputError

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
+from lavender._derived import cached_property
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 
 import numpy as np
 
 from lavender._arrays import FloatArray, IntArray
+from lavender._derived import cached_property
 from lavender.certificates import check_certificate
 from lavender.deadline import Deadline
 from lavender.problem import Problem

@@ -8,11 +8,11 @@ formed       entries of A that a method forms first, of a problem given by J and
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from lavender._derived import cached_property
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.solvers import weights

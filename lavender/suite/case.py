@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, ParamSpec
 
 from lavender._arrays import FloatArray, number
+from lavender._derived import cached_property
 from lavender.errors import InputError, UnknownName
 from lavender.problem import Problem
 
@@ -42,7 +43,7 @@ class Case:
     expect: str = ""  # what is expected of whom
     solve_reference: Callable[[], Reference] | None = field(default=None, repr=False)
 
-    @functools.cached_property
+    @cached_property
     def reference(self) -> Reference | None:
         """What the solution is known to be, or None where only the judge can say."""
         return None if self.solve_reference is None else self.solve_reference()

@@ -1,5 +1,8 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
+import ast
+import dataclasses
+import os
 import sys
 import sysconfig
 import threading
@@ -9,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from random_problems import FORMS, random_contact_problem, random_lcp
-from worked import python
+from worked import python, syntax_of_package
 
 import lavender as lv
 import lavender_ext
@@ -119,3 +122,64 @@ def test_threads_prepare_each_their_own(often):
     alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
     for found in at_once(lambda: lv.prepare(problem, "block_gauss_seidel").solve(max_iter=50)):
         np.testing.assert_array_equal(found.impulse, alone.impulse)
+
+
+def test_what_is_worked_out_of_one_object_waits_for_none_of_another():
+    inside, leave, quick = threading.Event(), threading.Event(), threading.Event()
+
+    def reference():
+        inside.set()
+        assert leave.wait(600)
+
+    case = lv.suite.case("stack(n=2)")
+    first, second = (dataclasses.replace(case, solve_reference=f) for f in (reference, quick.set))
+    with ThreadPoolExecutor(2) as pool:
+        waiting = pool.submit(lambda: first.reference)
+        try:
+            assert inside.wait(600)
+            pool.submit(lambda: second.reference)
+            assert quick.wait(30)  # it may come at any time, and never does where it waits for the first
+        finally:
+            leave.set()
+        assert waiting.result() is None
+
+
+def test_no_object_has_a_property_of_functools():
+    found = [
+        f"{path.name}:{node.lineno}"
+        for path, tree in syntax_of_package().items()
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.ImportFrom) and node.module == "functools")
+        for name in node.names
+        if name.name == "cached_property"
+    ]
+    assert found == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
+def test_a_process_forked_while_a_thread_works_solves_the_same_problem():
+    script = """if True:
+        import os, signal, threading
+        import numpy as np
+        import lavender as lv
+
+        problem = lv.Problem.contact(np.eye(6), [-1.0, 0.5, 0.0] * 2, 0.5)
+        held, leave = threading.Event(), threading.Event()
+
+        def work():
+            with problem.derived.lock:
+                held.set()
+                leave.wait(600)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        held.wait(600)
+        child = os.fork()
+        if not child:
+            signal.alarm(60)  # of a child that waits for ever
+            os._exit(not lv.prepare(problem, "pgs").solve(tol=1e-6).success)
+        status = os.waitpid(child, 0)[1]
+        leave.set()
+        thread.join()
+        assert status == 0, status"""
+    python("-W", "ignore::DeprecationWarning", "-c", script)
