@@ -80,20 +80,42 @@ class Rounding:
 
 @dataclass(frozen=True, eq=False)
 class Residual:
-    """Error of one impulse. `str()` is one line."""
+    """Error of one impulse. `str()` is one line.
 
-    relative: float  # -, max(energy / energy_start, velocity / velocity_start)
-    energy: float  # sqrt J
-    velocity: float  # m/s, of the worst row
-    floor: float  # -, relative residual that rounding to `precision` alone costs
-    worst_row: int  # row of the largest velocity error, -1 for an empty problem
-    energy_start: float  # sqrt J, E of doing nothing (or the norm of b)
-    velocity_start: float  # m/s
-    error: FloatArray = field(repr=False)  # (m,) N s, e
-    slack: FloatArray = field(repr=False)  # (m,) m/s, w
+    Parameters
+    ----------
+    relative : float, -
+        max(energy / energy_start, velocity / velocity_start).
+    energy, energy_start : float, sqrt J
+        E of the impulse, and of doing nothing (or the norm of b).
+    velocity, velocity_start : float, m/s
+        V of the impulse, which is that of its worst row, and of doing nothing.
+    floor : float, -
+        Relative residual that rounding to `precision` alone costs.
+    worst_row : int
+        Row of the largest velocity error, -1 for an empty problem; `worst_name` is its name.
+    error : (m,) N s
+        e of each row; `velocity_by_row` has it in m/s.
+    slack : (m,) m/s
+        w of each row.
+    precision : {"float64", "float32"}
+        In which the answer was made.
+    rounding : Rounding or None
+        In float32: the parts of the floor.
+    """
+
+    relative: float
+    energy: float
+    velocity: float
+    floor: float
+    worst_row: int
+    energy_start: float
+    velocity_start: float
+    error: FloatArray = field(repr=False)
+    slack: FloatArray = field(repr=False)
     _problem: Problem = field(repr=False)
-    precision: str = "float64"  # in which the answer was made
-    rounding: Rounding | None = None  # in float32: the parts of the floor
+    precision: str = "float64"
+    rounding: Rounding | None = None
 
     @property
     def at_floor(self) -> bool:

@@ -254,7 +254,7 @@ class Solution:
             "worst row": f"{self.residual.worst_name}, {self.residual.velocity:.2g} m/s",
             "floor of float64": f"{self.residual.floor:.1e}",
             "work": self._done,
-            "time": f"{1e3 * (self.setup_time + self.solve_time):.3g} ms",
+            "time": self._took,
         }
         if self.contradicted:
             facts["contradicted"] = self.contradicted
@@ -267,12 +267,17 @@ class Solution:
     def _done(self) -> str:
         return ", ".join(counted(n, k) for k, n in (self.work or {"iterations": self.iterations}).items())
 
+    @property
+    def _took(self) -> str:
+        t = self.setup_time + self.solve_time
+        return f"{1e3 * t:.3g} ms" if t < 0.9995 else f"{t:.3g} s"
+
     def __str__(self) -> str:
         note = f"; {self.message}" if self.message else ""
         wrong = f"; CONTRADICTED: {self.contradicted}" if self.contradicted else ""
         return (
             f"{self.solver.name}: {self.status.name}, {self.residual}, {self._done}, "
-            f"{1e3 * (self.setup_time + self.solve_time):.3g} ms{note}{wrong}"
+            f"{self._took}{note}{wrong}"
         )
 
 

@@ -172,7 +172,11 @@ class Prepared:
         _check_problem(problem, spec)
         for name in options:
             if name not in spec.accepts:
-                if name in ("order", "ground", "seed", "threads") or name in FRONT_DOOR:
+                if name in FRONT_DOOR:
+                    raise CapabilityError(
+                        f"prepare does not take {name}=: give it to the solve of what it returns"
+                    )
+                if name in ("order", "ground", "seed", "threads"):
                     raise CapabilityError(
                         f"solver {spec.name!r} does not take {name}=; it takes: "
                         f"{', '.join(sorted(spec.accepts)) or 'no options'}"

@@ -51,15 +51,11 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
 
 def _print_idle(report: Report, console: Console) -> None:
     still = idle(report.every)
-    for case in still[:SHORT]:
-        console.print(
-            f"nothing to do: {case.case}; at worst {residual(case.velocity)} m/s by {case.solver or 'nobody'}",
-            highlight=False,
-            markup=False,
-            style="dim",
-        )
-    if len(still) > SHORT:
-        console.print(f"and {len(still) - SHORT} more with nothing to do", highlight=False, style="dim")
+    if still:
+        worst = max(still, key=lambda case: case.velocity)
+        said = f"{count(len(still), 'case')} with nothing to do; at worst {residual(worst.velocity)} m/s, by "
+        said += f"{worst.solver or 'nobody'} on {worst.case}"
+        console.print(said, highlight=False, markup=False, style="dim")
 
 
 def _print_lost(records: Records, console: Console) -> None:
