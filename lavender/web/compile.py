@@ -225,8 +225,11 @@ def build_library(out: Path, source: Path, names: Iterable[str]) -> None:
 
 
 def _run(command: list[str], folder: Path) -> None:
+    env = dict(os.environ)
+    if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # where zig keeps libraries
+        env.setdefault("ZIG_GLOBAL_CACHE_DIR", str(folder / "cache"))
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
     except OSError as error:
         raise BuildFailed(f"{command[0]} cannot be run: {error.strerror or error}") from None
     if done.returncode:

@@ -1,6 +1,7 @@
 """lavender.h through ctypes: structs field by field, problems of the package as problems of the library."""
 
 import ctypes as ct
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -125,3 +126,10 @@ class Solver:
         if code:
             raise Refused(self.library, code)
         return out
+
+
+def run(*command, **more):
+    """What a command prints; it has to succeed."""
+    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **more)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout

@@ -1,11 +1,10 @@
 """The library written and compiled once; everything here skips, with the reason, without Cython or a compiler."""
 
 import shutil
-import subprocess
 from importlib.util import find_spec
 
 import pytest
-from clib import Library
+from clib import Library, run
 
 from lavender import export
 from lavender.errors import LavenderError
@@ -42,9 +41,3 @@ def shared(folder, compiler):
 @pytest.fixture(scope="session")
 def library(shared):
     return Library(shared)
-
-
-def run(*command, **more):
-    done = subprocess.run([str(c) for c in command], capture_output=True, text=True, check=False, **more)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout

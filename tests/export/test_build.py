@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import random_problems as rp
+from clib import run
 from click.testing import CliRunner
-from conftest import run
 from tower import self_test_problem
 
 import lavender as lv

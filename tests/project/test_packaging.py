@@ -36,10 +36,10 @@ def test_version_is_the_installed_one_and_in_the_changelog():
 def test_what_is_not_built_says_what_to_do(tmp_path):
     # A fresh clone hides an installed lavender from whoever starts Python in it. Without site-packages (-S), since
     # an editable installation finds its kernels even so.
-    shutil.copytree(KERNELS, tmp_path / "lavender_ext", ignore=shutil.ignore_patterns("*.so", "*.pyd"))
-    shutil.copytree(
-        Path(lavender.__file__).parent, tmp_path / "lavender", ignore=shutil.ignore_patterns("*.wasm")
-    )
+    # Other tests may be writing modules and byte code meanwhile.
+    rest = shutil.ignore_patterns("*.so", "*.pyd", "*.wasm", "*.part", "__pycache__")
+    for folder in (KERNELS, Path(lavender.__file__).parent):
+        shutil.copytree(folder, tmp_path / folder.name, ignore=rest)
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = python("-S", "-c", "import lavender", status=1, cwd=tmp_path, env=env)
     last = done.stderr.strip().splitlines()[-1]

@@ -84,6 +84,16 @@ def test_tests_take_public_names_only():
     assert found == [], f"take a public way, or make public:\n{chr(10).join(found)}"
 
 
+def test_no_test_imports_a_conftest():
+    """There are several, and which one Python finds first is a matter of the folders that pytest is given."""
+    tests = Path(__file__).resolve().parent.parent
+    texts = {path: path.read_text(encoding="utf-8") for path in tests.rglob("*.py")}
+    found = [
+        path.name for path, text in texts.items() if re.search(r"^\s*(from|import) conftest\b", text, re.M)
+    ]
+    assert found == []
+
+
 def test_a_private_name_is_seen():
     source = """
 from lavender.solvers._plan import plan
