@@ -109,29 +109,22 @@ class QPResidual:
         return max(self.primal, self.dual, self.gap, self.sign)
 
 
-def qp_residual(problem: Problem, impulse: ArrayLike, multiplier: ArrayLike | None = None) -> QPResidual:
+def qp_residual(problem: Problem, impulse: ArrayLike, multiplier: ArrayLike) -> QPResidual:
     """Primal, dual and gap residuals with multiplier signs checked.
 
     Parameters
     ----------
     impulse : (m,) N s
-    multiplier : (m,) m/s, optional
+    multiplier : (m,) m/s
         z with A l - b + z = 0: positive part for the upper bound, negative for the lower (the sign of
-        qpsolvers' `z_box`). Default: the slack, z = -(A l - b), where the bound is within 1e-9 of its
-        range or of |l|.
+        qpsolvers' `z_box`).
     """
     if problem.law not in ("linear", "lcp"):
         raise InputError(f"qp_residual is for bounded rows; this problem is {problem.law!r}")
     lam = problem.impulse_array(impulse)
     w = problem.slack(lam)
     c = problem.cones
-    scale = np.maximum(np.abs(lam).max(initial=0.0), 1e-300)
-    if multiplier is None:
-        at_low = lam - c.lower <= 1e-9 * scale
-        at_high = c.upper - lam <= 1e-9 * scale
-        z = np.where(at_low, np.minimum(-w, 0.0), 0.0) + np.where(at_high, np.maximum(-w, 0.0), 0.0)
-    else:
-        z = problem.impulse_array(multiplier, "multiplier")
+    z = problem.impulse_array(multiplier, "multiplier")
     up, down = np.maximum(z, 0.0), np.maximum(-z, 0.0)
     bound = up @ np.where(np.isfinite(c.upper), c.upper, 0.0) - down @ np.where(
         np.isfinite(c.lower), c.lower, 0.0

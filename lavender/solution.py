@@ -72,9 +72,6 @@ class History:
     energy: FloatArray  # sqrt J
     velocity: FloatArray  # m/s
 
-    def __len__(self) -> int:
-        return len(self.iterations)
-
     def plot(self, against: str = "iterations") -> Any:
         """The relative residual on the way, as a figure of matplotlib.
 

@@ -163,11 +163,6 @@ class Stepping:
             self._last = self._told(self._last)
         return self._last
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the engine's arrays."""
-        return self.state.nbytes
-
     @alone
     def set_solver_iterations(self, n: int) -> None:
         """Budget from the next step on.
