@@ -16,7 +16,7 @@ from benchmarks.auto.regret import SHIFT
 from lavender import registry
 from lavender.solution import Claim, Status
 from lavender.solvers.costs import METHODS, Costs, candidates
-from lavender.solvers.methods import FIRST, Candidate, first_turn
+from lavender.solvers.methods import FIRST, Candidate
 from lavender.solvers.schedule import race
 from lavender.solvers.structure import Structure
 from lavender_ext.small.checked_sweeps import sweeps_left
@@ -104,7 +104,6 @@ def replayed(
         curve = curves.get("newton over velocities" if over else name)
         if curve is not None and curve.points:
             found.append(Replayed(name, log, costs, curve, level))
-    first_turn(found)
     race(list(found), lambda: log.solved)
     return log.seconds if log.solved else math.inf
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from hashlib import sha256
-from math import inf, log10
+from math import inf
 from typing import Any
 
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.solvers.structure import Structure
-from lavender.solvers.weights import READ, law_of, of_law, rates
+from lavender.solvers.weights import READ, decades, law_of, of_law, rates
 
 __all__ = ["METHODS", "READ", "TABLE", "Cost", "Costs", "Plan", "candidates", "made", "rates", "structure_of"]
 
@@ -39,6 +39,7 @@ _GIVEN = {
     "lcp": ("anderson", "direct", "newton", "nncg"),
     "cone": ("anderson", "newton"),
     "coulomb": ("anderson", "newton", "admm", "nncg"),
+    "round": ("nncg", "admm"),
 }
 #: At most four for each law and operator; "round": cones of more than two tangents.
 TABLE: dict[str, dict[str, tuple[str, ...]]] = {
@@ -54,7 +55,6 @@ TABLE: dict[str, dict[str, tuple[str, ...]]] = {
     },
 }
 BOTH_WAYS = 2.0  # sweeps of an iteration in the symmetric order
-SIXTH = 6.0  # decades that counts of sweeps are fitted for
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ class Costs:
         self.rates = rates() if given is None else given
         self.planned = {} if plan is None else dict(plan.candidates)
         self.law = law_of(problem)
-        self.decades = -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
+        self.decades = decades(tol)
 
     @property
     def sure(self) -> float:
@@ -203,11 +203,8 @@ class Costs:
         """ns that a method which factors takes at least, told by rows alone; inf for sweeps, which take any time."""
         r, law, m = self.rates, self.law, self.structure.m
         if name == "newton" and self.problem.generalized is not None:
-            v, half = (
-                r["velocities"],
-                0.5 if law == "linear" else 1.0,
-            )  # of the steps, where all rows are soft
-            n = half * of_law(v["count"], law)
+            v = r["velocities"]
+            n = of_law(v["count"], law)
             return float(n * v["step"] + (READ + n) * v["entry"] * self.structure.sweep)
         if name in ("direct", "newton", "newton over rows"):
             part = r["direct" if name == "direct" else "newton"]
@@ -270,7 +267,7 @@ def candidates(structure: Structure) -> tuple[str, ...]:
     """Names of the table that take a problem, in its order."""
     problem = structure.problem
     if problem.cones.has_round:
-        return TABLE["generalized"]["round"]
+        return TABLE[problem.operator]["round"]
     if problem.cones.has_rolling:
         return ROLLING
     names = TABLE[problem.operator][problem.law]
@@ -289,6 +286,6 @@ def made(problem: Problem, tol: float) -> Plan:
     counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
-        small=costs.structure.is_small, first=(chosen.name, chosen.steps(chosen.rest)),
+        small=costs.structure.is_small(tol), first=(chosen.name, chosen.steps(chosen.rest)),
         candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
     )  # fmt: skip

@@ -394,29 +394,16 @@ def make(
         made = kind(name, log, costs, spec)
         if made.rest < np.inf:
             found.append(made)
-    first_turn(found, planned)
+    if planned is not None:
+        first_turn(found, planned)
     return found
 
 
-def first_turn(found: list[Candidate], planned: tuple[str, int] | None = None) -> None:
-    """Settle who goes first, whatever it costs: what is planned, or Newton's method on few rows over velocities.
-
-    `planned`: who has the first turn, and for how many iterations.
-    """
-    if planned is not None:
-        for candidate in found:
-            candidate.counted = True
-            if candidate.name == planned[0]:
-                cost = candidate.cost
-                candidate.rest = min(
-                    cost.total, cost.setup + planned[1] * cost.each, *(c.rest for c in found)
-                )
-        found.sort(key=lambda candidate: candidate.name != planned[0])
-    elif (
-        found
-        and isinstance(found[0], Newton)
-        and found[0].over_velocities
-        and found[0].costs.structure.goes_first
-    ):
-        found[0].count()
-        found[0].rest = min(c.rest for c in found)
+def first_turn(found: list[Candidate], planned: tuple[str, int]) -> None:
+    """Who is planned to go first does, whatever it costs; `planned`: who, and for how many iterations."""
+    for candidate in found:
+        candidate.counted = True
+        if candidate.name == planned[0]:
+            cost = candidate.cost
+            candidate.rest = min(cost.total, cost.setup + planned[1] * cost.each, *(c.rest for c in found))
+    found.sort(key=lambda candidate: candidate.name != planned[0])

@@ -1,9 +1,9 @@
 """Small problems in one compiled call, and the claim that goes with its counts.
 
 It is used for few rows of bodies or of A and for small islands under friction (`lavender_ext/small/call.pyx`), and
-for generalised coordinates if Newton's method is counted to cost little (`lavender_ext/small/many.pyx`), because
-Python would cost more than such a solve. If the call does not find a solution it returns nothing, and the solver runs
-as on any other problem, from the beginning.
+for generalised coordinates if Newton's method is counted to cost no more than others (`lavender_ext/small/many.pyx`),
+because Python would cost more than such a solve. If the call does not find a solution it returns nothing, and the
+solver runs as on any other problem, from the beginning.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from math import nan
+from math import inf, nan
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,8 @@ from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn, counted
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
-from lavender.solvers.weights import READ, of_law, rates, sweep_cost
+from lavender.solvers.sweeping import reads_whitened
+from lavender.solvers.weights import READ, SIXTH, decades, of_law, rates, sweep_cost
 from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first
 
@@ -32,11 +33,7 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 ISLAND = 150
 SWEPT = 32  # the most sweeps of a part before its first factorisation
 FACTORED = 0.05  # ns per multiply-add of the factorisations of parts
-# Counted cost [ns] of Newton's method over generalised velocities up to which `auto` tries it first (less where others
-# often converge sooner: sweeps under Coulomb's law; on bounded rows `direct`, since steps take up to three times their
-# count); and MOST, up to which the clock is not read in between.
-AT_ONCE = {"linear": 1e6, "lcp": 1e6, "cone": 4e6, "coulomb": 5e5}
-MOST = 1e7
+MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
 def velocities_cost(problem: Problem, largest: int) -> float:
@@ -47,11 +44,29 @@ def velocities_cost(problem: Problem, largest: int) -> float:
     return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
 
 
-def limits(most: Mapping[str, float]) -> Limits:
-    """Limits of the compiled call: the most counted cost [ns] by law."""
-    v, laws = rates()["velocities"], ("lcp", "coulomb", "cone")
-    count, cost = (of_law(v["count"], law) for law in laws), (most[law] for law in laws)
-    return Limits(np.array([v["step"], v["entry"], v["work"], READ, *count, *cost, general.ROOM]))
+def others_cost(problem: Problem, tol: float) -> float:
+    """The least of what sweeps cost and, on bounded rows, exchanges at least [ns]; of the compiled call as well."""
+    r, m, data = rates(), problem.m, problem.metric
+    a, d = r["anderson"], r["direct"]
+    each = a["row"] * m + of_law(a["work"], problem.law) * data.work
+    sweeps = float(a["start"] + decades(tol) * a["count"] * each)
+    if problem.law not in ("linear", "lcp"):
+        return sweeps
+    formed = data.entries_of_a if reads_whitened(problem) else 0.0
+    return min(sweeps, float(d["start"] + d["count"] * d["row"] * m + r["formed"] * formed))
+
+
+def limits(most: float, rows: float = inf) -> Limits:
+    """Limits of the compiled call: the most counted cost [ns], and of more than `rows` rows no more than others'."""
+    r = rates()
+    v, a, d = r["velocities"], r["anderson"], r["direct"]
+    count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
+    work = (of_law(a["work"], law) for law in ("coulomb", "cone"))
+    others = [a["start"], a["row"], *work, a["count"], SIXTH]
+    exchanges = [d["start"], d["count"] * d["row"], r["formed"]]
+    return Limits(np.array([
+        v["step"], v["entry"], v["work"], READ, *count, general.ROOM, most, rows, *others, *exchanges,
+    ]))  # fmt: skip
 
 
 def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
@@ -230,6 +245,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(AT_ONCE), True, True)
+AUTO = SmallCall("auto", limits(MOST, SMALL_ROWS), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", limits(dict.fromkeys(AT_ONCE, MOST)), False)
+NEWTON = SmallCall("newton", limits(MOST), False)

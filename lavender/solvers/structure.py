@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lavender._derived import cached_property
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
@@ -20,16 +18,15 @@ from lavender.solvers._accelerated import sweep_work
 from lavender.solvers._factor import PanelsLU, choose, filled_cost, panels_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.small import AT_ONCE, prepared, velocities_cost
+from lavender.solvers.small import MOST, others_cost, prepared, velocities_cost
 from lavender.solvers.sweeping import reads_whitened
 from lavender_ext.core import assemble
 from lavender_ext.factor import graph
 
 __all__ = ["Structure"]
 
-TREE = 1.05  # neighbours of a body, in the mean, up to which bodies form trees
+THIN = 3.0  # entries in a row of a factor, at least
 FILL = 6.0  # entries of a factor for each of A, at most
-SOFT = 1e-6  # of d: where all free rows have so much compliance of their own one step over velocities is the last
 
 
 class Structure:
@@ -87,8 +84,7 @@ class Structure:
         """What one factor of A costs at least."""
         if self.problem.matrix is not None:
             return self.direct
-        width = max(3.0, self._width(self.m))
-        return min(weights.BAND * self.m * width**2, weights.dense_factor(self.m))
+        return min(weights.BAND * self.m * THIN**2, weights.dense_factor(self.m))
 
     @cached_property
     def direct(self) -> float:
@@ -96,7 +92,8 @@ class Structure:
         p, m = self.problem, self.m
         dense = weights.dense_factor(m)
         if p.rows is not None and p.rows.n_bodies:
-            return min(dense, weights.BAND * m * self._body_band() ** 2, self._sparse(self.entries))
+            band = float(graph.body_spread(p.cones.ptr, p.rows.block_bodies, p.rows.n_bodies) + 1)
+            return min(dense, weights.BAND * m * band**2, self._sparse(self.entries))
         if p.generalized is not None and p.law != "linear":
             return min(dense, self._sparse(self.entries))
         form, band, _ = choose(p) if p.is_symmetric else ("general", max(p.bandwidth), None)
@@ -106,17 +103,6 @@ class Structure:
         if form == "sparse" or (form == "general" and p.law == "linear" and PanelsLU.takes(p)):
             return min(dense, self._sparse(nnz))
         return min(dense, weights.sparse_factor(int(nnz), m))
-
-    def _body_band(self) -> float:
-        """Of A in the order of blocks, or of a tree."""
-        p = self.problem
-        assert p.rows is not None
-        bodies, n = p.rows.block_bodies, p.rows.n_bodies
-        width = float(graph.body_spread(p.cones.ptr, bodies, n) + 1)
-        if self._loops <= TREE:
-            of = np.repeat(bodies, np.diff(p.cones.ptr), axis=0)
-            width = min(width, 2.0 * float(np.bincount(of[of >= 0], minlength=1).max()))
-        return width
 
     def _sparse(self, entries: float) -> float:
         """A sparse symmetric factor of so many entries.
@@ -153,15 +139,6 @@ class Structure:
         entries = self.m if p.matrix is None else self.entries
         return min(weights.row_factor(self.m, entries), weights.dense_factor(self.m))
 
-    def _width(self, n: int) -> float:
-        """Neighbours that elimination leaves each of n unknowns, at a guess: none in a tree, as in a plane else."""
-        return 0.5 * float(np.sqrt(n)) * self._loops if self._loops > TREE else 0.0
-
-    @cached_property
-    def _loops(self) -> float:
-        """The same, at least 1."""
-        return max(1.0, self._pairs)
-
     @cached_property
     def _pairs(self) -> float:
         """Pairs of bodies with a block between them, for each body: 1 in a chain, 2 or 3 in a lattice."""
@@ -177,20 +154,13 @@ class Structure:
         """Newton's method over them with its memory; None if the problem is too large for it."""
         return None if self.problem.generalized is None else general.prepare(self.problem)
 
-    @cached_property
-    def goes_first(self) -> bool:
-        """The compiled call does the same."""
-        kernel = self.kernel
-        return (
-            kernel is not None and velocities_cost(self.problem, kernel.largest) <= AT_ONCE[self.problem.law]
-        )
-
-    @property
-    def is_small(self) -> bool:
+    def is_small(self, tol: float) -> bool:
         """One compiled call is tried before all else."""
-        if self.problem.generalized is not None:
-            return self.goes_first
-        return self.m <= SMALL_ROWS or prepared(self.problem) is not None
+        p, kernel = self.problem, self.kernel
+        if p.generalized is not None:
+            most = MOST if self.m <= SMALL_ROWS else min(MOST, others_cost(p, tol))
+            return kernel is not None and velocities_cost(p, kernel.largest) <= most
+        return self.m <= SMALL_ROWS or prepared(p) is not None
 
     @cached_property
     def velocities(self) -> float:
@@ -203,9 +173,7 @@ class Structure:
         """What it reads beside its factor: a sweep's multiply-adds, of one of the islands."""
         return self.sweep / max(1, self.kernel.islands)
 
-    @cached_property
+    @property
     def steps(self) -> float:
-        """Steps for each that one island takes; free rows that are all soft need no proximal term, so half."""
-        p, islands = self.problem, float(max(1, self.kernel.islands))
-        assert p.compliance is not None
-        return 0.5 * islands if p.law == "linear" and np.all(p.compliance >= SOFT * p.d) else islands
+        """Steps for each that one island takes."""
+        return float(max(1, self.kernel.islands))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from math import log10
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ SPARSE_ROWS = 1000.0  # as many times more as it has thousands of rows: fill gro
 # pattern, and each multiply-add.
 FILLED, FILLED_ENTRY, FILLED_WORK = 50e3, 6.0, 0.12
 
+SIXTH = 6.0  # decades that counts of sweeps are fitted for
 READ = 4.0  # times that what steps over velocities read is read before the first (fitted to curves: 3.6)
 FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its entries
 
@@ -36,6 +38,11 @@ def rates() -> dict[str, Any]:
     """Of `rates.json`, read once."""
     found: dict[str, Any] = json.loads(RATES.read_text(encoding="utf-8"))
     return found
+
+
+def decades(tol: float) -> float:
+    """Sweeps to `tol`, relative to those that are fitted."""
+    return -log10(min(max(tol, 1e-16), 0.1)) / SIXTH
 
 
 def law_of(problem: Problem) -> str:

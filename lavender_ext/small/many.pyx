@@ -6,6 +6,7 @@ to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
+from libc.math cimport log10
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
@@ -39,10 +40,18 @@ cdef struct limits_t:           # as `velocities_cost` of lavender/solvers/small
     double bounded              # iterations by law
     double coulomb
     double cone
-    double most_bounded         # what all may cost to be asked at all, by law
-    double most_coulomb
-    double most_cone
     double values               # of one island's N
+    double most                 # what all may cost to be asked at all; and of more than
+    double rows                 # rows no more than the others, `others_cost`:
+    double start                # sweeps, each row and, in its friction's law, multiply-add of one, their number for
+    double row                  # `decades` decades;
+    double swept
+    double swept_cone
+    double sweeps
+    double decades
+    double exchanges            # on bounded rows what exchanges take at least: once, each row, and entry of A formed
+    double exchanged
+    double formed
 
 
 cdef struct job_t:
@@ -66,14 +75,30 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
 
 
-cdef inline bint is_cheap(const job_t* j, const limits_t* limits, double largest) noexcept nogil:
-    cdef double flops = j.g.n * (largest * largest) / 6.0, count = limits.bounded, most = limits.most_bounded
+cdef inline double others_cost(const job_t* j, const limits_t* l, double tol, double sweep, double* w) noexcept nogil:
+    """What others cost; w (n) is scratch."""
+    cdef double m = j.p.n_rows, swept = l.swept, least, least_exchanges, entries
+    if has_friction(&j.p) and j.p.law != COULOMB:
+        swept = l.swept_cone
+    least = l.start - log10(min(max(tol, 1e-16), 0.1)) / l.decades * l.sweeps * (l.row * m + swept * sweep)
+    if has_friction(&j.p):
+        return least
+    least_exchanges = l.exchanges + l.exchanged * m
+    entries = entries_of(&j.g, w)
+    if sweep - 4.0 * m < entries:                       # else sweeps form A as well
+        least_exchanges += l.formed * entries
+    return min(least, least_exchanges)
+
+
+cdef inline bint is_cheap(const job_t* j, const limits_t* l, double tol, double largest, double* w) noexcept nogil:
+    cdef double flops = j.g.n * (largest * largest) / 6.0, count = l.bounded
     cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
     if has_friction(&j.p):
-        count, most = limits.cone, limits.most_cone
+        count = l.cone
         if j.p.law == COULOMB:
-            count, most, flops = limits.coulomb, limits.most_coulomb, 2.0 * flops
-    return limits.entry * limits.read * sweep + count * (limits.step + limits.entry * sweep + limits.work * flops) <= most
+            count, flops = l.coulomb, 2.0 * flops
+    cdef double cost = l.entry * l.read * sweep + count * (l.step + l.entry * sweep + l.work * flops)
+    return cost <= l.most and (j.p.n_rows <= l.rows or cost <= others_cost(j, l, tol, sweep, w))
 
 
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
@@ -87,7 +112,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if j.begin[0] < 0.0:
         begin(j, room.real)
     settle(&f, &j.p, &j.g, per, room.index, &need)
-    if need.crowded or need.values > limits.values or not is_cheap(j, limits, need.wide):
+    if need.crowded or need.values > limits.values or not is_cheap(j, limits, tol, need.wide, room.real):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -152,7 +177,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (11,)."""
+    """Of the numbers of a `limits_t` (19,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):

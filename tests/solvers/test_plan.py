@@ -9,7 +9,7 @@ from random_trees import random_general
 
 import benchmarks.drawn  # noqa: F401  # families of the suite
 import lavender as lv
-from lavender import suite
+from lavender import registry, suite
 from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
@@ -143,6 +143,7 @@ def test_cones_that_nobody_of_the_table_takes_are_refused():
     assert {name for name, _ in lv.explain(general).candidates} <= {"newton", "nncg", "admm"}
     matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
     taken = lv.explain(matrix)
+    assert not [name for name, _ in taken.candidates if registry.get(name).refuses(matrix)]
     assert lv.solve(matrix, plan=taken, tol=1e-4).solver.name == "auto"
 
 
