@@ -16,9 +16,11 @@ the rounds are, and rises where one fails.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
+from libc.string cimport memset
 
-from lavender_ext.core.block cimport CONE
+from lavender_ext.core.block cimport CONE, ROW
 from lavender_ext.judge.score cimport relative
+from lavender_ext.newton.cones cimport PARTS, cone_gap, cone_size, gather, has_cone, is_high, is_low
 from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.natural_map cimport z_end
 from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
@@ -27,8 +29,8 @@ from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AU
                                       leave, progress_t, newton_t, polish_t, proximal_t, pursuit_t, relative_at, score,
                                       spent, take, with_products)
 from lavender_ext.newton.steps cimport interior_step
-from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, largest, solve_natural, solve_refined, system_factor,
-                                         system_natural, system_t, system_times)
+from lavender_ext.newton.system cimport (OF_BARRIER, OF_NATURAL, all_finite, largest, solve_natural, solve_refined, system_factor,
+                                         system_natural, system_solve, system_t, system_times)
 
 
 cdef enum:
@@ -40,6 +42,8 @@ cdef enum:
     END = 12                    # factorisations of the rounds that end an interior point of cones
     MEMORY = 6                  # steps that the non-monotone line search looks back
     HALVINGS = 7                # of one step
+    REFINED = 3                 # solves of (4) with one factor
+    RESTS = 4                   # factors of (4) at most, each with fewer elements
     FREE = 20                   # rounds in a row that cost no factorisation, and so change nothing but the weight
     FIRST = 8                   # factorisations of the first stretch from the start
     STRETCH = 12                # factorisations between two checks of what rounds gain
@@ -172,6 +176,65 @@ cdef inline void go_exchange(newton_t* n) noexcept nogil:
 # -- interior points of the convex law ---------------------------------------------------------------------------
 
 
+cdef inline bint ends(const elements_t* e, int32_t i, const double* y) noexcept nogil:
+    """Whether y cannot go on for ever on element i."""
+    cdef int32_t which
+    cdef double x[4]
+    if e.kind[i] == ROW:
+        return (y[e.ptr[i]] < 0.0 and is_low(e, e.ptr[i])) or (y[e.ptr[i]] > 0.0 and is_high(e, e.ptr[i]))
+    for which in range(PARTS):
+        if has_cone(e, i, which):
+            gather(e, i, which, y, x)
+            if cone_gap(x, cone_size(e, i, which)) < 0.0:
+                return True
+    return False
+
+
+cdef inline void rest_on(newton_t* n, int32_t i) noexcept nogil:
+    """`direction` changes nothing on element i."""
+    cdef int32_t k
+    memset(n.direction + n.s.e.ptr[i], 0, (n.s.e.ptr[i + 1] - n.s.e.ptr[i]) * sizeof(double))
+    for k in range(n.s.e.wptr[i], n.s.e.wptr[i + 1]):
+        n.s.v[k] = 0.0
+        if n.s.bt != NULL:
+            n.s.bt[k] = 0.0
+
+
+cdef inline void ask_interior(newton_t* n) noexcept nogil:
+    """Without a solution an interior point walks off inside the cones along what H does not see. A proof, if the caller
+    finds it one, is the y with H y = 0 next to its z in the metric of the cones,
+
+        y <- y - (H + W)^-1 H y,   W z = u                                                                (4)
+
+    with W of its last step, on elements whose z outgrows its dual u; those that y would lead out of their bounds rest.
+    """
+    cdef system_t* s = &n.s
+    cdef const elements_t* e = s.e
+    cdef int32_t i, j, _, resting = 1, left = RESTS
+    if not largest(n.ip.hz, e.m) < 1e-3 * largest(n.ip.z, e.m):
+        return
+    take(n, n.direction, n.ip.z)
+    for i in range(e.n):
+        j = e.ptr[i]
+        if (not fabs(n.ip.z[j]) > fabs(n.ip.u1[j]) or s.v[e.wptr[i]] * 0.0 != 0.0
+                or (e.kind[i] == ROW and is_low(e, j) and is_high(e, j))):
+            rest_on(n, i)
+    while resting and left and not spent(n):
+        left -= 1
+        system_factor(s, OF_BARRIER, 0.0)
+        for _ in range(REFINED):
+            system_times(s, n.direction, n.rest)
+            system_solve(s, OF_BARRIER, n.rest, n.trial)
+            for j in range(e.m):
+                n.direction[j] -= n.trial[j]
+        resting = 0
+        for i in range(e.n):
+            if ends(e, i, n.direction):
+                rest_on(n, i)
+                resting += 1
+    n.asked = resting == 0
+
+
 cdef inline void begin_progress(newton_t* n, double near) noexcept nogil:
     cdef progress_t* k = &n.progress
     k.lowest = 1.0 / 0.0
@@ -196,6 +259,8 @@ cdef inline void end_steps(newton_t* n, bint rounds) noexcept nogil:
     if rounds and not k.rows and k.lowest < close_to() and not done(n) and not at_floor(n):
         begin_rounds(n, 1, k.kept, CONE, 1e-4 if k.lowest > 1e-4 else k.lowest, INNER)
         enter_rounds(n, 1, END)
+    elif not k.rows and k.lowest >= close_to() and not done(n):
+        ask_interior(n)
 
 
 cdef inline void go_interior(newton_t* n) noexcept nogil:

@@ -594,6 +594,48 @@ def test_where_nothing_rubs_the_law_has_no_slip_and_no_rounds(form, seed):
     assert np.array_equal(coulomb.impulse, cone.impulse)
 
 
+def pinched(seed, form, **kind):
+    """Rigid contacts of the cone's law in four pairs, the two sides of one body, b >= 0.1 m/s along both normals."""
+    p = random_contact_problem(seed, "cone", bodies=3, joints=2, contacts=8, **kind)
+    rows, b, first = p.rows, p.b.copy(), p.cones.normal_rows
+    sides = {
+        key: np.repeat(getattr(rows, key)[::2], 2, axis=0)
+        for key in ("normal", "tangent", "arm_a", "arm_b", "contact_body")
+    }
+    sides["normal"][1::2] *= -1.0
+    b[first[1::2]] = np.random.default_rng(seed).uniform(0.1, 1.0, 4) - b[first[::2]]
+    cones = replace(p.cones, mu=0.2 + p.cones.mu)
+    return FORMS[form](replace(p, rows=replace(rows, **sides), b=b, cones=cones, compliance=np.zeros(p.m)))
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("kind", [{"tangents": 2, "spin": False}, {}, {"rolling": True}])
+def test_cones_without_a_solution_are_proven_to_have_none(form, kind):
+    """The way of the interior point is a proof on nearly all: 352 of 360 disks, spinning and rolling contacts."""
+    proven = 0
+    for seed in range(20):
+        problem = pinched(seed, form, **kind)
+        solution = lv.solve(problem, "newton", max_iter=150)
+        assert not solution.success and not solution.contradicted
+        proven += solution.status is lv.Status.INFEASIBLE
+    assert proven >= 18
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(seed=seeds)
+@settings(max_examples=4)
+def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
+    """b = A lambda - w with lambda in the cone and w in its dual: for w.y >= 0 = lambda.A y no y proves anything."""
+    p, rng = pinched(seed, "rows", tangents=2, spin=False), np.random.default_rng(seed)
+    contacts, mu, normal = p.cones.contact_rows, p.cones.mu[p.cones.kind != ROW], p.cones.normal_rows
+    lam, w = np.zeros(p.m), np.zeros(p.m)
+    lam[contacts], w[contacts] = rng.normal(size=(2, contacts.sum()))
+    lam[normal] = rng.uniform(0.0, 2.0, 8) + np.hypot(lam[normal + 1], lam[normal + 2]) / mu
+    w[normal] = rng.uniform(0.0, 2.0, 8) + np.hypot(w[normal + 1], w[normal + 2]) * mu
+    problem = FORMS[form](replace(p, b=p.dense() @ lam - w))
+    assert lv.solve(problem, "newton", max_iter=300).status is not lv.Status.INFEASIBLE
+
+
 @given(seed=seeds)
 @settings(max_examples=4)
 def test_what_rolls_or_rubs_at_one_contact_alone_is_friction(seed):
