@@ -306,7 +306,7 @@ class Newton(Candidate):
             self.solver: Any = self.spec.load()(**METHODS[self.name][1])
             self.state = self.prepare()
             self.impulse = log.impulse.copy()
-        claim: Claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left)
+        claim: Claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         _offer(log, self.impulse)
         return claim
 

@@ -134,15 +134,23 @@ class Newton:
 
     @np.errstate(all="ignore")  # what overflows is judged
     def turn(
-        self, state: NewtonState, impulse: FloatArray, n: int, tol: float, time_limit: float | None = None
+        self,
+        state: NewtonState,
+        impulse: FloatArray,
+        n: int,
+        tol: float,
+        time_limit: float | None = None,
+        left: int | None = None,
     ) -> Claim:
-        """n steps, or a few more, on from the end of the turn before; the first begins at `impulse` (m,), in place.
+        """n steps, or a few more up to `left`, on from the end of the last turn; the first from `impulse` (m,), in place.
 
         Over generalised velocities nothing follows over rows.
         """
         again, state.begun = state.begun, True
         if state.general is None:
-            return self._run_system(state.problem, state.system, impulse, n, tol, time_limit, again, True)
+            return self._run_system(
+                state.problem, state.system, impulse, n, tol, time_limit, again, left or SPEC.max_iter
+            )
         claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, again)
         if claim.status is Status.MAX_ITERATIONS and not state.general.waits:
             return Claim(Status.STALLED, claim.iterations, claim.work)
@@ -186,7 +194,7 @@ class Newton:
         tol: float,
         time_limit: float | None,
         again: bool = False,
-        more: bool = False,
+        more: int | None = None,
     ) -> Claim:
         if system is None:
             system = make_system(problem, "impulse")
@@ -218,7 +226,7 @@ def _turns(
     tol: float,
     time_limit: float | None,
     again: bool = False,
-    more: bool = False,
+    more: int | None = None,
 ) -> tuple[Status, FloatArray | None]:
     """Turns of at most n factorisations on `impulse`, in place, with a look at the clock and at Ctrl-C in between.
 
@@ -230,6 +238,8 @@ def _turns(
     last = max_iter + (solve.factorisations if again else 0)
     if not again:
         solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
+    if more:
+        solve.allow(more)
     try:
         while True:
             before = solve.factorisations

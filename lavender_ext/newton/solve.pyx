@@ -280,6 +280,10 @@ cdef class Solve:
         """The best so far into impulse (rows,)."""
         impulse_of(&self.n, self.n.best_z, &impulse[0])
 
+    def allow(self, int more):
+        """So many factorisations more at most."""
+        self.n.budget = min(self.n.budget, self.n.s.factorisations + more)
+
     def stop(self):
         """There is no time for another factorisation: the next step judges what is there, and ends."""
         self.n.stop = 1

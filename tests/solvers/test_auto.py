@@ -324,3 +324,15 @@ def test_a_budget_that_was_used_up_in_vain_still_asks_for_a_certificate():
     assert found.iterations == 20_000
     assert found.status is lv.Status.INFEASIBLE
     assert found.turns[-1].solver == "linear program"
+
+
+@pytest.mark.parametrize("budget", [1, 2, 3, 5, 10])
+def test_a_turn_of_newton_takes_no_step_more_than_is_left(budget):
+    # A step is two factorisations here, the first of which fails; drawn, and made smaller.
+    a, b = np.diag([-1e-150, -1e150, -np.finfo(float).max, -1e-310]), [0.0, -1e-20, np.finfo(float).max, 1.0]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        start = rng.normal(size=4) * 10.0 ** rng.integers(-3, 4, 4)
+        assert (
+            lv.solve(lv.Problem.linear(a, b), impulse=start, tol=1e-6, max_iter=budget).iterations <= budget
+        )
