@@ -142,7 +142,7 @@ class Newton:
         time_limit: float | None = None,
         left: int | None = None,
     ) -> Claim:
-        """n steps, or a few more up to `left`, on from the end of the last turn; the first from `impulse` (m,), in place.
+        """n steps, or a few more up to `left`, on from where the last turn ended; the first from `impulse` (m,).
 
         Over generalised velocities nothing follows over rows.
         """
