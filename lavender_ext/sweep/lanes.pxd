@@ -1,7 +1,7 @@
 """Two blocks of one kind at once, one in each lane: the update of core/rows.pxd, operation by operation.
 
-A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; and
-spin), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a block of another
+A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; spin;
+rolling), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a block of another
 kind, or of more rows, has the kind ALONE and is updated by it.
 
 A record holds what an update reads, in pairs, one entry for each lane:
@@ -9,14 +9,15 @@ A record holds what an update reads, in pairs, one entry for each lane:
     header      places of both bodies in v [bytes], where read, where written; a number of its owner's; kind and size
     impulses    n
     contact     normal 3, arms 3 and 3, inverse masses 2; of each row compliance, b, step, swing 6;
-                with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2; of a box mu_2, A_t2t1
+                with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2; of a box mu_2, A_t2t1;
+                with rolling mu_r
     joint       of each row compliance, b, step, lower, upper, J 12, M^-1 J^T 12
 
 Where a block has no partner both lanes hold it, and what the second computes is written where nobody reads.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_SPIN, blocks_t, relax_tangents
+from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, relax_tangents
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
                                       not_below_zero, pair_t, scatter_six)
@@ -28,9 +29,11 @@ cdef enum:                      # kinds
     SQUARE = 2                  # a box
     DISK = 3
     SPIN = 4
-    JOINT = 5                   # + 4 (rows - 1) + 2 where a moves + 1 where b does
+    ROLL = 5
+    ROLL_SPIN = 6
+    JOINT = 7                   # + 4 (rows - 1) + 2 where a moves + 1 where b does
     MOST_ROWS = 6
-    KINDS = 29
+    KINDS = 31
 
 cdef enum:                      # int64 in the header, one of each lane
     P_READ = 0                  # a, b; of a block alone its number
@@ -63,12 +66,18 @@ cdef struct spin_t:
     pair_t header
 cdef struct square_t:
     pair_t header
+cdef struct roll_t:
+    pair_t header
+cdef struct roll_spin_t:
+    pair_t header
 
 ctypedef fused contact_t:
     normal_t
     disk_t
     spin_t
     square_t
+    roll_t
+    roll_spin_t
 
 
 cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexcept nogil:
@@ -81,6 +90,8 @@ cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexc
         return SQUARE
     if p.kind[i] == CONTACT and (n == NORMAL or n == DISK) or p.kind[i] == CONTACT_SPIN and n == SPIN:
         return n
+    if p.kind[i] == CONTACT_ROLLING:
+        return n                                        # ROLL, or ROLL_SPIN
     return ALONE
 
 
@@ -94,7 +105,8 @@ cdef inline int32_t record_size(int32_t kind) noexcept nogil:
     if kind >= JOINT:
         return HEADER + (1 + J_ROW_SIZE) * n
     return HEADER + (0 if kind == ALONE else n + C_ROW + C_ROW_SIZE * n
-                     + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN else 0) + (B_SIZE if kind == SQUARE else 0))
+                     + (T_SIZE if n > 1 else 0) + (S_SIZE if n == SPIN or n == ROLL_SPIN else 0)
+                     + (B_SIZE if kind == SQUARE else 0) + (n >= ROLL))
 
 
 cdef inline const int32_t* bodies_of(const rows_t* r, int32_t i) noexcept nogil:
@@ -137,16 +149,20 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     put(out + 3, 3, t2, t2 + 3)
     out[T_MU] = gather(p.mu + i, p.mu + j)
     put(out + T_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
-    if n == SPIN or p.kind[i] == CONTACT_BOX:
+    out += T_SIZE
+    if n == SPIN or n == ROLL_SPIN or p.kind[i] == CONTACT_BOX:
         m[0] = p.mu[i] * p.patch_radius[i]
         m[1] = p.mu[j] * p.patch_radius[j]
-        out[T_SIZE] = gather(m, m + 1)
-        if n == SPIN:
-            put(out + T_SIZE + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+        out[0] = gather(m, m + 1)
+        if p.kind[i] == CONTACT_BOX:
+            m[0] = r.coupling[5 * c + 2] * p.step[e + 2]
+            m[1] = r.coupling[5 * d + 2] * p.step[f + 2]
+            out[1] = gather(m, m + 1)
             return
-        m[0] = r.coupling[5 * c + 2] * p.step[e + 2]
-        m[1] = r.coupling[5 * d + 2] * p.step[f + 2]
-        out[T_SIZE + 1] = gather(m, m + 1)
+        put(out + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
+        out += S_SIZE
+    if n >= ROLL:
+        out[0] = gather(p.rolling + i, p.rolling + j)
 
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
@@ -213,19 +229,21 @@ cdef inline void project_tangents(pair_t* x, pair_t radius) noexcept nogil:
 
 
 cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
-    """relax_contact of core/rows.pxd for no tangents or two; lam (1 + nt + spin), to: where a and b are written."""
-    cdef int32_t nt = 0 if contact_t is normal_t else 2, spin = 1 if contact_t is spin_t else 0
+    """relax_contact of core/rows.pxd for no tangents or two, then relax_rolling; lam (1 + nt + spin + roll), to: where a and
+    b are written."""
+    cdef int32_t nt = 0 if contact_t is normal_t else 2, spin = 1 if contact_t is spin_t or contact_t is roll_spin_t else 0
+    cdef int32_t roll = 2 if contact_t is roll_t or contact_t is roll_spin_t else 0
     cdef const int64_t* place = <const int64_t*>c
-    cdef const pair_t* n = <const pair_t*>c + HEADER + 1 + nt + spin
+    cdef const pair_t* n = <const pair_t*>c + HEADER + 1 + nt + spin + roll
     cdef const pair_t* q = n + C_ARM_A
     cdef const pair_t* row = n + C_ROW
-    cdef const pair_t* t = row + C_ROW_SIZE * (1 + nt + spin)
+    cdef const pair_t* t = row + C_ROW_SIZE * (1 + nt + spin + roll)
     cdef pair_t a[6]
     cdef pair_t b[6]
     cdef pair_t u[3]
     cdef pair_t turn[3]
     cdef pair_t x[2]
-    cdef pair_t d0 = both(0.0), d1 = d0, ds = d0, y, z, dn, impulse, swing_a, swing_b
+    cdef pair_t d0 = both(0.0), d1 = d0, ds = d0, y, z, dn, normal, impulse, swing_a, swing_b
     cdef int32_t k
     gather_six(at(v, place[0]), at(v, place[LANES - 1]), a)
     gather_six(at(v, place[LANES]), at(v, place[2 * LANES - 1]), b)
@@ -235,6 +253,7 @@ cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v,
     y = not_below_zero(lam[0] - (dot_pair(n, u) + (row[0] * lam[0] - row[1])) * row[2])
     dn = y - lam[0]
     lam[0] = y
+    normal = y
     if nt > 0:
         row += C_ROW_SIZE
         d0 = lam[1]
@@ -287,6 +306,25 @@ cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v,
         a[3 + k] = a[3 + k] - swing_a
         b[k] = b[k] + n[C_MASS + 1] * impulse
         b[3 + k] = b[3 + k] + swing_b
+    if roll:
+        for k in range(3):
+            turn[k] = b[3 + k] - a[3 + k]
+        row = n + C_ROW + C_ROW_SIZE * (1 + nt + spin)
+        lam += 1 + nt + spin
+        d0 = lam[0]
+        d1 = lam[1]
+        z = row[2]                                      # one step for both
+        x[0] = d0 - (dot_pair(t, turn) + (row[0] * d0 - row[1])) * z
+        x[1] = d1 - (dot_pair(t + 3, turn) + (row[C_ROW_SIZE] * d1 - row[C_ROW_SIZE + 1])) * z
+        project_tangents(x, t[T_SIZE + (S_SIZE if spin else 0)] * normal)
+        lam[0] = x[0]
+        lam[1] = x[1]
+        d0 = x[0] - d0
+        d1 = x[1] - d1
+        row += 3
+        for k in range(3):
+            a[3 + k] = a[3 + k] - (d0 * row[k] + d1 * row[C_ROW_SIZE + k])
+            b[3 + k] = b[3 + k] + (d0 * row[3 + k] + d1 * row[C_ROW_SIZE + 3 + k])
     scatter_six(at(v, to[0]), at(v, to[LANES - 1]), a)
     scatter_six(at(v, to[LANES]), at(v, to[2 * LANES - 1]), b)
 
@@ -335,6 +373,10 @@ cdef inline void relax_record(const blocks_t* p, const rows_t* r, const pair_t* 
         relax_contact_lanes(<const square_t*>c, lam, v, to)
     elif kind == SPIN:
         relax_contact_lanes(<const spin_t*>c, lam, v, to)
+    elif kind == ROLL:
+        relax_contact_lanes(<const roll_t*>c, lam, v, to)
+    elif kind == ROLL_SPIN:
+        relax_contact_lanes(<const roll_spin_t*>c, lam, v, to)
     elif kind >= JOINT:
         relax_joint_lanes(c, kind, lam, v, to)
     else:

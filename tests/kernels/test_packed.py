@@ -27,6 +27,8 @@ CASES = [
     ("stack", {"n": 8, "friction": 0.0}),  # one row
     ("stack", {"n": 8, "patch_radius": 0.1}),  # four
     ("pyramid", {"base": 6, "friction": 0.05, "patch_radius": 0.1}),  # slides and spins
+    ("stack", {"n": 8, "rolling_radius": 0.05}),  # five
+    ("pyramid", {"base": 6, "friction": 0.05, "patch_radius": 0.1, "rolling_radius": 0.001}),  # six; rolls
     ("pile", {"n": 60, "friction": 0.0}),
     ("newtons_cradle", {}),
     ("four_bar", {}),
@@ -111,7 +113,7 @@ KINDS = {
     "one tangent": partial(random_contact_problem, tangents=1),
     **{kind: CONTACTS[kind] for kind in ("disks", "rolling", "boxes")},
 }
-NO_LANES = ("one tangent", "rolling")
+NO_LANES = ("one tangent",)
 
 
 def tangled(seed, contacts, joints, bodies=None, kind="disks"):
