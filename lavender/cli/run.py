@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from lavender.cli.options import parameters_of, refuse_unused
+from lavender.errors import InputError
 
 __all__ = ["run"]
 
@@ -25,13 +26,20 @@ __all__ = ["run"]
 @click.option(
     "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
 )
+@click.option(
+    "--order",
+    default=None,
+    help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
+    "Default: the stepper's.",
+)
+@click.option("--solver", default=None, help="Solver of each step, by name. Default: sequential_impulses.")
 @click.option("--stepper", default=None, help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
     "parameters",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Set a parameter of the scene, e.g. n=20, order=top_down or solver=newton; may be repeated.",
+    help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.",
 )
 @click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
 @click.option(
@@ -65,6 +73,8 @@ def run(
     /,
     scene: str,
     steps: int,
+    order: str | None,
+    solver: str | None,
     stepper: str | None,
     parameters: tuple[str, ...],
     **asked: Any,
@@ -89,19 +99,35 @@ def run(
     found = run_scene(
         scene,
         steps=steps,
-        parameters={**parameters_of(parameters), **({} if stepper is None else {"stepper": stepper})},
+        parameters=_parameters(parameters, order=order, solver=solver, stepper=stepper),
         every=1 if live else max(1, steps // 20),
         show=show,
         **asked,
     )
     if live:
         click.echo()
-    best = 1e3 * found.cost.min()
-    click.echo(
-        f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, order {found.order}, {best:.3g} ms a step at best"
-    )
     for name, option in (("trace", "trace"), ("figure", "plot"), ("film", "film")):
         if asked[option] is not None:
             click.echo(f"{name}: {asked[option]}")
     if record is not None:
         click.echo(f"{found.recorded} problems in {record}: lavender report {record}")
+    best = 1e3 * found.cost.min()
+    click.echo(
+        f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {found.method}, {best:.3g} ms a step at best"
+    )
+
+
+def _parameters(words: tuple[str, ...], **options: str | None) -> dict[str, Any]:
+    """Parameters of the scene from `--set` and from the options that have their names."""
+    found = parameters_of(words)
+    for name, value in options.items():
+        if value is None:
+            continue
+        if name in found:
+            raise InputError(
+                f"--{name} {value} and --set {name}={found[name]} both say {name}: leave one out"
+            )
+        found[name] = value
+    if found.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in found:
+        found["solver_options"] = {"order": found.pop("order")}  # a solver that takes none refuses it
+    return found

@@ -16,6 +16,7 @@ from lavender._arrays import FloatArray, whole_number
 from lavender.engine.picture import PICTURES, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
 from lavender.io.stored import folder_for_steps, write_figure, write_text
+from lavender.registry import get
 from lavender.scene import Scene
 
 __all__ = ["Trace", "run", "run_scene"]
@@ -34,6 +35,7 @@ class Trace:
     recorded: int = 0  # problems written
     title: str = ""  # of figures
     order: str = ""  # in which each sweep visits the contacts
+    method: str = ""  # in words: the solver unless it is the engine's own, the order unless it takes none
 
     def __len__(self) -> int:
         return len(self.time)
@@ -106,7 +108,10 @@ def run(
             if watch is not None:
                 watch(done, observation, info)
     scene = simulation.scene
+    spec = get(scene.parameters.solver)
     order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
+    words = [] if spec.name == "sequential_impulses" else [spec.name]
+    method = ", ".join([*words, f"order {order}"] if spec.order else words)
     return Trace(
         scene=repr(scene),
         time=time[:done],
@@ -116,8 +121,9 @@ def run(
         lost_body=lost,
         recorded=recorded,
         title=f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
-        f"{'warm' if simulation.warm_start else 'cold'}, order {order}",
+        f"{'warm' if simulation.warm_start else 'cold'}, {method}",
         order=order,
+        method=method,
     )
 
 

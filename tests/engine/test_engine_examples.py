@@ -142,8 +142,8 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
         "12",
         "--set",
         "n=2",
-        "--set",
-        "order=top_down",
+        "--order",
+        "top_down",
         "--residual",
     ]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
@@ -152,7 +152,7 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
     assert not code.value.code
     printed = capsys.readouterr().out
     assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
-    assert "order top_down" in printed
+    assert "order top_down" in printed.splitlines()[-1]
     table = np.genfromtxt(paths[0], delimiter=",", names=True, dtype=None, encoding="utf-8")
     assert table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
     assert table["residual_final"].max() < table["residual_initial"].max()
@@ -162,12 +162,34 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
 
 
 @pytest.mark.parametrize(
+    ("words", "last"),
+    [
+        (["--solver", "newton"], "newton, "),
+        (["--solver", "pgs", "--order", "bottom_up"], "pgs, order bottom_up, "),
+        (["--stepper", "xpbd", "--order", "reverse"], "order reverse, "),
+    ],
+)
+def test_the_last_line_says_solver_and_order(words, last, capsys):
+    from lavender.cli import main
+
+    with pytest.raises(SystemExit) as code:
+        main(["run", "stack", "--set", "n=2", "--steps", "3", *words])
+    assert not code.value.code
+    assert f" s, {last}" in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
     "words",
     [
         ["run", "stac"],
         ["run", "stack", "--set", "n"],
         ["run", "stack", "--set", "mu=1"],
         ["run", "stack", "--iterations", "3"],
+        ["run", "stack", "--solver", "newtn"],
+        ["run", "stack", "--order", "up"],
+        ["run", "stack", "--solver", "newton", "--order", "bottom_up"],
+        ["run", "stack", "--order", "given", "--set", "order=reverse"],
+        ["run", "stack", "--stepper", "xpbd", "--solver", "newton"],
     ],
 )
 def test_lavender_run_refuses_what_it_cannot_do(words, capsys):
