@@ -10,12 +10,22 @@ import lavender as lv
 
 
 # Those of the chapter are run by test_chapter.py.
-@pytest.mark.parametrize("name", ["residual_or_motion", "two_motions", "turns_of_auto"])
+@pytest.mark.parametrize("name", ["residual_or_motion", "two_motions", "turns_of_auto", "what_a_row_costs"])
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
     path = tmp_path / "figure.png"
     example(name).main(str(path))
     assert path.read_bytes().startswith(b"\x89PNG")
     assert str(path) in capsys.readouterr().out
+
+
+def test_rows_that_no_body_asks_for_are_not_there():
+    module = example("what_a_row_costs")
+    contacts = 4 * module.BOXES
+    rows = {
+        name: lv.Simulation(lv.Scene("stack", n=module.BOXES, **more)).constraint_problem().m
+        for name, more in module.DECLARED.items()
+    }
+    assert list(rows.values()) == [contacts * n for n in (1, 3, 4, 5, 6)]
 
 
 def test_direct_does_not_mind_the_condition_number_and_sweeps_do():
