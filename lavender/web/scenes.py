@@ -12,7 +12,7 @@ from lavender.engine.snapshot import Snapshot
 from lavender.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
 
-__all__ = ["PAGE", "PRESETS", "describe", "layout", "page_scenes"]
+__all__ = ["EXPERIMENTS", "PAGE", "PRESETS", "describe", "layout", "page_scenes"]
 
 #: Scenes of the page, the whole gallery: name, title, what to look for, what the caption measures of each side:
 #: "lean" (how far sideways of its start, or below it, a body is), "gap" (how far the ends of a joint are apart),
@@ -88,6 +88,16 @@ PAGE: tuple[tuple[str, str, str, str], ...] = (
 )
 
 
+class Number(NamedTuple):
+    """A line below the pictures: medians of one of `SOLVER_FIELDS` over steps first + 1 to last, of A and of B."""
+
+    text: str
+    field: str
+    first: int
+    last: int
+    over: str  # "AB" for the ratio A/B, "BA" for B/A, or "" without
+
+
 class Preset(NamedTuple):
     """A button of the page: two settings of one scene side by side."""
 
@@ -97,7 +107,90 @@ class Preset(NamedTuple):
     a: dict[str, Any]
     b: dict[str, Any]
     note: str  # what to see
+    numbers: tuple[Number, ...] = ()
 
+
+_LEFT = "residual after the last sweep [N s]"
+
+#: The chapter's five, under its numbers (docs/chapter.md), opened by a link.
+EXPERIMENTS = (
+    Preset(
+        name="experiment=1",
+        title="1 directly, or by sweeps",
+        scene="stack",
+        a={"iterations": 16, "warm_start": False, "solver": "newton"},
+        b={"iterations": 64, "warm_start": False},
+        note=(
+            "A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each step from "
+            "nothing. In the plots along the sweeps each point of A is a factorisation."
+        ),
+        numbers=(
+            Number(_LEFT, "residual_final", 20, 60, "BA"),
+            Number("approach velocity left [m/s]", "violation_final", 20, 60, "BA"),
+        ),
+    ),
+    Preset(
+        name="experiment=2",
+        title="2 inequalities, sweep by sweep",
+        scene="stack",
+        a={"iterations": 8, "warm_start": False, "order": "bottom_up"},
+        b={"iterations": 32, "warm_start": False, "order": "bottom_up"},
+        note=(
+            "Pause and step: the plots show the error after every sweep. Each impulse is clamped in its own row, so "
+            "that the error falls from sweep to sweep; clamping once at the end would not do."
+        ),
+        numbers=(
+            Number("second solve: residual [N s]", "residual_final", 0, 1, "AB"),
+            Number("second solve: approach velocity [m/s]", "violation_final", 0, 1, "AB"),
+        ),
+    ),
+    Preset(
+        name="experiment=3",
+        title="3 two orders",
+        scene="stack",
+        a={"iterations": 4, "warm_start": False, "order": "bottom_up"},
+        b={"iterations": 4, "warm_start": False, "order": "top_down"},
+        note=(
+            "The same sweeps, from the ground up and from the top down. By the residual B looks better, by the "
+            "approach velocity A does: compare orders by the error of all rows, E."
+        ),
+        numbers=(
+            Number(_LEFT, "residual_final", 20, 60, "AB"),
+            Number("approach velocity left [m/s]", "violation_final", 20, 60, "AB"),
+        ),
+    ),
+    Preset(
+        name="experiment=4",
+        title="4 four sweeps or 64",
+        scene="stack",
+        a={"iterations": 4, "warm_start": False, "order": "bottom_up"},
+        b={"iterations": 64, "warm_start": False, "order": "bottom_up"},
+        note=(
+            "B sweeps sixteen times as often; both from nothing, from the ground up. How much less it leaves depends "
+            "on when you look: A begins to lean."
+        ),
+        numbers=(
+            Number(f"second solve: {_LEFT}", "residual_final", 0, 1, "AB"),
+            Number(_LEFT, "residual_final", 20, 60, "AB"),
+            Number(_LEFT, "residual_final", 180, 240, "AB"),
+        ),
+    ),
+    Preset(
+        name="experiment=5",
+        title="5 warm or cold",
+        scene="stack",
+        a={"iterations": 4, "warm_start": True, "order": "alternating"},
+        b={"iterations": 4, "warm_start": False, "order": "alternating"},
+        note=(
+            "Four sweeps in both. A finds its contacts in the cache and begins where the last step ended; B begins "
+            "from nothing."
+        ),
+        numbers=(
+            Number("residual before the first sweep [N s]", "residual_initial", 20, 90, "BA"),
+            Number("contacts found in the cache", "cache_matches", 20, 90, ""),
+        ),
+    ),
+)
 
 #: The first opens the page.
 PRESETS = (
@@ -239,7 +332,8 @@ def page_scenes() -> dict[str, Any]:
                 for side in (one, two)
             ],
             "note": note,
+            "numbers": [number._asdict() for number in numbers],
         }
-        for name, title, scene_name, one, two, note in PRESETS
+        for name, title, scene_name, one, two, note, numbers in (*PRESETS, *EXPERIMENTS)
     ]
     return {"layout": layout(), "scenes": scenes, "presets": presets}

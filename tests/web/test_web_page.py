@@ -14,7 +14,7 @@ from lavender.errors import LavenderError
 from lavender.scene import SCENES as SCENES_OF_GALLERY
 from lavender.scene.parts import rotation
 from lavender.web import pages
-from lavender.web.scenes import PRESETS
+from lavender.web.scenes import EXPERIMENTS, PRESETS
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
@@ -337,7 +337,7 @@ def test_a_lost_state_is_named(visit):
 
 def test_it_opens_moving_with_two_settings_that_make_the_point(visit):
     v = visit("")
-    _, title, scene, one, two, note = PRESETS[0]
+    _, title, scene, one, two, note, _ = PRESETS[0]
     assert v.page.locator("#scene").input_value() == scene
     assert v.page.locator("#note").text_content() == note
     assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
@@ -396,9 +396,9 @@ def test_reduced_motion_opens_at_rest(visit):
     assert v.page.locator("#play").get_attribute("aria-pressed") == "false"
 
 
-@pytest.mark.parametrize("preset", PRESETS, ids=lambda preset: preset[0])
+@pytest.mark.parametrize("preset", [*PRESETS, *EXPERIMENTS], ids=lambda preset: preset[0])
 def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
-    _, title, scene, *sides, note = preset
+    _, title, scene, *sides, note, _ = preset
     v = visit()
     v.page.get_by_role("button", name=title, exact=True).click()
     v.page.keyboard.press("Escape")
@@ -413,6 +413,64 @@ def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
         values, lean = run(scene, 30, **side)
         assert v.values(i)[0] == values
         assert leans[i] == pytest.approx(lean, abs=1e-12)
+
+
+def medians(number, side):
+    """Of the native engine, the median that a line of an experiment shows."""
+    settings = dict(side)
+    if settings.pop("solver", "sweeps") == "newton":
+        del settings["iterations"]
+        steps_of = NewtonSteps("stack", **settings)
+        values = [steps_of.step() for _ in range(number.last)]
+    else:
+        settings.setdefault("order", "given")
+        simulation = lv.Simulation(
+            lv.Scene("stack", solver_iterations=settings.pop("iterations"), **settings)
+        )
+        values = [simulation.step()[0]["solver"] for _ in range(number.last)]
+    return np.median(np.array(values)[number.first :, SOLVER_FIELDS.index(number.field)])
+
+
+@pytest.mark.parametrize(
+    "phone", [{}, {"viewport": {"width": 390, "height": 844}}], ids=["1280 px", "390 px"]
+)
+@pytest.mark.parametrize("preset", EXPERIMENTS, ids=lambda preset: preset.name)
+def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, phone):
+    v = visit("#" + preset.name, **phone)
+    assert v.page.locator("#experiments button[aria-pressed=true]").text_content() == preset.title
+    assert v.page.locator("#note").text_content() == preset.note
+    v.js("lavender.play(false)")
+    v.page.click("#reset")
+    v.page.wait_for_function("!lavender.waiting")
+    assert v.page.locator("#numbers").is_visible()
+    v.js("lavender.advance(240)")
+    lines = v.page.locator("#numbers tbody tr").all()
+    assert len(lines) == len(preset.numbers) > 0
+    for line, number, seen in zip(lines, preset.numbers, v.js("lavender.seen"), strict=True):
+        a, b = (medians(number, side) for side in (preset.a, preset.b))
+        assert [seen["a"], seen["b"]] == [a, b]
+        assert number.text in line.text_content()
+        if number.over:
+            ratio = a / b if number.over == "AB" else b / a
+            shown = float(line.text_content().rsplit("= ")[1])
+            assert shown == pytest.approx(ratio, rel=6e-3 if ratio < 1000 else 0.5)  # three digits, or one
+    assert v.js("document.documentElement.scrollWidth <= innerWidth")
+
+
+def test_numbers_of_an_experiment_are_of_an_undisturbed_run(visit):
+    v = visit("#experiment=4")
+    v.js("lavender.play(false)")
+    v.page.click("#reset")
+    v.js("lavender.advance(30)")
+    v.page.click("#push")
+    v.js("lavender.advance(300)")
+    first, *later = v.js("lavender.seen")
+    assert first is not None and later == [None, None]
+    v.page.click("#reset")
+    v.js("lavender.advance(240)")
+    assert None not in v.js("lavender.seen")
+    v.page.select_option("#scene", "pyramid")
+    assert v.page.locator("#numbers").is_hidden()
 
 
 def run(scene, steps, iterations, solver="sweeps", **settings):

@@ -3,7 +3,7 @@
 import { Chart, OVER_TIME, positive } from "./charts.js";
 import { colors, fail, find } from "./draw.js";
 import { Newton, ORDERS, SOLVER_FIELDS } from "./lavender.js";
-import { Side } from "./side.js";
+import { Side, shown } from "./side.js";
 
 const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
 const PART_EVERY = 16; // ms between two parts of the page beside the pictures, of eight, while it runs
@@ -29,15 +29,15 @@ class App {
     this.makeCharts();
     this.listen();
     find("scene").append(...contents.scenes.map((scene) => new Option(scene.title, scene.name)));
-    find("presets").append(...contents.presets.map((preset) => {
+    for (const preset of contents.presets) {
       const button = Object.assign(document.createElement("button"), { type: "button", textContent: preset.title });
       button.dataset.preset = preset.name;
       button.addEventListener("click", () => {
         this.take(preset);
         this.play(true);
       });
-      return button;
-    }));
+      find(preset.numbers.length ? "experiments" : "presets").append(button);
+    }
     this.read();
     window.addEventListener("hashchange", () => location.hash !== this.written && this.read());
     requestAnimationFrame((now) => this.frame(now));
@@ -173,9 +173,45 @@ class App {
     const now = this.contents.presets.find((preset) => preset.scene === this.scene.name
       && preset.sides.every((side, i) => Object.entries(side).every(([key, value]) => this.sides[i].settings[key] === value)));
     find("note").textContent = (now ?? this.scene).note;
-    for (const button of find("presets").children) {
+    for (const button of document.querySelectorAll("[data-preset]")) {
       button.setAttribute("aria-pressed", button.dataset.preset === now?.name);
     }
+    if (this.now !== now) {
+      this.now = now;
+      this.forgetNumbers();
+    }
+  }
+
+  // The lines of an experiment, before a step has been taken.
+  forgetNumbers() {
+    const numbers = this.now?.numbers ?? [];
+    this.seen = numbers.map(() => null);
+    find("numbers").hidden = numbers.length === 0;
+    find("numbers").tBodies[0].replaceChildren(...numbers.map(({ text, first, last }) => {
+      const row = document.createElement("tr");
+      row.append(Object.assign(document.createElement("th"), { textContent: text }));
+      const steps = last - first > 1 ? `${first + 1} to ${last}` : String(last);
+      row.append(...[steps, "–", "–", "–"].map((words) => Object.assign(document.createElement("td"), { textContent: words })));
+      return row;
+    }));
+  }
+
+  // Each line is told once, when its last step has been taken.
+  tellNumbers() {
+    (this.now?.numbers ?? []).forEach(({ field, first, last, over }, i) => {
+      if (this.seen[i]) {
+        return;
+      }
+      const [a, b] = this.sides.map((side) => side.median(field, first, last));
+      if (a === null || b === null) {
+        return;
+      }
+      this.seen[i] = { a, b, ratio: over === "AB" ? a / b : b / a };
+      const { ratio } = this.seen[i];
+      const cells = find("numbers").tBodies[0].rows[i].cells;
+      [cells[2].textContent, cells[3].textContent] = [a, b].map((x) => shown(field, x));
+      cells[4].textContent = over ? `${over[0]} / ${over[1]} = ${ratio >= 1000 ? ratio.toExponential(0) : ratio.toPrecision(3)}` : "";
+    });
   }
 
   take(preset) {
@@ -241,6 +277,7 @@ class App {
     find("restore").disabled = true;
     find("failure").hidden = true;
     this.write();
+    this.forgetNumbers();
     this.show(true);
   }
 
@@ -277,6 +314,7 @@ class App {
       }
       const watched = !this.playing || (curves && i === steps - 1);
       this.sides.forEach((side) => side.step(this.steps * this.scene.dt, watched));
+      this.tellNumbers();
     }
     this.show(!this.playing);
   }

@@ -57,7 +57,7 @@ export class Side {
   }
 
   forget() {
-    this.history = { time: [], values: [] };
+    this.history = { time: [], values: [], plain: true }; // plain: settings of its own, and nothing else, since the start
     this.curve = null; // of the last step whose sweeps were watched
     this.fresh = true; // no step since then
     this.kept = null;
@@ -68,6 +68,7 @@ export class Side {
   }
 
   set({ solver, ...changes }) {
+    this.history.plain &&= this.history.time.length === 0;
     this.simulation.set(changes);
     if (solver) {
       this.choose(solver);
@@ -94,6 +95,7 @@ export class Side {
     if (dynamic[body] < 0) {
       return;
     }
+    this.history.plain = false;
     const dt = this.app.scene.dt;
     for (let k = 0; k < 3; k++) {
       const now = v[6 * body + k];
@@ -167,7 +169,7 @@ export class Side {
   snapshot() {
     this.kept = {
       state: this.simulation.snapshot(),
-      history: { time: [...this.history.time], values: [...this.history.values] },
+      history: { ...this.history, time: [...this.history.time], values: [...this.history.values] },
       curve: this.curve,
       fresh: this.fresh,
     };
@@ -177,13 +179,14 @@ export class Side {
     const { state, history, curve, fresh } = this.kept;
     this.simulation.restore(state);
     this.wanted = state.newton ? "newton" : state.stepper === "soft_step" ? "soft_step" : "sweeps";
-    this.history = { time: [...history.time], values: [...history.values] };
+    this.history = { ...history, time: [...history.time], values: [...history.values] };
     this.curve = curve;
     this.fresh = fresh;
     this.readSettings();
   }
 
   push(random) {
+    this.history.plain = false;
     const [v, dynamic] = [this.simulation.array("v"), this.simulation.array("dyn")];
     for (let i = 0; i < dynamic.length; i++) {
       for (let k = 0; k < 6; k++) {
@@ -197,6 +200,18 @@ export class Side {
 
   draw() {
     this.view.draw(this.simulation, this.app.colors);
+  }
+
+  // Median of one of the eight values over the steps first + 1 to last; null before, or where the run was touched.
+  median(field, first, last) {
+    const { time, values, plain } = this.history;
+    if (!plain || values.length < last || values.length !== Math.round(time[time.length - 1] / this.app.scene.dt)) {
+      return null;
+    }
+    const at = SOLVER_FIELDS.indexOf(field);
+    const found = values.slice(first, last).map((row) => row[at]).sort((x, y) => x - y);
+    const half = found.length >> 1;
+    return found.length % 2 ? found[half] : (found[half - 1] + found[half]) / 2;
   }
 
   // What the step cost, in words.
