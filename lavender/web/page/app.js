@@ -3,7 +3,7 @@
 import { Chart, OVER_TIME, positive } from "./charts.js";
 import { colors, fail, find } from "./draw.js";
 import { Newton, ORDERS, SOLVER_FIELDS } from "./lavender.js";
-import { Side, shown } from "./side.js";
+import { Side } from "./side.js";
 
 const MOST_STEPS = 6; // in one frame; a slower machine runs slower than real time
 const PART_EVERY = 16; // ms between two parts of the page beside the pictures, of eight, while it runs
@@ -209,7 +209,7 @@ class App {
       this.seen[i] = { a, b, ratio: over === "AB" ? a / b : b / a };
       const { ratio } = this.seen[i];
       const cells = find("numbers").tBodies[0].rows[i].cells;
-      [cells[2].textContent, cells[3].textContent] = [a, b].map((x) => shown(field, x));
+      [cells[2].textContent, cells[3].textContent] = [a, b].map((x) => (Number.isInteger(x) ? x : x.toExponential(2)));
       cells[4].textContent = over ? `${over[0]} / ${over[1]} = ${ratio >= 1000 ? ratio.toExponential(0) : ratio.toPrecision(3)}` : "";
     });
   }
