@@ -11,7 +11,7 @@ import numpy as np
 from lavender import registry
 from lavender.cones import CONTACT_ROLLING, ROUND, ROW
 from lavender.errors import InputError
-from lavender.export.bindings import constants, struct_fields
+from lavender.export.header import constants, struct_fields
 from lavender.export.library import HEADER
 from lavender.problem import Problem
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lavender.export import HEADER
-from lavender.export.bindings import struct_fields
+from lavender.export.header import struct_fields
 from lavender.export.view import METHODS, view
 
 COUNTS = (

@@ -19,7 +19,7 @@ from tower import self_test_problem
 import lavender as lv
 from lavender import export
 from lavender.export import HEADER
-from lavender.export.bindings import constants
+from lavender.export.header import constants
 from lavender.export.view import ARRAYS, METHODS
 
 ERRORS = {
@@ -363,7 +363,7 @@ def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, meth
 
 
 def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
-    from lavender.export.bindings import STRUCTS, functions, struct_fields
+    from lavender.export.header import STRUCTS, functions, struct_fields
 
     header = HEADER.read_text()
     made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
