@@ -2,8 +2,16 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
 
+/* Some contact has more than its normal: the law counts, and which sweeps know it, however rough the contacts are. */
+static int32_t has_tangents(const blocks_t *p) {
+  int32_t i;
+  for (i = 0; i < p->n_blocks; i++)
+    if (p->kind[i] != LAV_ROW && p->ptr[i + 1] - p->ptr[i] > 1) return 1;
+  return 0;
+}
+
 static int32_t prepare_accelerated(lav_solver *s) {
-  const int32_t rubs = core_block_has_friction(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
+  const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
   const int32_t convex = rubs && !is_cone ? s->options.convex : 0;
   const int64_t n = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
