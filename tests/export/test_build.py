@@ -12,6 +12,7 @@ import pytest
 import random_problems as rp
 from clib import run
 from click.testing import CliRunner
+from test_same_bits import kinds_of
 from tower import self_test_problem
 
 import lavender as lv
@@ -173,6 +174,7 @@ def write_vectors(out):
         (rp.random_contact_problem(5, "cone"), "nncg", {"restart": "against"}),
         (lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, 0.5]), "direct", {}),
         (rp.random_contact_problem(6), "auto", {}), (rp.random_contact_problem(7), "admm", {}),
+        *((given, "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
         (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
     ]  # fmt: skip
     packed = [vectors.pack(problem, solver, 1e-6, 500, options) for problem, solver, options in given]
@@ -205,6 +207,26 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
     assert "LAV_NNCG" in vectors.made(records, None, 1)["chosen.h"]
     with pytest.raises(lv.InputError, match="of these records are: nncg"):
         vectors.made(records, "direct", 1)
+
+
+def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, compiler, tmp_path):
+    records = tmp_path / "records.jsonl"
+    plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
+    sizes = ("granularF(n=3)", "granular(n=3)", "granularF(n=6)")  # the last by a relaxation, which is a step
+    bench.run(sizes, ["auto"], plan, records)
+    made = vectors.made(records, None, 2)
+    header = made["chosen.h"]
+    assert "to a relative residual of 1e-06" in header and "1e-09" not in header
+    assert all(step in header for step in ("LAV_ANDERSON", "LAV_DIRECT", ", 1}"))
+    for name, text in made.items():
+        (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    (tmp_path / "vectors.bin").write_bytes(vectors.made(records, None, 3)["vectors.bin"])
+    (tmp_path / "use.cpp").write_text('#include "chosen.h"\nint main() { return lav_chosen[0].relaxed; }\n')
+    run(compiler, "-std=c++11", "-x", "c++", *WARNINGS, "-I", folder, "-fsyntax-only", tmp_path / "use.cpp")
+    link = [shared, f"-Wl,-rpath,{shared.parent}", "-o", tmp_path / "check"]
+    run(compiler, "-std=c11", *WARNINGS, "-I", folder, tmp_path / "check.c", *link)
+    said = run(tmp_path / "check", cwd=tmp_path).splitlines()
+    assert len(said) == 3 and all(line.startswith("met ") for line in said)
 
 
 def test_vectors_are_of_the_problems_that_the_report_measured(tmp_path, monkeypatch):

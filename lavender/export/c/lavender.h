@@ -84,8 +84,7 @@ enum { /* methods; names as in Python, by `lav_name` */
   LAV_NEWTON = 9,              /* all forms; rolling and round cones with J and M alone */
   LAV_DIRECT = 10,             /* A, bodies; rows alone */
   LAV_LEMKE = 11,              /* A, bodies; rows alone */
-  LAV_ADMM = 12,               /* A, bodies; dense */
-  LAV_AUTO = 13                /* all forms: others in turns, `turns` of the options */
+  LAV_ADMM = 12                /* A, bodies; dense */
 };
 
 enum { /* how a run ended; a claim, which `relative` beside it may contradict */
@@ -147,11 +146,9 @@ typedef struct lav_options {
   int32_t sweep;               /* anderson, nncg: LAV_DEFAULT_SWEEP (blocks under the cone law, else pgs) | ... */
   int32_t convex;              /* anderson, nncg: iterations under the cone law first */
   int32_t keeps;               /* nncg: 1 restarts only against the sweep */
-  int32_t n_turns;             /* auto: of `turns`, 0 to 16; 0: the library's own for the problem */
+  int32_t unused;
   uint64_t seed;               /* of LAV_RANDOM */
   double omega;                /* sor: 0 to 2; jacobi: > 0, or 0 for the safe damping */
-  const int32_t *turns;        /* (n_turns, 2) auto: method and iterations of each turn; after the last one the first again, with
-                                  four times as many; copied by `lav_open` */
 } lav_options;
 
 typedef struct lav_budget {
@@ -191,7 +188,7 @@ typedef struct lav_result {
   int32_t iterations;          /* of this run */
   int32_t sweeps;
   int32_t restarts;            /* of anderson and nncg; blocks without an exact answer; factorisations of the others */
-  int32_t method;              /* that made the impulse: auto names another one */
+  int32_t unused;
   lav_verdict verdict;
 } lav_result;
 

@@ -8,7 +8,6 @@ typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
 enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64 };
-enum { MOST_TURNS = 16, FEW_ROWS = 600 }; /* of auto, and up to which it forms dense matrices */
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
 enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */
 
@@ -60,9 +59,6 @@ struct lav_solver {
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
   int32_t factors, is_broken;
-  int32_t turns[2 * MOST_TURNS], given_turns[2 * MOST_TURNS], n_turns, at_turn; /* of auto */
-  uint64_t common;             /* where the memory of a turn begins */
-  double *chosen;
 #endif
 };
 
@@ -139,7 +135,6 @@ static int32_t check_counts(const lav_problem *q) {
 }
 
 static int32_t check_options(const lav_options *o) {
-  int32_t i;
   if (o->size != sizeof *o) return LAV_ERROR_VERSION;
   if (!lav_name(o->method) || o->order < LAV_GIVEN || o->order > LAV_REVERSE) return LAV_ERROR_OPTION;
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
@@ -147,9 +142,6 @@ static int32_t check_options(const lav_options *o) {
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
   if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && o->omega < 1e300)) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
-  if (o->n_turns < 0 || o->n_turns > MOST_TURNS || (o->n_turns > 0 && !o->turns)) return LAV_ERROR_OPTION;
-  for (i = 0; i < o->n_turns; i++)
-    if (!lav_name(o->turns[2 * i]) || o->turns[2 * i] == LAV_AUTO || o->turns[2 * i + 1] < 1) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
 
@@ -163,7 +155,7 @@ static int32_t takes_form(int32_t method, int32_t form) {
     case LAV_PGS: return form != LAV_BODIES;
     case LAV_SOR: case LAV_GAUSS_SEIDEL: case LAV_JACOBI: return form == LAV_MATRIX;
 #ifndef LAV_SWEEPS_ONLY
-    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: case LAV_AUTO: return 1;
+    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: return 1;
     case LAV_DIRECT: case LAV_LEMKE: case LAV_ADMM: return form != LAV_VELOCITIES; /* over A, which is formed of bodies */
 #endif
     default: return 0;
@@ -172,8 +164,8 @@ static int32_t takes_form(int32_t method, int32_t form) {
 
 /* Does it take contacts whose rolling is bounded, and cones of more than two tangents? */
 static int32_t takes_kind(int32_t method, int32_t form, int32_t kind) {
-  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_AUTO ||
-                             (method == LAV_NEWTON && form == LAV_VELOCITIES) || method == LAV_NNCG;
+  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_NNCG ||
+                             (method == LAV_NEWTON && form == LAV_VELOCITIES);
   if (kind == LAV_ROUND) return is_general && form != LAV_BODIES;
   return kind != LAV_CONTACT_ROLLING || is_general || method == LAV_ANDERSON || method <= LAV_PGS || method == LAV_JACOBI;
 }

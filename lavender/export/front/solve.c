@@ -138,11 +138,8 @@ static int32_t prepare_sweeps(lav_solver *s) {
 static int32_t prepare_newton(lav_solver *s);
 static int32_t prepare_pivots(lav_solver *s);
 static int32_t prepare_admm(lav_solver *s);
-static int32_t usual_turns(const lav_problem *q, int32_t rows, int32_t *turns);
-static int32_t prepare_auto(lav_solver *s, const lav_problem *q);
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
-static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out);
 static int32_t restarts_of(const lav_solver *s);
 static int32_t begins_again(lav_solver *s);
 #endif
@@ -241,7 +238,8 @@ static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out)
 
 #ifndef LAV_SWEEPS_ONLY
 /* Numbers that a method has beside the problem; what depends on arrays is guessed. */
-static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t method, int32_t n_v) {
+static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int32_t method = o->method;
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
   const int32_t bodies = q->form == LAV_BODIES, mj = bodies ? joint_rows(q) : 0, mc = bodies ? contact_rows(q) : 0;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
@@ -297,19 +295,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     numbers += nv + 2 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
 #ifndef LAV_SWEEPS_ONLY
-  {
-    int32_t turns[2 * MOST_TURNS] = {0}, count = 1, i;
-    int64_t most = 0;
-    turns[0] = options->method;
-    if (options->method == LAV_AUTO && options->n_turns > 0) COPY(turns, options->turns, 2 * (count = options->n_turns));
-    else if (options->method == LAV_AUTO) /* kinds are not read: rows alone, unless contacts have tangents */
-      count = usual_turns(problem, problem->form != LAV_BODIES || contact_rows(problem) <= k - problem->n_joints, turns);
-    for (i = 0; i < count; i++) {
-      const int64_t here = numbers_of(problem, options, turns[2 * i], s.n_v);
-      if (here > most) most = here;
-    }
-    numbers += most + (options->method == LAV_AUTO ? m : 0);
-  }
+  numbers += numbers_of(problem, options, s.n_v);
 #endif
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
   return LAV_OK;
@@ -342,8 +328,6 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
 #ifndef LAV_SWEEPS_ONLY
   s->newton_options.tol = 1e-6;
   s->newton_options.budget = 1000;
-  if (options->n_turns > 0) COPY(s->given_turns, options->turns, 2 * options->n_turns);
-  s->options.turns = s->given_turns; /* `lav_set` reads them when the caller's may be gone */
 #endif
   s->magic = MAGIC;
   *out = s;
@@ -388,10 +372,8 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else carry(s);
 #ifndef LAV_SWEEPS_ONLY
   s->is_broken = 0;
-  if (s->options.method == LAV_AUTO) GIVE_BACK(prepare_auto(s, q));
-  else
 #endif
-    GIVE_BACK(prepare(s));
+  GIVE_BACK(prepare(s));
   s->ready = 1;
   return LAV_OK;
 }
@@ -411,7 +393,6 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 }
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  int32_t code = LAV_OK;
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -419,7 +400,6 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   if (budget->seconds > 0.0 && !budget->clock) return LAV_ERROR_NULL;
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
-  out->method = s->options.method;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
   if (!s->begun) begin_method(s);
   s->begun = 1;
@@ -427,13 +407,10 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;
     else out->iterations = budget->iterations;
   }
-#ifndef LAV_SWEEPS_ONLY
-  else if (s->options.method == LAV_AUTO) code = run_auto(s, budget, out);
-#endif
   else run_method(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
   judge(s, s->impulse, 1, &out->verdict);
-  return code;
+  return LAV_OK;
 }
 
 int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out) {

@@ -18,7 +18,6 @@ const LENGTHS = {
       jac: 12 * (given.block_ptr?.[joints] ?? joints),
     };
   },
-  lav_options: (options) => ({ turns: 2 * options.get('n_turns') }),
 };
 
 export class LavenderError extends Error {
