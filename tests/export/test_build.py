@@ -23,8 +23,13 @@ from lavender.export import vectors
 from lavender.export.header import constants, functions, javascript
 from lavender.web import cut
 
-WARNINGS = ["-Wall", "-Wextra", "-Werror"]
-LANGUAGES = {"C11": ["-std=c11"], "C++17": ["-std=c++17", "-x", "c++"]}
+WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
+LANGUAGES = {
+    "C99": ["-std=c99"],
+    "C11": ["-std=c11"],
+    "C++11": ["-std=c++11", "-x", "c++"],
+    "C++17": ["-std=c++17", "-x", "c++"],
+}
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
@@ -86,7 +91,7 @@ def tower(*command, **more):
 def test_the_tower_in_c_and_cpp_has_one_hash(folder, shared, compiler, tmp_path):
     link = [shared, f"-Wl,-rpath,{shared.parent}", "-ffp-contract=off", *WARNINGS]
     run(compiler, "-std=c11", folder / "tower.c", *link, "-o", tmp_path / "tower_c")
-    run(compiler, "-std=c++17", folder / "tower.cpp", *link, "-lstdc++", "-o", tmp_path / "tower_cpp")
+    run(compiler, "-std=c++11", folder / "tower.cpp", *link, "-lstdc++", "-o", tmp_path / "tower_cpp")
     assert tower(tmp_path / "tower_c") == tower(tmp_path / "tower_cpp")
     lines = {name: len((folder / name).read_text().splitlines()) for name in ("tower.c", "tower.cpp")}
     assert max(lines.values()) <= 70
