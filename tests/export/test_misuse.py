@@ -60,6 +60,7 @@ def changed(key, at, value):
         problem.keep[key] = array
         setattr(problem, key, array.ctypes.data)
 
+    apply.array, apply.index = key, at
     return apply
 
 
@@ -97,6 +98,13 @@ MISTAKES = {
     "NaN in an inertia": (changed("inv_inertia", 9, np.nan), "NUMBER"),
     "a mass below 0": (changed("inv_mass", 1, -1.0), "MASS"),
     "a compliance below 0": (changed("compliance", 3, -1.0), "MASS"),
+    "an inertia below 0": (changed("inv_inertia", 13, -1.0), "MASS"),
+    "an inertia that is not symmetric": (changed("inv_inertia", 11, 0.5), "MASS"),
+    "a normal of length 0": (changed("normal", 14, 0.0), "FRAME"),
+    "a normal of length 2": (changed("normal", 14, 2.0), "FRAME"),
+    "a tangent along the normal": (changed("tangent", 14, 0.6), "FRAME"),
+    "a body that touches itself": (changed("contact_body", 10, 1), "PAIR"),
+    "two static bodies": (changed("contact_body", 1, -1), "PAIR"),
     "no masses": (put("inv_mass", None), "NULL"),
     "no normals": (put("normal", None), "NULL"),
     "no bodies of contacts": (put("contact_body", None), "NULL"),
@@ -104,8 +112,11 @@ MISTAKES = {
     "rolling not a number": (put_array("rolling", [np.nan] * 12), "FRICTION"),
     "rows that do not roll": (changed("kind", 2, 5), "BLOCKS"),
     "a box of one tangent": (lambda q: (changed("kind", 2, 4)(q), changed("block_ptr", 3, 8)(q)), "BLOCKS"),
-    "an order with a block twice": (lambda q: changed("order", 1, 0)(q), "INDEX"),
+    "an order with a block twice": (changed("order", 1, 0), "INDEX"),
 }
+
+
+ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a", "arm_b")
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
@@ -118,6 +129,15 @@ def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
     code = library.c.lav_set(solver.at, ct.byref(problem))
     assert ERRORS[code] == f"LAV_ERROR_{error}"
     assert len(library.c.lav_text(code)) > 20
+    if hasattr(apply, "array") and error != "BLOCKS":  # named, with the place of what it is part of
+        at, whole = ct.c_int32(), {"normal": 3, "tangent": 3, "inv_inertia": 9, "contact_body": 2}
+        assert library.c.lav_refused(solver.at, ct.byref(at)).decode() == apply.array
+        size = whole.get(apply.array, 1)
+        assert at.value // size == apply.index % problem.keep[apply.array].size // size
+        if apply.array in ROWS:  # as the package refuses it
+            given = {name: problem.keep[name] for name in ROWS} | {"v_free": problem.keep["velocity"]}
+            with pytest.raises(lv.InputError, match=apply.array):
+                lv.Rows(**given)
     assert solver.whole()
     result = Result()
     result.size = ct.sizeof(Result)
@@ -171,6 +191,51 @@ def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, metho
             assert solver.code == -10
         assert solver.whole()
     assert seen == {0, -10}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_memory_alone_binds_and_needed_suffices_wherever_nothing_is_guessed(library, method):
+    """A solver that was opened for little takes the largest problem in enough memory, with the impulses it had."""
+    small, c = random_lcp(1, m=3), library.c
+    bodies = random_contact_problem(3, bodies=4, contacts=6)
+    rng = np.random.default_rng(5)
+    more = lv.Problem.linear(np.eye(60) + 0.01, rng.normal(size=60))
+    free = lv.Problem.linear(np.eye(3) + 0.01, rng.normal(size=3))
+    towers, grown = [stack_of(n) for n in (1, 6)], 0
+    for few, many in (
+        (free, more),
+        (small, random_lcp(2, m=60)),
+        (as_matrix(bodies), as_matrix(towers[1])),
+        towers,
+    ):
+        problems = [library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)]
+        options = library.options(method)
+        if any(c.lav_takes(ct.byref(q), ct.byref(options)) for q in problems):
+            continue
+        solver = library.open(problems[0], options)
+        solver.run(50, 1e-6)
+        before = solver.impulse()
+        code, asked = solver.set(problems[1]), 0
+        while code == -10:
+            needed = c.lav_needed(solver.at)
+            memory, at = (ct.c_double * (needed // 8 + 2))(), ct.c_void_p()
+            assert c.lav_move(solver.at, memory, ct.c_uint64(needed), ct.byref(at)) == 0
+            solver.at, solver.memory, asked = at, memory, asked + 1
+            code = solver.set(problems[1])
+        assert code == 0 and asked <= (1 if method in SWEEPS else 3)
+        grown += asked
+        same = int(np.searchsorted(many.cones.ptr, few.m, side="right")) - 1  # blocks of the same keys
+        if np.array_equal(many.cones.kind[:same], few.cones.kind[:same]) and same == few.n_blocks:
+            assert solver.impulse()[: few.m].tobytes() == before.tobytes()
+    assert grown
+
+
+def test_newton_of_more_bodies_than_its_factor_has_room_for_is_refused(library):
+    problem, options, room = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
+    assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
+    assert (
+        ERRORS[library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))] == "LAV_ERROR_BODIES"
+    )
 
 
 def test_a_second_caller_in_one_solver_is_turned_away(library):
@@ -262,6 +327,27 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(tmp_path):
     assert module.read_bytes() == b"mine"
 
 
+def stack_of(n):
+    """n unit boxes on one another, by a contact each."""
+    z = np.tile([0.0, 0.0, 1.0], (n, 1))
+    rows = lv.Rows(
+        np.ones(n), np.tile(6.0 * np.eye(3), (n, 1, 1)), np.hstack([-z, 0.0 * z]), normal=z,
+        tangent=np.roll(z, 1, axis=1), arm_a=0.5 * z, arm_b=-0.5 * z,
+        contact_body=np.arange(n)[:, None] + [-1, 0],
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, mu=0.5, tangents=2)
+
+
+SWEEPS = (
+    "sequential_impulses",
+    "pgs",
+    "sor",
+    "gauss_seidel",
+    "jacobi",
+    "block_gauss_seidel",
+    "anderson",
+    "nncg",
+)
 SMALL = st.integers(-2, 9)
 WHOLE = st.lists(st.integers(-3, 12), min_size=0, max_size=12)
 REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_size=12)

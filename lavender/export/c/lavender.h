@@ -56,14 +56,17 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_FRICTION = -6,    /* mu or patch_radius is negative, or a contact with mu has no row to feel it */
   LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts */
   LAV_ERROR_INDEX = -8,       /* a column, body or place in the order is out of range, or columns do not ascend */
-  LAV_ERROR_MASS = -9,        /* an inverse mass is negative, or M is not positive definite */
+  LAV_ERROR_MASS = -9,        /* an inverse mass or a compliance is negative, an inertia is no positive semidefinite tensor, or M is not positive definite */
   LAV_ERROR_ROOM = -10,       /* too little memory: give as many bytes as lav_needed or lav_room says */
   LAV_ERROR_UNSUPPORTED = -11, /* this method of this build does not take this form, law or kind of block: lav_takes asks beforehand */
   LAV_ERROR_OPTION = -12,     /* an option is out of its range */
   LAV_ERROR_BUSY = -13,       /* another thread is in this solver: one at a time */
   LAV_ERROR_NO_PROBLEM = -14, /* no problem is set: lav_set comes first, and must have succeeded */
   LAV_ERROR_SOLVER = -15,     /* this is no solver: not opened, or its memory was written over */
-  LAV_ERROR_SELF_TEST = -16   /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
+  LAV_ERROR_SELF_TEST = -16,  /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
+  LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact that moves nothing: leave it out */
+  LAV_ERROR_FRAME = -18,      /* normal and tangent of a contact are no orthogonal unit vectors, to 1e-5: divide each by its length */
+  LAV_ERROR_BODIES = -19      /* newton takes 1,500 bodies at most: its factor may be full. Take sweeps or anderson, or solve islands apart */
 };
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */
@@ -205,13 +208,18 @@ LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-
 /* Whether a method takes a problem of this form, law and kinds, which are read; LAV_OK or LAV_ERROR_UNSUPPORTED. */
 LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options);
 
-/* Bytes for a solver of problems with at most these counts. Arrays may be null; block_ptr alone is read, where there are
+/* Bytes for a solver of problems with at most these counts (a hint: what binds later is memory alone). Arrays may be null; block_ptr alone is read, where there are
  * joints: it tells their rows from those of contacts. What a factor fills and which columns M's trees join is guessed:
  * `lav_set` tells when it is more. */
 LAV_API int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
 LAV_API int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options,
                          lav_solver **out);
 LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `lav_set` asked for */
+/* The solver in other memory, with its options and the impulses that it carries: for one that lav_set found too small. What
+ * it was in before is the caller's again. */
+LAV_API int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out);
+/* The array, or count, that the last lav_set refused, and the place in it; null where it refused none. */
+LAV_API const char *lav_refused(const lav_solver *solver, int32_t *index);
 
 /* A new problem, or new numbers: impulses come from `impulse`, from blocks of the same key, kind and rows, or Pi(0). */
 LAV_API int32_t lav_set(lav_solver *solver, const lav_problem *problem);

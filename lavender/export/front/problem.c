@@ -153,7 +153,8 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   if (q->order) {
     memset(s->marks, 0, (size_t)k * sizeof(int32_t));
     for (i = 0; i < k; i++) {
-      if (q->order[i] < 0 || q->order[i] >= k || s->marks[q->order[i]]++) return LAV_ERROR_INDEX;
+      if (q->order[i] < 0 || q->order[i] >= k || s->marks[q->order[i]]++)
+        return refuse(&s->refused, LAV_ERROR_INDEX, "order", i);
       s->order[i] = q->order[i];
     }
   } else if (s->options.order == LAV_REVERSE) {

@@ -13,6 +13,31 @@ static void keep_impulses(lav_solver *s) {
   kept->n_rows = s->p.n_rows;
 }
 
+/* Impulses that are carried, in arrays for a larger problem: these move towards its end, the last one first. */
+static int32_t grow_kept(lav_solver *s, const lav_problem *q) {
+  const kept_t old = s->kept;
+  const uint64_t used = s->used;
+  lav_problem most = *q;
+  if (q->n_blocks <= old.most_blocks && q->n_rows <= old.most_rows) return LAV_OK;
+  if (most.n_blocks < old.most_blocks) most.n_blocks = old.most_blocks;
+  if (most.n_rows < old.most_rows) most.n_rows = old.most_rows;
+  s->used = sizeof(lav_solver);
+  s->is_short = 0;
+  take_kept(s, &most);
+  if (s->is_short) {
+    s->kept = old;
+    s->used = used;
+    return LAV_ERROR_ROOM;
+  }
+  s->begin = s->used;
+  s->kept.n_blocks = old.n_blocks;
+  s->kept.n_rows = old.n_rows;
+  memmove(s->kept.impulse, old.impulse, (size_t)old.n_rows * sizeof *old.impulse);
+  memmove(s->kept.kind, old.kind, (size_t)old.n_blocks * sizeof *old.kind);
+  memmove(s->kept.ptr, old.ptr, ((size_t)old.n_blocks + 1) * sizeof *old.ptr);
+  return LAV_OK;
+}
+
 static uint32_t place_of(uint64_t key, uint32_t mask) {
   key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9u;
   return (uint32_t)(key ^ key >> 31) & mask;
@@ -281,7 +306,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
   if (!problem || !options || !bytes) return LAV_ERROR_NULL;
   GIVE_BACK(check_counts(problem));
   GIVE_BACK(check_options(options));
-  if (!takes_form(options->method, problem->form)) return LAV_ERROR_UNSUPPORTED;
+  GIVE_BACK(takes_counts(problem, options));
   memset(&s, 0, sizeof s);
   s.used = sizeof(lav_solver);
   m = problem->n_rows, k = problem->n_blocks, n = problem->n_bodies, nv = problem->n_velocities;
@@ -302,27 +327,24 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
 }
 
 int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options, lav_solver **out) {
-  lav_solver *s;
+  lav_solver *s, probe;
   uint64_t skip;
   if (!memory || !largest || !options || !out) return LAV_ERROR_NULL;
   GIVE_BACK(check_counts(largest));
   GIVE_BACK(check_options(options));
-  if (!takes_form(options->method, largest->form)) return LAV_ERROR_UNSUPPORTED;
+  GIVE_BACK(takes_counts(largest, options));
   skip = (16 - (uintptr_t)memory % 16) % 16;
-  if (bytes < skip + sizeof(lav_solver)) return LAV_ERROR_ROOM;
+  memset(&probe, 0, sizeof probe);
+  probe.used = sizeof(lav_solver);
+  take_kept(&probe, largest);
+  if (bytes < skip + probe.used) return LAV_ERROR_ROOM;
   s = (lav_solver *)(void *)((char *)memory + skip);
-  {
-    lav_solver probe;
-    memset(&probe, 0, sizeof probe);
-    probe.used = sizeof(lav_solver);
-    take_kept(&probe, largest);
-    if (probe.used > bytes - skip) return LAV_ERROR_ROOM;
-  }
   memset(s, 0, sizeof *s);
   s->base = (char *)s;
   s->bytes = bytes - skip;
   s->used = sizeof(lav_solver);
   s->options = *options;
+  s->form = largest->form;
   take_kept(s, largest);
   s->begin = s->used;
 #ifndef LAV_SWEEPS_ONLY
@@ -334,6 +356,37 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   return LAV_OK;
 }
 
+int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out) {
+  lav_problem most;
+  lav_solver *to;
+  int32_t code;
+  GIVE_BACK(enter(solver));
+  if (!memory || !out) return leave(solver, LAV_ERROR_NULL);
+  keep_impulses(solver);
+  memset(&most, 0, sizeof most);
+  most.size = (uint32_t)sizeof most;
+  most.form = solver->form;
+  most.n_blocks = solver->kept.most_blocks;
+  most.n_rows = solver->kept.most_rows;
+  most.n_velocities = most.n_rows;
+  code = lav_open(memory, bytes, &most, &solver->options, &to);
+  if (code != LAV_OK) return leave(solver, code);
+  COPY(to->kept.key, solver->kept.key, solver->kept.n_blocks);
+  COPY(to->kept.ptr, solver->kept.ptr, solver->kept.n_blocks + 1);
+  COPY(to->kept.kind, solver->kept.kind, solver->kept.n_blocks);
+  COPY(to->kept.impulse, solver->kept.impulse, solver->kept.n_rows);
+  to->kept.n_blocks = solver->kept.n_blocks;
+  to->kept.n_rows = solver->kept.n_rows;
+  *out = to;
+  return leave(solver, LAV_OK);
+}
+
+const char *lav_refused(const lav_solver *solver, int32_t *index) {
+  if (!solver || (uintptr_t)solver % 16 != 0 || solver->magic != MAGIC || !solver->refused.array) return NULL;
+  if (index) *index = solver->refused.index;
+  return solver->refused.array;
+}
+
 uint64_t lav_needed(const lav_solver *solver) {
   return solver && (uintptr_t)solver % 16 == 0 && solver->magic == MAGIC ? solver->needed : 0;
 }
@@ -342,9 +395,10 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   int32_t code = LAV_OK;
   keep_impulses(s);
   s->ready = s->begun = 0; /* whatever is wrong below: no answer of the problem before passes for this one's */
-  GIVE_BACK(check_problem(q));
+  s->refused.array = NULL;
+  GIVE_BACK(check_problem(q, &s->refused));
   GIVE_BACK(takes(q, &s->options));
-  if (q->n_blocks > s->kept.most_blocks || q->n_rows > s->kept.most_rows) return LAV_ERROR_ROOM;
+  GIVE_BACK(grow_kept(s, q));
   s->used = s->peak = s->begin;
   s->is_short = 0;
   take_blocks(s, q);
