@@ -235,6 +235,29 @@ def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_doe
     assert met >= 7
 
 
+def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library):
+    """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
+    ran = 0
+    for given in GIVEN:
+        if given.m == 0 or library.c.lav_takes(
+            ct.byref(library.problem(given)), ct.byref(library.options("newton"))
+        ):
+            continue
+        rng = np.random.default_rng(given.m)
+        for start in (
+            given.start(),
+            given.start() + 0.1 * rng.normal(size=given.m),
+            1e3 * rng.normal(size=given.m),
+        ):
+            least = min(1.0, lv.residual(given, start).relative)
+            for n in (0, 1, 2, 3, 5, 10):
+                solver = library.open(library.problem(given, impulse=start), library.options("newton"))
+                said = solver.run(n, 1e-12)
+                assert said.verdict.relative <= least or said.outcome in (1, 4)
+                ran += said.outcome == 0
+    assert ran > 100
+
+
 def test_a_line_search_ends_singular_rows_on_which_exchanges_go_round(library):
     descended = 0
     for seed in range(40):

@@ -223,7 +223,8 @@ LAV_API const char *lav_refused(const lav_solver *solver, int32_t *index);
 
 /* A new problem, or new numbers: impulses come from `impulse`, from blocks of the same key, kind and rows, or Pi(0). */
 LAV_API int32_t lav_set(lav_solver *solver, const lav_problem *problem);
-/* More iterations, from where the last run ended. The best impulse found is kept, a budget of tol 0 keeps the last. */
+/* More iterations, from where the last run ended. The best impulse found is kept, a budget of tol 0 keeps the last;
+ * newton's is never worse than its start or than doing nothing. */
 LAV_API int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out);
 /* Problems first, first + stride, ... of a batch: a thread for each `first`. results (n); the worst error of all. */
 LAV_API int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t first, int32_t stride,

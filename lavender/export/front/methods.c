@@ -115,11 +115,26 @@ static int32_t prepare_newton(lav_solver *s) {
   return LAV_OK;
 }
 
+/* A run that its budget ended is no worse than where it began, and no worse than doing nothing. */
+static void keep_better(lav_solver *s, const double *begin) {
+  lav_verdict now, then;
+  double nothing[3];
+  judge(s, s->impulse, 0, &now);
+  judge(s, begin, 0, &then);
+  if (!(now.relative <= then.relative)) {
+    COPY(s->impulse, begin, s->p.n_rows);
+    now = then;
+  }
+  if (!(now.relative <= 1.0))
+    judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, 0, nothing);
+}
+
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct driver_driver_said_t said = {0, 0.0, NULL};
   double closer = 1.0;
   int32_t how = newton_plan_MORE, before = 0;
   lav_verdict now;
+  COPY(s->compare, s->impulse, s->p.n_rows);
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
     how = start_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
@@ -140,6 +155,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare);
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;
