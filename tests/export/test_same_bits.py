@@ -110,6 +110,43 @@ def test_every_method_has_the_bits_of_the_package(library, at):
     assert ran >= 4
 
 
+SWEEPS = ("pgs", "sequential_impulses", "block_gauss_seidel", "anderson", "nncg")
+
+
+def dense_velocities():
+    """J and a full M, so few velocities that sweeps over A cost less: the package forms it."""
+    for seed, friction in itertools.product(range(4), ("coulomb", "cone")):
+        rng = np.random.default_rng(seed)
+        root, m = rng.normal(size=(24, 24)), 9 * (1 + seed)
+        cones = lv.Cones.contacts(0.5, count=m // 3) if seed else lv.Cones.contacts(0.0, count=m, tangents=0)
+        jac, mass = rng.normal(size=(m, 24)), np.eye(24) + 0.1 * root @ root.T
+        yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=24), cones=cones, friction=friction)
+
+
+def of_matrix(given):
+    return lv.Problem(given.b, given.cones, given.csr, friction=given.friction)
+
+
+def test_where_the_package_sweeps_over_rows_of_a_the_library_has_its_bits_on_that_matrix(library):
+    """`solver.form` says where: `problem.csr` is the matrix to give; everywhere else the problem as it is."""
+    seen = {True: 0, False: 0}
+    for given, name in itertools.product([*GIVEN, *dense_velocities()], SWEEPS):
+        try:
+            found = lv.solve(given, name, tol=0, max_iter=40)
+        except lv.CapabilityError:
+            continue
+        form = found.solver.form
+        formed = given.matrix is None and ("rows of A" in form or (name == "pgs" and form != "whitened J"))
+        problem = library.problem(of_matrix(given) if formed else given, impulse=given.start())
+        if library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name))):
+            continue
+        solver = library.open(problem, library.options(name))
+        solver.run(40, 0.0)
+        assert solver.impulse().tobytes() == found.impulse.tobytes(), (name, form, given)
+        seen[formed] += 1
+    assert min(seen.values()) > 10
+
+
 def test_vectors_are_of_methods_that_the_library_takes(library):
     looked = set()
     for given in GIVEN:
