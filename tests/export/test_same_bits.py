@@ -1,12 +1,13 @@
 """Every method, through the public header alone, has the bits of the package."""
 
 import ctypes as ct
+import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 import random_problems as rp
-from clib import METHODS, Motion, Refused
+from clib import METHODS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
@@ -348,3 +349,48 @@ def test_motion_errors_are_those_of_the_package(library):
             )  # without friction Coulomb's law is convex, which the package does not use
             assert out.bound == np.inf or given.law != "coulomb" or not rough
     assert looked >= 5
+
+
+def test_frames_of_float32_are_made_whole_as_the_package_does(library):
+    rng = np.random.default_rng(4)
+    tower = self_test_problem().rows
+    axes = np.linalg.qr(rng.normal(size=(12, 3, 3)))[0].astype(np.float32).astype(float)
+    rough = {"normal": axes[:, 0].copy(), "tangent": axes[:, 1].copy()}
+    given = lv.Problem.from_rows(dataclasses.replace(tower, **rough), mu=0.3, tangents=2)
+    assert not np.array_equal(given.rows.normal, rough["normal"])
+    found = lv.solve(given, "sequential_impulses", tol=0, max_iter=30)
+    problem = library.problem(given, **{name: np.ascontiguousarray(x) for name, x in rough.items()})
+    solver = library.open(problem, library.options("sequential_impulses"))
+    solver.run(30, 0.0)
+    np.testing.assert_allclose(solver.impulse(), found.impulse, rtol=0.0, atol=1e-13)
+
+
+DUMP = """#include "lavender_dump.h"
+LAV_API int32_t dump(lav_solver *s, const lav_problem *q, const char *path) { return lav_dump(s, q, path); }
+"""
+
+
+def test_a_dumped_problem_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
+    (tmp_path / "dump.c").write_text(DUMP)
+    flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED", "-fPIC", "-shared", "-I", folder]
+    run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")
+    run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", tmp_path / "dump.c")
+    c, path = ct.CDLL(str(tmp_path / "dump.so")), tmp_path / "step.npz"
+    looked = set()
+    for given in GIVEN:
+        key = np.arange(given.n_blocks, dtype=np.uint64) + np.uint64(2**63)
+        problem = library.problem(given, key=key)
+        solver = library.open(problem, library.options("block_gauss_seidel"))
+        assert c.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
+        found = lv.load(path)
+        assert (
+            found.b.tobytes() == given.b.tobytes() and found.cones == given.cones and found.rows == given.rows
+        )
+        assert np.array_equal(found.key, key) and found.friction == given.friction
+        again = library.open(library.problem(found), library.options("block_gauss_seidel"))
+        solver.run(7, 0.0), again.run(7, 0.0)
+        assert solver.impulse().tobytes() == again.impulse().tobytes()
+        looked.add(given.operator)
+    assert looked == {"matrix", "rows", "generalized"}
+    missing = str(tmp_path / "no" / "such").encode()
+    assert c.dump(solver.at, ct.byref(problem), missing) == -20

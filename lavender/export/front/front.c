@@ -14,7 +14,8 @@ typedef struct where_t { /* what is refused: an array or a count, and the place 
 
 enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64 };
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
-static const double ROUNDED = 1e-5; /* above what float32 leaves of unit vectors and tensors after some turns */
+/* Above rounding of what was normalised in float64; above what float32 leaves of unit vectors and tensors after some turns. */
+static const double EXACT = 1e-9, ROUNDED = 1e-5;
 enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */
 
 typedef struct kept_t { /* impulses of the problem before, by key */
