@@ -172,7 +172,7 @@ class BuildWasm(Command):
 
 
 class BuildLibrary(Command):
-    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with it, header and bindings."""
+    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with all of it."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
@@ -191,14 +191,14 @@ class BuildLibrary(Command):
         if self.editable_mode:
             return  # `lavender export` makes it when it is first needed
         for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
-            if path.is_file() and path.suffix not in (".py", ".pyc", ".part") and "target" not in path.parts:
+            if path.is_file() and path.suffix not in (".py", ".pyc", ".part"):
                 out = Path(self.build_lib, path)
                 out.parent.mkdir(parents=True, exist_ok=True)
                 out.write_bytes(path.read_bytes())
                 self.written.append(str(out))
 
     def get_outputs(self):
-        """Source, header, bindings."""
+        """Source, header, and what lies beside them."""
         return self.written
 
     def get_output_mapping(self):

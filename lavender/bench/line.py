@@ -76,7 +76,7 @@ def code_of(record: Record) -> tuple[str, ...]:
 def c_of(record: Record) -> tuple[str, ...]:
     """The C calls of a record, on `options` and `budget`; none where the library lacks the solver or an option."""
     spec = registry.specs().get(record.solver)
-    if spec is None or spec.external or not spec.own or record.way == "batch":
+    if spec is None or spec.external or spec.delegates or not spec.own or record.way == "batch":
         return ()
     out = [f"lav_default_options(LAV_{record.solver.upper()}, &options)"]
     for key, value in {"order": record.order or "given", **record.options}.items():

@@ -12,7 +12,7 @@ __all__ = ["export"]
 
 
 @click.command()
-@click.argument("kind", type=click.Choice(["c", "rust", "npm"]))
+@click.argument("kind", type=click.Choice(["c", "npm"]))
 @click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
 @click.option(
     "--for", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
@@ -33,7 +33,7 @@ def export(
     vectors: int,
     replace: bool,
 ) -> None:
-    """Write the kernels for use without Python: a C library with one header, Rust crates, or an npm package."""
+    """Write the kernels for use without Python: a C library with one header, or an npm package."""
     from lavender.export import library
     from lavender.export import vectors as chosen
 

@@ -1,4 +1,4 @@
-"""The C library as a folder: its one source, its header, and how it is built; its bindings likewise."""
+"""The C library as a folder: its one source, its header, and how it is built; the package of npm likewise."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
-from lavender.export import bindings
 from lavender.export.amalgamate import CutFailed, amalgamate, source_hash
+from lavender.export.header import functions, javascript
 from lavender.io.stored import write_bytes, write_text
 from lavender.web import compile as wasm
 
@@ -20,9 +20,9 @@ __all__ = ["HEADER", "source", "write"]
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 HEADER = HERE / "c" / "lavender.h"
-TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".rs", ".toml", ".mjs", ".mts", ".json")
+TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".mjs", ".mts", ".json")
 #: Folders of what can be written, by name.
-KINDS = {"c": "c", "rust": "rust", "npm": "js"}
+KINDS = {"c": "c", "npm": "js"}
 
 
 def source() -> str:
@@ -60,11 +60,11 @@ def _files(folder: Path) -> Iterator[Path]:
 def write(
     kind: str, out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False
 ) -> list[Path]:
-    """Write a folder: the C library, the Rust crates, or the npm package.
+    """Write a folder: the C library, or the npm package.
 
     Parameters
     ----------
-    kind : {"c", "rust", "npm"}
+    kind : {"c", "npm"}
     out : Path
         A folder; made where it is not there. Files of other names in it stay.
     more : mapping, optional
@@ -86,13 +86,9 @@ def write(
     """
     folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
     made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
-    if kind == "rust":
-        made["lavender-sys/c/lavender.c"] = source()
-        made["lavender-sys/c/lavender.h"] = header
-        made["lavender-sys/src/lib.rs"] = bindings.rust(header)
-    elif kind == "npm":
-        made["header.mjs"], made["header.d.mts"] = bindings.javascript(header)
-    elif kind == "c":
+    if kind == "npm":
+        made["header.mjs"], made["header.d.mts"] = javascript(header)
+    else:
         made["lavender.c"] = source()
     sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
     made["SHA256SUMS"] = sums
@@ -110,7 +106,7 @@ def _module(header: str) -> bytes:
         work = Path(folder)
         (work / "lavender.c").write_text(text, encoding="utf-8")
         (work / "lavender.h").write_text(header, encoding="utf-8")
-        names = [name for _, name, _ in bindings.functions(header)]
+        names = [name for _, name, _ in functions(header)]
         try:
             wasm.build_library(work / kept.name, work / "lavender.c", names)
         except wasm.BuildFailed as error:

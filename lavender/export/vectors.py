@@ -1,13 +1,15 @@
 """Test vectors: problems of a report, the solver it recommends with its settings, and the bits that come of both.
 
 `vectors.bin` is read by `check.c`, which a build runs: 8 bytes of name, the number of vectors, then each as whole
-numbers of 8 bytes and arrays (bytes, data, padded to 8) in the order of `lav_problem`, -1 for null. Little-endian.
+numbers of 8 bytes and arrays (bytes, data, padded to 8): its steps, the problem in the order of `lav_problem` (-1 for
+null), and what is to come out. Little-endian.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +17,93 @@ import numpy as np
 
 import lavender as lv
 from lavender import bench, registry
+from lavender._arrays import FloatArray
 from lavender.bench.cases import fingerprint
-from lavender.bench.line import c_of
+from lavender.bench.record import Record
 from lavender.bench.store import Records, read
 from lavender.errors import InputError
 from lavender.export.library import HERE
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.io.stored import write_bytes
+from lavender.report import tables
 from lavender.report.moved import working
 from lavender.report.verdict import verdict
-from lavender.solvers.costs import METHODS as METHODS_OF_PLANS
+from lavender.solvers.costs import METHODS as CANDIDATES
+from lavender_ext.driver.driver import Driver
+from lavender_ext.newton.solve import OUTCOMES
 
-__all__ = ["chosen", "made", "pack", "pack_problem", "write_packed"]
+__all__ = ["Step", "made", "pack", "pack_problem", "steps_of", "write_packed"]
 
-MAGIC = b"LAVVEC1\0"
+MAGIC = b"LAVVEC2\0"
+COUNTED = ("sweeps", "factorisations", "solves")  # what the library counts as iterations
+
+
+CHOSEN = """/* What the report measured: {solver}, to a relative residual of {tol:g}, as steps.
+ *
+ * Each begins where the one before ended; the first that meets its tolerance is the last, and one that does not take a
+ * problem (lav_takes) is left out. Iterations are twice what the longest of the measured problems took. */
+#ifndef LAVENDER_CHOSEN_H
+#define LAVENDER_CHOSEN_H
+
+#include "lavender.h"
+
+typedef struct lav_step {{
+  lav_options options;
+  lav_budget budget;
+  int32_t relaxed; /* run it under LAV_CONE, whatever the problem's law is */
+}} lav_step;
+
+static const lav_step lav_chosen[{count}] = {{
+{lines}
+}};
+
+#endif
+"""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One method of the library and its work; it begins where the step before has ended."""
+
+    solver: str
+    iterations: int
+    tol: float
+    options: Mapping[str, Any] = field(default_factory=dict)
+    relaxed: bool = False  # under the law of the cone, whatever the problem's is
+
+    def whole(self) -> tuple[int, ...]:
+        """Whole numbers of `lav_options` but its seed: method, order, memory, sweep, convex, keeps."""
+        return (METHODS[self.solver], *choices(self.solver, self.options)[0])
+
+    def packed(self) -> bytes:
+        """As check.c reads it."""
+        omega = choices(self.solver, self.options)[1]
+        return struct.pack("<7qdqdq", *self.whole(), 0, omega, self.iterations, self.tol, self.relaxed)
+
+    def text(self) -> str:
+        """As C has it: options, budget, relaxed."""
+        whole, omega = ", ".join(map(str, self.whole()[1:])), choices(self.solver, self.options)[1]
+        options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {whole}, 0, 0, {omega!r}"
+        budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0"
+        return f"{{{{{options}}}, {{{budget}}}, {int(self.relaxed)}}}"
+
+
+def steps_of(found: lv.Solution, step: Step) -> list[Step]:
+    """What a solve did: the step itself, or the turns of `auto`, each solver once with twice all of its work."""
+    if step.solver != "auto":
+        return [step]
+    done: dict[tuple[str, bool], int] = {}
+    for turn in found.turns:
+        of, _, name = turn.solver.rpartition(": ")
+        key = name.split()[0], of == "relaxation"
+        pivots = key[0] in ("direct", "lemke")  # which end by themselves
+        counted = 0 if pivots else max((turn.work.get(kind, 0) for kind in COUNTED), default=0)
+        done[key] = done.get(key, 0) + (2 * counted or registry.specs()[key[0]].max_iter)
+    steps = []
+    for (name, relaxed), count in (done or {("anderson", False): 1}).items():
+        options = CANDIDATES[name][1] if name in CANDIDATES else {}
+        steps.append(replace(step, solver=name, iterations=count, options=options, relaxed=relaxed))
+    return steps
 
 
 def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
@@ -49,48 +124,65 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
         No such solver, or one that the library does not have, or no problem that can be had again.
     """
     records = working(read(path).latest())  # what the report itself recommends by
-    record = chosen(records, solver)
+    measured = _chosen(records, solver)
     packed: list[bytes] = []
     left: list[str] = []
-    for case, sha in dict.fromkeys(
-        (r.case, r.sha) for r in records if r.solver == record.solver and r.success
-    ):
-        if len(packed) < most:
-            try:
-                problem = _again(records, case, sha)
-                packed.append(pack(problem, record.solver, record.tol, record.max_iter, record.options))
-            except (NotTaken, lv.LavenderError) as error:
-                left.append(f"{case}: {error}")
+    steps: dict[tuple[str, bool], Step] = {}
+    for record in {(r.case, r.sha): r for r in measured}.values():
+        if len(packed) >= most and record.solver != "auto":
+            break
+        try:
+            problem = _again(records, record)
+            vector, ran = _pack(problem, record.solver, record.tol, record.max_iter, record.options)
+        except (NotTaken, lv.LavenderError) as error:
+            left.append(f"{record.case}: {error}")
+            continue
+        packed.append(vector)
+        for step in ran:
+            key = step.solver, step.relaxed
+            most_so_far = steps[key].iterations if key in steps else 0
+            steps[key] = replace(step, iterations=max(step.iterations, most_so_far))
     if not packed:
         raise InputError(
-            f"no problem of {record.solver} in {path} makes a test vector: {'; '.join(left[:3])}"
+            f"no problem of {measured[0].solver} in {path} makes a test vector: {'; '.join(left[:3])}"
         )
-    text = (
-        f"/* What the report measured: {record.solver}, to a relative residual of {record.tol:g}. */\n"
-        '#include "lavender.h"\n\n'
-        "static inline void lav_chosen(lav_options *options, lav_budget *budget) {\n"
-        + _turns_of(records, record)
-        + "".join(f"  {_by_pointer(line)};\n" for line in c_of(record))
-        + (
-            "  options->turns = turns;\n  options->n_turns = sizeof turns / sizeof *turns / 2;\n"
-            if record.solver == "auto"
-            else ""
-        )
-        + "}\n"
-    )
+    if len(steps) == 1 and measured[0].solver != "auto":  # twice what the longest took
+        key, step = steps.popitem()
+        longest = 2 * max(r.iterations for r in measured)
+        steps[key] = replace(step, iterations=max(1, min(longest, step.iterations)))
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
-    return {"vectors.bin": _file_of(packed), "check.c": check, "chosen.h": text}
+    lines = ",\n".join(f"  {step.text()}" for step in steps.values())
+    header = CHOSEN.format(solver=measured[0].solver, tol=measured[0].tol, count=len(steps), lines=lines)
+    return {"vectors.bin": _file_of(packed[:most]), "check.c": check, "chosen.h": header}
 
 
-def _again(records: Records, case: str, sha: str) -> lv.Problem:
+def _chosen(records: Records, solver: str | None) -> list[Record]:
+    """Runs of the solver that is written, to the level that the report recommends by, or else its tightest."""
+    solved = [r for r in records if r.success and r.mode == "tol" and r.way == "call"]
+    names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
+    if solver is None:
+        leaders = verdict(records).leaders
+        solver = next((name for name in leaders if name in names), None)
+    if solver not in names:
+        have = ", ".join(names) or "none"
+        raise InputError(
+            f"{solver or 'what is recommended'} is not in the C library; of these records are: {have} (--solver)"
+        )
+    mine, levels = [r for r in solved if r.solver == solver], tables.levels_of(records)
+    level = levels[len(levels) // 2]
+    tol = level if any(r.tol == level for r in mine) else min(r.tol for r in mine)
+    return [r for r in mine if r.tol == tol and r.options == mine[0].options]
+
+
+def _again(records: Records, record: Record) -> lv.Problem:
     """The problem that was measured, from where the report had it; InputError where other numbers stand there now."""
-    if case not in records.cases:
+    if record.case not in records.cases:
         raise InputError("the records do not say where it is from")
-    source = records.cases[case].source
+    source = records.cases[record.case].source
     problem = bench.resolve([source])[0].problem
     now = fingerprint(problem)
-    if now != sha:
-        raise InputError(f"{source} is another problem here, hash {now}; measured was {sha}")
+    if now != record.sha:
+        raise InputError(f"{source} is another problem here, hash {now}; measured was {record.sha}")
     return problem
 
 
@@ -103,64 +195,59 @@ def _file_of(packed: Sequence[bytes]) -> bytes:
     return MAGIC + struct.pack("<q", len(packed)) + b"".join(packed)
 
 
-def _by_pointer(line: str) -> str:
-    return line.replace("&", "").replace("options.", "options->").replace("budget.", "budget->")
-
-
-def _turns_of(records: Records, record: Any) -> str:
-    """The plan of `auto` for the record's problem as turns in C; empty for the others."""
-    if record.solver != "auto":
-        return ""
-    plan = lv.explain(_again(records, record.case, record.sha), record.tol)
-    return (
-        f"  static const int32_t turns[] = {{{', '.join(map(str, turns(plan)))}}}; /* lavender.explain */\n"
-    )
-
-
-def turns(plan: lv.Plan) -> list[int]:
-    """`lav_options.turns` of a plan: each candidate's number and expected iterations, the least expected cost first."""
-    solvers = [(METHODS[METHODS_OF_PLANS[name][0]], cost) for name, cost in plan.candidates]
-    first = {number: max(1, round(cost.count)) for number, cost in reversed(solvers)}
-    return [x for number, _ in solvers if number in first for x in (number, first.pop(number))]
-
-
-def chosen(records: Any, solver: str | None) -> Any:
-    """The record whose solver and settings are written."""
-    solved = [r for r in records if r.success and r.mode == "tol"]
-    mine = [r for r in solved if r.solver in METHODS]
-    names = sorted({r.solver for r in mine})
-    if solver is None:
-        leaders = verdict(records).leaders
-        solver = next((name for name in leaders if name in names), None)
-    if solver not in names:
-        have = ", ".join(names) or "none"
-        raise InputError(
-            f"{solver or 'what is recommended'} is not in the C library; of these records are: {have} (--solver)"
-        )
-    return min((r for r in mine if r.solver == solver), key=lambda r: r.tol)
-
-
 def pack(problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]) -> bytes:
     """One vector; NotTaken where the library does not do what the package did."""
-    numbers, doubles = choices(solver, options)
-    given = pack_problem(problem, solver)
+    return _pack(problem, solver, tol, max_iter, options)[0]
+
+
+def _pack(
+    problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]
+) -> tuple[bytes, list[Step]]:
+    """One vector and the steps in it: bits of the package, or by the judge's verdict alone where it has others."""
     max_iter = max_iter or registry.specs()[solver].max_iter
     found = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
     form = found.solver.form
-    if problem.matrix is None and ("rows of A" in form or (solver == "pgs" and form != "whitened J")):
-        raise NotTaken(f"{solver} formed A, which the library does not")
-    out = struct.pack("<6q", METHODS[solver], *numbers) + struct.pack("<Q", 0) + struct.pack("<d", doubles)
-    steps = turns(lv.explain(problem, tol)) if solver == "auto" else []
-    out += struct.pack("<qd", max_iter, tol) + struct.pack(f"<{len(steps) + 1}q", len(steps) // 2, *steps)
-    is_met = solver in OTHER_BITS  # by the judge's verdict alone
-    relative = tol if is_met else found.residual.relative
-    return out + given + struct.pack("<qd", is_met, relative) + (b"" if is_met else found.impulse.tobytes())
+    if ", then" in form or (
+        problem.matrix is None and ("rows of A" in form or (solver == "pgs" and form != "whitened J"))
+    ):
+        raise NotTaken(f"{solver} formed A, which the library does not: give it the matrix, problem.csr")
+    steps = [s for s in steps_of(found, Step(solver, max_iter, tol, options)) if takes(problem, s.solver)]
+    given = pack_problem(problem, solver, bool(steps))
+    impulse, relative = found.impulse, found.residual.relative
+    if solver == "newton" and problem.generalized is None:
+        impulse = driven(problem, tol, max_iter)[0]
+        relative = lv.residual(problem, impulse).relative
+    is_met = solver in OTHER_BITS
+    out = struct.pack("<q", len(steps)) + b"".join(step.packed() for step in steps) + given
+    return out + struct.pack("<qd", is_met, tol if is_met else relative) + (
+        b"" if is_met else impulse.tobytes()
+    ), steps
 
 
-def pack_problem(problem: Any, solver: str) -> bytes:
+def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, int]:
+    """Impulse and factorisations of `newton` over A or bodies by the compiled driver, which the library has.
+
+    `lavender.solve` tries warm sweeps and joints alone before it, and looks for certificates between its turns.
+
+    Raises
+    ------
+    NotTaken
+        The driver does not take the problem.
+    """
+    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    driver, impulse, how = Driver(problem.metric, tol, budget), problem.start().copy(), OUTCOMES["more"]
+    done = 0
+    if not driver.start(impulse):
+        raise NotTaken("the compiled driver of newton does not take this problem")
+    while how in (OUTCOMES["more"], OUTCOMES["certificate"]):
+        how, done, _, _ = driver.step(10**6, impulse)
+    return impulse, done
+
+
+def pack_problem(problem: Any, solver: str, taken: bool | None = None) -> bytes:
     """The problem itself: counts, then arrays in the order of `lav_problem`; NotTaken where the method refuses it."""
     given = view(problem)
-    if not takes(problem, solver):
+    if not (takes(problem, solver) if taken is None else taken):
         raise NotTaken(
             f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
         )

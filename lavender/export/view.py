@@ -11,7 +11,7 @@ import numpy as np
 from lavender import registry
 from lavender.cones import CONTACT_ROLLING, ROUND, ROW
 from lavender.errors import InputError
-from lavender.export.bindings import constants, struct_fields
+from lavender.export.header import constants, struct_fields
 from lavender.export.library import HEADER
 from lavender.problem import Problem
 
@@ -39,9 +39,9 @@ BODIES = (
 METHODS = {
     name: constants(_HEADER)[f"LAV_{name.upper()}"]
     for name, spec in registry.specs().items()
-    if spec.own and not spec.external
+    if spec.own and not spec.external and not spec.delegates
 }
-#: Those whose factor is another in the package, or whose turns are chosen there: other bits, the same judge.
+#: Those whose factor is another in the package, or which stand for steps of others: other bits, the same judge.
 OTHER_BITS = ("admm", "auto")
 ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
 SWEEPS = {None: 0, "pgs": 1, "blocks": 2}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from shlex import quote
 
 from lavender.bench.line import c_of
 from lavender.bench.record import Record, level_name
@@ -180,10 +181,9 @@ def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     timed = f"{seconds(time)}, {what}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
     calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
-    made = "lavender export c"
-    if final.line.solver == "auto":
-        made += " --for records.jsonl, which writes the turns that options are to name"
-    in_c = [f"# in C ({made}): {calls}, lav_run(solver, &budget, &result);"] if calls else []
+    in_c = [f"# in C (docs/c.md): {calls}, lav_run(solver, &budget, &result);"] if calls else []
+    if final.line.solver == "auto" and records.source:  # its steps, as data
+        in_c = [f"# in C: lavender export c liblavender --solver auto --for {quote(records.source)}"]
     if calls and reason:
         in_c = [f"# not in C: {reason}"]
     if final.line.start == "carried":

@@ -14,19 +14,21 @@ cdef extern from *:
     #define lavender_at(x, offset) ((double*)((char*)(x) + (offset)))
     #if defined(__GNUC__) && !defined(LAVENDER_ONE_LANE)
     #define LAVENDER_LANES 2
-    #define lavender_both(x) ((lavender_pair){(x), (x)})
+    #define lavender_both(x) lavender_of((x), (x))
+    #define LAVENDER_INLINE static inline __attribute__((always_inline))
     typedef double lavender_pair __attribute__((vector_size(16)));
     typedef long long lavender_pair_bits __attribute__((vector_size(16)));
-    static inline lavender_pair lavender_gather(const double* x, const double* y) {
-        return (lavender_pair){*x, *y};
+    LAVENDER_INLINE lavender_pair lavender_of(double x, double y) {
+        const lavender_pair z = {x, y};
+        return z;
     }
-    typedef double lavender_two __attribute__((vector_size(16), aligned(8)));
-    #define LAVENDER_INLINE static inline __attribute__((always_inline))
+    static inline lavender_pair lavender_gather(const double* x, const double* y) { return lavender_of(*x, *y); }
+    typedef double lavender_near __attribute__((vector_size(16), aligned(8)));
     LAVENDER_INLINE void lavender_gather_six(const double* x, const double* y, lavender_pair* z) {
         for (int k = 0; k < 6; k += 2) {
-            const lavender_two a = *(const lavender_two*)(x + k), b = *(const lavender_two*)(y + k);
-            z[k] = (lavender_pair){a[0], b[0]};
-            z[k + 1] = (lavender_pair){a[1], b[1]};
+            const lavender_near a = *(const lavender_near*)(x + k), b = *(const lavender_near*)(y + k);
+            z[k] = lavender_of(a[0], b[0]);
+            z[k + 1] = lavender_of(a[1], b[1]);
         }
     }
     static inline void lavender_scatter(double* x, double* y, lavender_pair z) {
@@ -35,12 +37,12 @@ cdef extern from *:
     }
     LAVENDER_INLINE void lavender_scatter_six(double* x, double* y, const lavender_pair* z) {
         for (int k = 0; k < 6; k += 2) {
-            *(lavender_two*)(x + k) = (lavender_two){z[k][0], z[k + 1][0]};
-            *(lavender_two*)(y + k) = (lavender_two){z[k][1], z[k + 1][1]};
+            *(lavender_near*)(x + k) = lavender_of(z[k][0], z[k + 1][0]);
+            *(lavender_near*)(y + k) = lavender_of(z[k][1], z[k + 1][1]);
         }
     }
     static inline lavender_pair lavender_not_below_zero(lavender_pair y) {
-        return (lavender_pair)(~(lavender_pair_bits)(y < (lavender_pair){0.0, 0.0}) & (lavender_pair_bits)y);
+        return (lavender_pair)(~(lavender_pair_bits)(y < lavender_both(0.0)) & (lavender_pair_bits)y);
     }
     static inline lavender_pair lavender_select(lavender_pair_bits m, lavender_pair x, lavender_pair y) {
         return (lavender_pair)((m & (lavender_pair_bits)x) | (~m & (lavender_pair_bits)y));

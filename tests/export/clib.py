@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from lavender.export import HEADER
-from lavender.export.bindings import struct_fields
+from lavender.export.header import struct_fields
 from lavender.export.view import METHODS, view
 
 COUNTS = (
@@ -46,6 +46,8 @@ class Library:
         self.c.lav_velocity.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int32]
         self.c.lav_islands.argtypes = [ct.c_void_p, ct.c_void_p, ct.c_int32]
         self.c.lav_text.restype = self.c.lav_name.restype = self.c.lav_outcome.restype = ct.c_char_p
+        self.c.lav_refused.restype = ct.c_char_p
+        self.c.lav_refused.argtypes = [ct.c_void_p, ct.c_void_p]
         self.c.lav_hash.restype = self.c.lav_needed.restype = ct.c_uint64
         self.c.lav_needed.argtypes = [ct.c_void_p]
         self.c.lav_hash.argtypes = [ct.c_void_p, ct.c_int32, ct.c_uint64]

@@ -233,7 +233,6 @@ COMMANDS = [
     ("solve", "stack(n=2)", "--output", "solution.npz"),
     ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
     ("export", "c", "c", "--for", "report"),
-    ("export", "rust", "rust"),
     ("web", "page", "page"),
 ]  # fmt: skip
 
@@ -269,7 +268,6 @@ def test_every_command_writes_files_under_other_names_first(tmp_path):
         "t.csv",
         "t.gif",
         "c",
-        "rust",
         "page",
         "phenomena.json",
     }

@@ -220,6 +220,7 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
         record("a", "auto", 4e-3, 1e-7), record("b", "auto", 4e-2, 1e-7),
         record("a", "pgs", 1e-4, 1e-1, max_iter=8, **budget), record("b", "pgs", 1e-4, 1e-1, max_iter=8, **budget),
     )  # fmt: skip
+    found.source = "my report/records.jsonl"
     said = verdict(found, [1e-3, 1.0])
     assert said.sentences == (
         "Use auto: 12.7 ms to 1e-6 on your 2 stacks (at worst 40.0 ms: b).",
@@ -230,14 +231,10 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     )
     assert said.code == (  # records of old: of prepare and solve
         'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call',
-        (
-            "# in C (lavender export c --for records.jsonl, which writes the turns that options are to name): "
-            "lav_default_options(LAV_AUTO, &options), lav_default_budget(&budget), budget.tol = 1e-06, "
-            "budget.iterations = 1000000, lav_run(solver, &budget, &result);"
-        ),
+        "# in C: lavender export c liblavender --solver auto --for 'my report/records.jsonl'",
         'lv.solve(problem, "pgs", tol=0, max_iter=8)  # not timed as a line: 100 µs, for 1.00 ms',
         (
-            "# in C (lavender export c): lav_default_options(LAV_PGS, &options), lav_default_budget(&budget), "
+            "# in C (docs/c.md): lav_default_options(LAV_PGS, &options), lav_default_budget(&budget), "
             "budget.tol = 0, budget.iterations = 8, lav_run(solver, &budget, &result);"
         ),
     )

@@ -56,14 +56,18 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_FRICTION = -6,    /* mu or patch_radius is negative, or a contact with mu has no row to feel it */
   LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts */
   LAV_ERROR_INDEX = -8,       /* a column, body or place in the order is out of range, or columns do not ascend */
-  LAV_ERROR_MASS = -9,        /* an inverse mass is negative, or M is not positive definite */
+  LAV_ERROR_MASS = -9,        /* an inverse mass or a compliance is negative, an inertia is no positive semidefinite tensor, or M is not positive definite */
   LAV_ERROR_ROOM = -10,       /* too little memory: give as many bytes as lav_needed or lav_room says */
   LAV_ERROR_UNSUPPORTED = -11, /* this method of this build does not take this form, law or kind of block: lav_takes asks beforehand */
   LAV_ERROR_OPTION = -12,     /* an option is out of its range */
   LAV_ERROR_BUSY = -13,       /* another thread is in this solver: one at a time */
   LAV_ERROR_NO_PROBLEM = -14, /* no problem is set: lav_set comes first, and must have succeeded */
   LAV_ERROR_SOLVER = -15,     /* this is no solver: not opened, or its memory was written over */
-  LAV_ERROR_SELF_TEST = -16   /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
+  LAV_ERROR_SELF_TEST = -16,  /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
+  LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact that moves nothing: leave it out */
+  LAV_ERROR_FRAME = -18,      /* normal and tangent of a contact are no orthogonal unit vectors, to 1e-5: divide each by its length */
+  LAV_ERROR_BODIES = -19,     /* newton takes 1,500 bodies at most: its factor may be full. Take sweeps or anderson, or solve islands apart */
+  LAV_ERROR_FILE = -20        /* a file cannot be written, by lav_dump alone: is there such a folder, and is there room? */
 };
 
 enum { LAV_MATRIX = 1, LAV_BODIES = 2, LAV_VELOCITIES = 3 };      /* form: A; bodies, joints, contacts; J and M */
@@ -84,8 +88,7 @@ enum { /* methods; names as in Python, by `lav_name` */
   LAV_NEWTON = 9,              /* all forms; rolling and round cones with J and M alone */
   LAV_DIRECT = 10,             /* A, bodies; rows alone */
   LAV_LEMKE = 11,              /* A, bodies; rows alone */
-  LAV_ADMM = 12,               /* A, bodies; dense */
-  LAV_AUTO = 13                /* all forms: others in turns, `turns` of the options */
+  LAV_ADMM = 12                /* A, bodies; dense */
 };
 
 enum { /* how a run ended; a claim, which `relative` beside it may contradict */
@@ -147,11 +150,9 @@ typedef struct lav_options {
   int32_t sweep;               /* anderson, nncg: LAV_DEFAULT_SWEEP (blocks under the cone law, else pgs) | ... */
   int32_t convex;              /* anderson, nncg: iterations under the cone law first */
   int32_t keeps;               /* nncg: 1 restarts only against the sweep */
-  int32_t n_turns;             /* auto: of `turns`, 0 to 16; 0: the library's own for the problem */
+  int32_t unused;
   uint64_t seed;               /* of LAV_RANDOM */
   double omega;                /* sor: 0 to 2; jacobi: > 0, or 0 for the safe damping */
-  const int32_t *turns;        /* (n_turns, 2) auto: method and iterations of each turn; after the last one the first again, with
-                                  four times as many; copied by `lav_open` */
 } lav_options;
 
 typedef struct lav_budget {
@@ -191,7 +192,7 @@ typedef struct lav_result {
   int32_t iterations;          /* of this run */
   int32_t sweeps;
   int32_t restarts;            /* of anderson and nncg; blocks without an exact answer; factorisations of the others */
-  int32_t method;              /* that made the impulse: auto names another one */
+  int32_t unused;
   lav_verdict verdict;
 } lav_result;
 
@@ -208,17 +209,23 @@ LAV_API int32_t lav_default_budget(lav_budget *out); /* 1000 iterations, tol 1e-
 /* Whether a method takes a problem of this form, law and kinds, which are read; LAV_OK or LAV_ERROR_UNSUPPORTED. */
 LAV_API int32_t lav_takes(const lav_problem *problem, const lav_options *options);
 
-/* Bytes for a solver of problems with at most these counts. Arrays may be null; block_ptr alone is read, where there are
+/* Bytes for a solver of problems with at most these counts (a hint: what binds later is memory alone). Arrays may be null; block_ptr alone is read, where there are
  * joints: it tells their rows from those of contacts. What a factor fills and which columns M's trees join is guessed:
  * `lav_set` tells when it is more. */
 LAV_API int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes);
 LAV_API int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options,
                          lav_solver **out);
 LAV_API uint64_t lav_needed(const lav_solver *solver); /* bytes that the last `lav_set` asked for */
+/* The solver in other memory, with its options and the impulses that it carries: for one that lav_set found too small. What
+ * it was in before is the caller's again. */
+LAV_API int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out);
+/* The array, or count, that the last lav_set refused, and the place in it; null where it refused none. */
+LAV_API const char *lav_refused(const lav_solver *solver, int32_t *index);
 
 /* A new problem, or new numbers: impulses come from `impulse`, from blocks of the same key, kind and rows, or Pi(0). */
 LAV_API int32_t lav_set(lav_solver *solver, const lav_problem *problem);
-/* More iterations, from where the last run ended. The best impulse found is kept, a budget of tol 0 keeps the last. */
+/* More iterations, from where the last run ended. The best impulse found is kept, a budget of tol 0 keeps the last;
+ * newton's is never worse than its start or than doing nothing. */
 LAV_API int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out);
 /* Problems first, first + stride, ... of a batch: a thread for each `first`. results (n); the worst error of all. */
 LAV_API int32_t lav_run_many(lav_solver *const *solvers, int32_t n, int32_t first, int32_t stride,

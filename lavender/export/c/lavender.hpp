@@ -1,10 +1,11 @@
-// lavender.h for C++17: a problem that owns its arrays, a solver that owns its memory, errors thrown here and only here.
+// lavender.h for C++11 and later: a problem that owns its arrays, a solver that owns its memory, errors thrown here alone.
 #ifndef LAVENDER_HPP
 #define LAVENDER_HPP
 
 #include <cstdint>
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "lavender.h"
@@ -27,7 +28,7 @@ struct span { // what std::span of C++20 is, as far as it is needed
 
 struct error : std::runtime_error {
   std::int32_t code;
-  explicit error(std::int32_t given) : std::runtime_error(lav_text(given)), code(given) {}
+  explicit error(std::int32_t given, const std::string &where = "") : std::runtime_error(where + lav_text(given)), code(given) {}
 };
 
 inline std::int32_t check(std::int32_t code) {
@@ -105,19 +106,23 @@ class contact_problem {
   std::vector<double> mu_, numbers_;
 };
 
-// A solver and its memory, which grows where a problem asks for more; impulses then start anew.
+// A solver and its memory, which at least doubles where a problem asks for more; impulses move with it.
 class solver {
  public:
   explicit solver(const lav_options &given) : options_(given) {}
 
   void set(const lav_problem &problem) {
-    if (!at_) open(problem, 0);
+    if (!at_) open(problem);
     std::int32_t code = lav_set(at_, &problem);
     for (int turn = 0; code == LAV_ERROR_ROOM && turn < 40; turn++) {
-      open(problem, lav_needed(at_));
+      grow();
       code = lav_set(at_, &problem);
     }
-    check(code);
+    if (code < 0) {
+      std::int32_t index = 0;
+      const char *array = lav_refused(at_, &index);
+      throw error(code, array ? std::string(array) + "[" + std::to_string(index) + "]: " : "");
+    }
     rows_ = static_cast<std::size_t>(problem.n_rows);
     speeds_ = problem.form == LAV_BODIES ? 6 * static_cast<std::size_t>(problem.n_bodies)
                                          : static_cast<std::size_t>(problem.n_velocities);
@@ -147,14 +152,20 @@ class solver {
   lav_solver *get() const { return at_; }
 
  private:
-  void open(const lav_problem &problem, std::uint64_t needed) {
-    std::uint64_t bytes = 0;
-    check(lav_room(&problem, &options_, &bytes));
-    if (bytes < needed) bytes = needed;
-    memory_.reset(new double[bytes / 8 + 2]);
-    check(lav_open(memory_.get(), bytes, &problem, &options_, &at_));
+  void open(const lav_problem &problem) {
+    check(lav_room(&problem, &options_, &bytes_));
+    memory_.reset(new double[bytes_ / 8 + 2]);
+    check(lav_open(memory_.get(), bytes_, &problem, &options_, &at_));
+  }
+  void grow() {
+    const std::uint64_t needed = lav_needed(at_);
+    bytes_ = needed > 2 * bytes_ ? needed : 2 * bytes_;
+    std::unique_ptr<double[]> more(new double[bytes_ / 8 + 2]);
+    check(lav_move(at_, more.get(), bytes_, &at_));
+    memory_.swap(more);
   }
   lav_options options_;
+  std::uint64_t bytes_ = 0;
   std::unique_ptr<double[]> memory_;
   lav_solver *at_ = nullptr;
   std::size_t rows_ = 0, speeds_ = 0;

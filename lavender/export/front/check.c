@@ -28,64 +28,100 @@ static void *array(int64_t bytes) {
 
 #define CHECK(call)                                                                             \
   do {                                                                                          \
-    const int32_t code = (call);                                                                \
-    if (code != LAV_OK) return fprintf(stderr, "%s: %s\n", #call, lav_text(code)), 1;           \
+    const int32_t code_ = (call);                                                               \
+    if (code_ != LAV_OK) return fprintf(stderr, "%s: %s\n", #call, lav_text(code_)), 1;         \
   } while (0)
 
-static int solve_one(int64_t number) {
-  lav_problem q;
+typedef struct step_t {
   lav_options options;
   lav_budget budget;
-  lav_result result;
-  lav_solver *solver = NULL;
-  uint64_t bytes, i;
-  double relative, *impulse = NULL, *found;
-  int32_t turns[32], is_met;
-  CHECK(lav_default_options((int32_t)whole(), &options));
-  CHECK(lav_default_budget(&budget));
-  options.order = (int32_t)whole(), options.memory = (int32_t)whole(), options.sweep = (int32_t)whole();
-  options.convex = (int32_t)whole(), options.keeps = (int32_t)whole(), options.seed = (uint64_t)whole(), options.omega = real();
-  budget.iterations = (int32_t)whole(), budget.tol = real();
-  options.n_turns = (int32_t)whole(), options.turns = turns;
-  for (i = 0; i < 2 * (uint64_t)options.n_turns && i < 32; i++) turns[i] = (int32_t)whole();
-  CHECK(lav_default_problem((int32_t)whole(), &q));
-  q.law = (int32_t)whole(), q.n_blocks = (int32_t)whole(), q.n_rows = (int32_t)whole(), q.n_entries = (int32_t)whole();
-  q.n_bodies = (int32_t)whole(), q.n_joints = (int32_t)whole(), q.n_velocities = (int32_t)whole();
-  q.n_mass_entries = (int32_t)whole();
-  {
-    const void **at = (const void **)(void *)&q.block_ptr, **end = (const void **)(void *)(&q + 1); /* pointers to the end */
-    for (; at < end; at++) {
-      const int64_t size = whole();
-      *at = size < 0 ? NULL : array(size);
-    }
+  int32_t relaxed;
+} step_t;
+
+static step_t read_step(void) {
+  step_t s;
+  lav_default_options((int32_t)whole(), &s.options);
+  lav_default_budget(&s.budget);
+  s.options.order = (int32_t)whole(), s.options.memory = (int32_t)whole(), s.options.sweep = (int32_t)whole();
+  s.options.convex = (int32_t)whole(), s.options.keeps = (int32_t)whole(), s.options.seed = (uint64_t)whole();
+  s.options.omega = real(), s.budget.iterations = (int32_t)whole(), s.budget.tol = real(), s.relaxed = (int32_t)whole();
+  return s;
+}
+
+static void read_problem(lav_problem *q) {
+  const void **at, **end;
+  lav_default_problem((int32_t)whole(), q);
+  q->law = (int32_t)whole(), q->n_blocks = (int32_t)whole(), q->n_rows = (int32_t)whole(), q->n_entries = (int32_t)whole();
+  q->n_bodies = (int32_t)whole(), q->n_joints = (int32_t)whole(), q->n_velocities = (int32_t)whole();
+  q->n_mass_entries = (int32_t)whole();
+  at = (const void **)(void *)&q->block_ptr, end = (const void **)(void *)(q + 1); /* pointers to the end */
+  for (; at < end; at++) {
+    const int64_t size = whole();
+    *at = size < 0 ? NULL : array(size);
   }
-  is_met = (int32_t)whole(), relative = real(); /* a residual to be met, or bits */
+}
+
+/* A solver with a problem, in memory of its own that grows as it asks. */
+static int set(const lav_options *options, const lav_problem *q, void **memory, lav_solver **solver) {
+  uint64_t bytes;
+  int32_t code = LAV_ERROR_ROOM;
+  CHECK(lav_room(q, options, &bytes));
+  while (code == LAV_ERROR_ROOM) {
+    free(*memory);
+    *memory = malloc(bytes);
+    CHECK(lav_open(*memory, bytes, q, options, solver));
+    code = lav_set(*solver, q);
+    bytes = lav_needed(*solver);
+  }
+  CHECK(code);
+  return 0;
+}
+
+/* One step on a problem, from q->impulse where it is not null, into found. */
+static int run_step(const step_t *s, const lav_problem *q, double *found, lav_result *result, void **memory) {
+  lav_solver *solver = NULL;
+  lav_budget budget = s->budget;
+  lav_problem given = *q;
+  if (s->relaxed) given.law = LAV_CONE;
+  if (set(&s->options, &given, memory, &solver)) return 1;
+  CHECK(lav_run(solver, &budget, result));
+  CHECK(lav_impulse(solver, found, q->n_rows));
+  if (!s->relaxed) return 0;
+  given.law = q->law, given.impulse = found, budget.iterations = 0; /* judged by the problem's own law */
+  if (set(&s->options, &given, memory, &solver)) return 1;
+  CHECK(lav_run(solver, &budget, result));
+  return 0;
+}
+
+static int solve_one(void) {
+  const int64_t n = whole();
+  step_t *steps = (step_t *)calloc((size_t)n, sizeof *steps);
+  lav_problem q;
+  lav_result result;
+  double relative, *impulse = NULL, *found;
+  void *memory = NULL;
+  int64_t i;
+  int is_met, same;
+  for (i = 0; i < n; i++) steps[i] = read_step();
+  read_problem(&q);
+  is_met = (int)whole(), relative = real(); /* a residual to be met, or bits */
   if (!is_met) impulse = (double *)array(8 * (int64_t)q.n_rows);
   found = (double *)calloc((size_t)q.n_rows + 1, 8);
   memset(&result, 0, sizeof result);
   result.size = sizeof result;
-  CHECK(lav_room(&q, &options, &bytes));
-  for (;;) {
-    int32_t set;
-    CHECK(lav_open(malloc(bytes), bytes, &q, &options, &solver));
-    set = lav_set(solver, &q);
-    if (set != LAV_ERROR_ROOM) {
-      CHECK(set);
-      break;
-    }
-    bytes = lav_needed(solver);
+  for (i = 0; i < n; i++) {
+    if (run_step(&steps[i], &q, found, &result, &memory)) return 1;
+    if (result.verdict.relative <= steps[i].budget.tol) break;
+    q.impulse = found;
   }
-  CHECK(lav_run(solver, &budget, &result));
-  CHECK(lav_impulse(solver, found, q.n_rows));
-  {
-    const int same = is_met ? result.verdict.relative <= relative
-                            : memcmp(found, impulse, 8 * (size_t)q.n_rows) == 0 && memcmp(&relative, &result.verdict.relative, 8) == 0;
-    printf("%s  %016llx  %s on %d rows: %s, residual %.2e\n", !same ? "DIFFERS" : is_met ? "met    " : "same   ",
-           (unsigned long long)lav_hash(found, q.n_rows, 0), lav_name(options.method), q.n_rows, lav_outcome(result.outcome),
-           result.verdict.relative);
-    (void)number;
-    return !same;
-  }
+  i = i < n ? i : n - 1;
+  same = is_met ? result.verdict.relative <= relative
+                : memcmp(found, impulse, 8 * (size_t)q.n_rows) == 0 && memcmp(&relative, &result.verdict.relative, 8) == 0;
+  printf("%s  %016llx  %s on %d rows: %s, residual %.2e\n", !same ? "DIFFERS" : is_met ? "met    " : "same   ",
+         (unsigned long long)lav_hash(found, q.n_rows, 0), lav_name(steps[i].options.method), q.n_rows,
+         lav_outcome(result.outcome), result.verdict.relative);
+  free(found), free(steps), free(memory);
+  return !same;
 }
 
 int main(int count, char **words) {
@@ -94,7 +130,7 @@ int main(int count, char **words) {
   int bad = 0;
   CHECK(lav_self_test());
   file = fopen(count > 1 ? words[1] : "vectors.bin", "rb");
-  if (!file || fread(magic, 8, 1, file) != 1 || memcmp(magic, "LAVVEC1", 8) != 0) return fprintf(stderr, "no vectors.bin here\n"), 2;
-  for (n = whole(), i = 0; i < n; i++) bad += solve_one(i);
+  if (!file || fread(magic, 8, 1, file) != 1 || memcmp(magic, "LAVVEC2", 8) != 0) return fprintf(stderr, "no vectors.bin here\n"), 2;
+  for (n = whole(), i = 0; i < n; i++) bad += solve_one();
   return bad > 0;
 }

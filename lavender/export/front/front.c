@@ -7,9 +7,15 @@ typedef struct core_generalized_generalized_t general_t;
 typedef struct judge_score_score_t score_t;
 typedef void (*sweep_t)(void *, double *, int32_t, int32_t);
 
+typedef struct where_t { /* what is refused: an array or a count, and the place in it */
+  const char *array;
+  int32_t index;
+} where_t;
+
 enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64 };
-enum { MOST_TURNS = 16, FEW_ROWS = 600 }; /* of auto, and up to which it forms dense matrices */
 enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
+/* Above rounding of what was normalised in float64; above what float32 leaves of unit vectors and tensors after some turns. */
+static const double EXACT = 1e-9, ROUNDED = 1e-5;
 enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */
 
 typedef struct kept_t { /* impulses of the problem before, by key */
@@ -22,6 +28,7 @@ typedef struct kept_t { /* impulses of the problem before, by key */
 struct lav_solver {
   uint32_t magic;
   int32_t busy;
+  where_t refused;  /* of the last lav_set */
   int32_t ready;    /* a problem is set */
   int32_t begun;    /* its method has run */
   char *base;
@@ -60,11 +67,14 @@ struct lav_solver {
   struct accelerate_admm_admm_t splitting;
   struct accelerate_admm_factor_t factor;
   int32_t factors, is_broken;
-  int32_t turns[2 * MOST_TURNS], given_turns[2 * MOST_TURNS], n_turns, at_turn; /* of auto */
-  uint64_t common;             /* where the memory of a turn begins */
-  double *chosen;
 #endif
 };
+
+#define GIVE_BACK(call)                                             \
+  do {                                                              \
+    const int32_t code_ = (call);                                   \
+    if (code_ != LAV_OK) return code_;                              \
+  } while (0)
 
 /* -- words ------------------------------------------------------------------------------------------------------------ */
 
@@ -139,7 +149,6 @@ static int32_t check_counts(const lav_problem *q) {
 }
 
 static int32_t check_options(const lav_options *o) {
-  int32_t i;
   if (o->size != sizeof *o) return LAV_ERROR_VERSION;
   if (!lav_name(o->method) || o->order < LAV_GIVEN || o->order > LAV_REVERSE) return LAV_ERROR_OPTION;
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
@@ -147,9 +156,6 @@ static int32_t check_options(const lav_options *o) {
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
   if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && o->omega < 1e300)) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
-  if (o->n_turns < 0 || o->n_turns > MOST_TURNS || (o->n_turns > 0 && !o->turns)) return LAV_ERROR_OPTION;
-  for (i = 0; i < o->n_turns; i++)
-    if (!lav_name(o->turns[2 * i]) || o->turns[2 * i] == LAV_AUTO || o->turns[2 * i + 1] < 1) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
 
@@ -163,7 +169,7 @@ static int32_t takes_form(int32_t method, int32_t form) {
     case LAV_PGS: return form != LAV_BODIES;
     case LAV_SOR: case LAV_GAUSS_SEIDEL: case LAV_JACOBI: return form == LAV_MATRIX;
 #ifndef LAV_SWEEPS_ONLY
-    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: case LAV_AUTO: return 1;
+    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: return 1;
     case LAV_DIRECT: case LAV_LEMKE: case LAV_ADMM: return form != LAV_VELOCITIES; /* over A, which is formed of bodies */
 #endif
     default: return 0;
@@ -172,8 +178,8 @@ static int32_t takes_form(int32_t method, int32_t form) {
 
 /* Does it take contacts whose rolling is bounded, and cones of more than two tangents? */
 static int32_t takes_kind(int32_t method, int32_t form, int32_t kind) {
-  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_AUTO ||
-                             (method == LAV_NEWTON && form == LAV_VELOCITIES) || method == LAV_NNCG;
+  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_NNCG ||
+                             (method == LAV_NEWTON && form == LAV_VELOCITIES);
   if (kind == LAV_ROUND) return is_general && form != LAV_BODIES;
   return kind != LAV_CONTACT_ROLLING || is_general || method == LAV_ANDERSON || method <= LAV_PGS || method == LAV_JACOBI;
 }
@@ -186,10 +192,19 @@ static int32_t are_rows(const lav_problem *q) {
   return 1;
 }
 
+/* As far as counts tell. */
+static int32_t takes_counts(const lav_problem *q, const lav_options *o) {
+  if (!takes_form(o->method, q->form)) return LAV_ERROR_UNSUPPORTED;
+#ifndef LAV_SWEEPS_ONLY
+  if (o->method == LAV_NEWTON && q->form == LAV_BODIES && q->n_bodies > newton_bodies_MOST_BODIES) return LAV_ERROR_BODIES;
+#endif
+  return LAV_OK;
+}
+
 static int32_t takes(const lav_problem *q, const lav_options *o) {
   const int32_t rows_alone = are_rows(q);
   int32_t i, free_rows = 1;
-  if (!takes_form(o->method, q->form)) return LAV_ERROR_UNSUPPORTED;
+  GIVE_BACK(takes_counts(q, o));
   for (i = 0; q->kind && i < q->n_blocks; i++)
     if (q->kind[i] != LAV_ROW) {
       free_rows = 0;
@@ -207,121 +222,169 @@ static int32_t takes(const lav_problem *q, const lav_options *o) {
   return LAV_OK;
 }
 
-static int32_t check_blocks(const lav_problem *q) {
+static int32_t refuse(where_t *at, int32_t code, const char *array, int64_t index) {
+  at->array = array;
+  at->index = (int32_t)index;
+  return code;
+}
+
+static int32_t check_blocks(const lav_problem *q, where_t *at) {
   static const int32_t least_rows[6] = {1, 1, 2, 4, 3, 5}, most_rows[6] = {1, 3, 4, 6, 3, 6}; /* by kind */
   int32_t i, j;
-  if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return LAV_ERROR_BLOCKS;
+  if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "n_blocks", 0);
   if (q->block_ptr) {
-    if (q->block_ptr[0] != 0 || q->block_ptr[q->n_blocks] != q->n_rows) return LAV_ERROR_BLOCKS;
+    if (q->block_ptr[0] != 0) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", 0);
     for (i = 0; i < q->n_blocks; i++)
-      if (q->block_ptr[i + 1] <= q->block_ptr[i] || q->block_ptr[i + 1] > q->n_rows) return LAV_ERROR_BLOCKS;
+      if (q->block_ptr[i + 1] <= q->block_ptr[i] || q->block_ptr[i + 1] > q->n_rows)
+        return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
+    if (q->block_ptr[i] != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i);
   }
   for (i = 0; i < q->n_blocks; i++) {
     const int32_t first = q->block_ptr ? q->block_ptr[i] : i, end = q->block_ptr ? q->block_ptr[i + 1] : i + 1;
     const int32_t kind = q->kind ? q->kind[i] : LAV_ROW;
     const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
-    if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return LAV_ERROR_BLOCKS;
-    if (end - first < least_rows[kind] || (kind != LAV_ROW && end - first > most_rows[kind])) return LAV_ERROR_BLOCKS;
-    if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return LAV_ERROR_BLOCKS;
-    if (!(mu >= 0.0 && mu <= DBL_MAX && radius >= 0.0 && radius <= DBL_MAX)) return LAV_ERROR_FRICTION;
-    if (q->rolling && !(q->rolling[i] >= 0.0 && q->rolling[i] <= DBL_MAX)) return LAV_ERROR_FRICTION;
-    if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES) return LAV_ERROR_FRICTION;
+    const double rolling = q->rolling ? q->rolling[i] : 0.0;
+    if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
+    if (end - first < least_rows[kind] || (kind != LAV_ROW && end - first > most_rows[kind]))
+      return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
+    if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
+    if (!(mu >= 0.0 && mu <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
+    if (!(radius >= 0.0 && radius <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
+    if (!(rolling >= 0.0 && rolling <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
+    if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES)
+      return refuse(at, LAV_ERROR_FRICTION, "mu", i);
     for (j = first; kind == LAV_ROW && j < end; j++) {
       const double low = q->lower ? q->lower[j] : -INFINITY, high = q->upper ? q->upper[j] : INFINITY;
-      if (!(low <= high && low <= DBL_MAX && high >= -DBL_MAX)) return LAV_ERROR_BOUNDS;
+      if (!(low <= high && low <= DBL_MAX && high >= -DBL_MAX)) return refuse(at, LAV_ERROR_BOUNDS, "lower", j);
     }
   }
   return LAV_OK;
 }
 
 static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t rows, int32_t columns, int32_t entries,
-                             int32_t is_lower) {
+                             int32_t is_lower, const char *name, where_t *at) {
   int32_t i, k;
-  if (!ptr || (entries > 0 && !index)) return LAV_ERROR_NULL;
-  if (ptr[0] != 0 || ptr[rows] != entries) return LAV_ERROR_COUNT;
-  for (i = 0; i < rows; i++)
-    if (ptr[i + 1] < ptr[i] || ptr[i + 1] > entries) return LAV_ERROR_COUNT;
+  if (!ptr || (entries > 0 && !index)) return refuse(at, LAV_ERROR_NULL, name, 0);
+  for (i = 0; i <= rows; i++)
+    if (ptr[i] < (i > 0 ? ptr[i - 1] : 0) || ptr[i] > (i > 0 ? entries : 0)) return refuse(at, LAV_ERROR_COUNT, name, i);
+  if (ptr[rows] != entries) return refuse(at, LAV_ERROR_COUNT, name, rows);
   for (i = 0; i < rows; i++) {
     for (k = ptr[i]; k < ptr[i + 1]; k++)
-      if (index[k] < 0 || index[k] >= columns || (k > ptr[i] && index[k] <= index[k - 1])) return LAV_ERROR_INDEX;
-    if (is_lower && (ptr[i] == ptr[i + 1] || index[ptr[i + 1] - 1] != i)) return LAV_ERROR_INDEX;
+      if (index[k] < 0 || index[k] >= columns || (k > ptr[i] && index[k] <= index[k - 1]))
+        return refuse(at, LAV_ERROR_INDEX, is_lower ? "mass_index" : "index", k);
+    if (is_lower && (ptr[i] == ptr[i + 1] || index[ptr[i + 1] - 1] != i)) return refuse(at, LAV_ERROR_INDEX, name, i);
   }
   return LAV_OK;
 }
 
-static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies) {
+/* Bodies of joints or contacts, none with itself; a contact moves one. */
+static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int32_t moves, const char *name, where_t *at) {
   int32_t i;
-  if (n > 0 && !body) return LAV_ERROR_NULL;
+  if (n > 0 && !body) return refuse(at, LAV_ERROR_NULL, name, 0);
   for (i = 0; i < 2 * n; i++)
-    if (body[i] < -1 || body[i] >= n_bodies) return LAV_ERROR_INDEX;
+    if (body[i] < -1 || body[i] >= n_bodies) return refuse(at, LAV_ERROR_INDEX, name, i);
+  for (i = 0; i < n; i++)
+    if (body[2 * i] == body[2 * i + 1] && (moves || body[2 * i] >= 0)) return refuse(at, LAV_ERROR_PAIR, name, 2 * (int64_t)i);
   return LAV_OK;
 }
 
-#define OPTIONAL(x, n)                                              \
-  do {                                                              \
-    if ((x) && !are_finite((x), (n))) return LAV_ERROR_NUMBER;      \
-  } while (0)
-#define NEEDED(x, n)                                                \
-  do {                                                              \
-    if ((n) > 0 && !(x)) return LAV_ERROR_NULL;                     \
-    OPTIONAL(x, n);                                                 \
-  } while (0)
-#define GIVE_BACK(call)                                             \
-  do {                                                              \
-    const int32_t code_ = (call);                                   \
-    if (code_ != LAV_OK) return code_;                              \
-  } while (0)
+static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, const char *name, where_t *at) {
+  int64_t i = 0;
+  if (!x) return is_needed && n > 0 ? refuse(at, LAV_ERROR_NULL, name, 0) : LAV_OK;
+  if (are_finite(x, n)) return LAV_OK;
+  while (fabs(x[i]) <= DBL_MAX) i++;
+  return refuse(at, LAV_ERROR_NUMBER, name, i);
+}
 
-static int32_t check_bodies(const lav_problem *q) {
+#define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
+#define NEEDED(name, n) GIVE_BACK(check_numbers(q->name, (n), 1, #name, at))
+
+/* How far normals and tangents are from orthogonal unit vectors, the worst of a contact. */
+static double off_frame(const double *n, const double *t) {
+  const double nn = fabs(sqrt(core_rows_dot3(n, n)) - 1.0), tt = fabs(sqrt(core_rows_dot3(t, t)) - 1.0), nt = fabs(core_rows_dot3(n, t));
+  const double most = nn > tt ? nn : tt;
+  return most > nt ? most : nt;
+}
+
+/* Symmetric, and with the shift positive definite: no eigenvalue is below -ROUNDED times the largest entry. */
+static int32_t is_inertia(const double *x) {
+  double size = 0.0, a[6], p, q, r;
+  int32_t i, k;
+  for (i = 0; i < 9; i++)
+    if (fabs(x[i]) > size) size = fabs(x[i]);
+  if (size == 0.0) return 1;
+  for (i = 0; i < 3; i++)
+    for (k = 0; k < i; k++)
+      if (fabs(x[3 * i + k] - x[3 * k + i]) > ROUNDED * size) return 0;
+  a[0] = x[0] / size + ROUNDED, a[1] = x[3] / size, a[2] = x[4] / size + ROUNDED;
+  a[3] = x[6] / size, a[4] = x[7] / size, a[5] = x[8] / size + ROUNDED;
+  if (!(a[0] > 0.0)) return 0;
+  p = a[2] - a[1] * (a[1] / a[0]);
+  if (!(p > 0.0)) return 0;
+  q = a[4] - a[3] * (a[1] / a[0]);
+  r = a[5] - a[3] * (a[3] / a[0]) - q * (q / p);
+  return r > 0.0;
+}
+
+static int32_t check_bodies(const lav_problem *q, where_t *at) {
   const int64_t n = q->n_bodies, c = q->n_blocks - q->n_joints, mj = q->block_ptr ? q->block_ptr[q->n_joints] : q->n_joints;
   int64_t i;
-  NEEDED(q->inv_mass, n);
-  NEEDED(q->inv_inertia, 9 * n);
-  OPTIONAL(q->velocity, 6 * n);
-  NEEDED(q->jac, 12 * mj);
-  NEEDED(q->normal, 3 * c);
-  NEEDED(q->tangent, 3 * c);
-  NEEDED(q->arm_a, 3 * c);
-  NEEDED(q->arm_b, 3 * c);
-  for (i = 0; i < n; i++)
-    if (q->inv_mass[i] < 0.0) return LAV_ERROR_MASS;
-  GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies));
-  return check_pairs(q->contact_body, (int32_t)c, q->n_bodies);
+  NEEDED(inv_mass, n);
+  NEEDED(inv_inertia, 9 * n);
+  OPTIONAL(velocity, 6 * n);
+  NEEDED(jac, 12 * mj);
+  NEEDED(normal, 3 * c);
+  NEEDED(tangent, 3 * c);
+  NEEDED(arm_a, 3 * c);
+  NEEDED(arm_b, 3 * c);
+  for (i = 0; i < n; i++) {
+    if (q->inv_mass[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "inv_mass", i);
+    if (!is_inertia(q->inv_inertia + 9 * i)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
+  }
+  GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies, 0, "joint_body", at));
+  GIVE_BACK(check_pairs(q->contact_body, (int32_t)c, q->n_bodies, 1, "contact_body", at));
+  for (i = 0; i < c; i++)
+    if (!(off_frame(q->normal + 3 * i, q->tangent + 3 * i) <= ROUNDED)) {
+      const double length = core_rows_dot3(q->normal + 3 * i, q->normal + 3 * i);
+      return refuse(at, LAV_ERROR_FRAME, fabs(sqrt(length) - 1.0) <= ROUNDED ? "tangent" : "normal", 3 * i);
+    }
+  return LAV_OK;
 }
 
-static int32_t check_velocities(const lav_problem *q) {
+static int32_t check_velocities(const lav_problem *q, where_t *at) {
   const int32_t n = q->n_velocities;
-  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, n, q->n_entries, 0));
-  NEEDED(q->value, q->n_entries);
-  if (q->mass_ptr) GIVE_BACK(check_columns(q->mass_ptr, q->mass_index, n, n, q->n_mass_entries, 1));
-  NEEDED(q->mass_value, q->n_mass_entries);
-  OPTIONAL(q->velocity, n);
-  return q->n_rows > 0 && (q->n_entries == 0 ? !q->index_ptr : 0) ? LAV_ERROR_COUNT : LAV_OK;
+  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, n, q->n_entries, 0, "index_ptr", at));
+  NEEDED(value, q->n_entries);
+  if (q->mass_ptr) GIVE_BACK(check_columns(q->mass_ptr, q->mass_index, n, n, q->n_mass_entries, 1, "mass_ptr", at));
+  NEEDED(mass_value, q->n_mass_entries);
+  OPTIONAL(velocity, n);
+  return q->n_rows > 0 && q->n_entries == 0 && !q->index_ptr ? refuse(at, LAV_ERROR_COUNT, "n_entries", 0) : LAV_OK;
 }
 
-static int32_t check_problem(const lav_problem *q) {
+static int32_t check_problem(const lav_problem *q, where_t *at) {
   const int64_t m = q->n_rows;
   int32_t i;
   GIVE_BACK(check_counts(q));
-  GIVE_BACK(check_blocks(q));
-  OPTIONAL(q->b, m);
-  OPTIONAL(q->target, m);
-  OPTIONAL(q->compliance, m);
-  OPTIONAL(q->impulse, m);
+  GIVE_BACK(check_blocks(q, at));
+  OPTIONAL(b, m);
+  OPTIONAL(target, m);
+  OPTIONAL(compliance, m);
+  OPTIONAL(impulse, m);
   for (i = 0; q->compliance && i < m; i++)
-    if (q->compliance[i] < 0.0) return LAV_ERROR_MASS;
-  if (q->form == LAV_BODIES) return check_bodies(q);
-  if (q->form == LAV_VELOCITIES) return check_velocities(q);
-  if (m > 0 && (!q->b || !q->value)) return LAV_ERROR_NULL;
-  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, q->n_rows, q->n_entries, 0));
-  NEEDED(q->value, q->n_entries);
+    if (q->compliance[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "compliance", i);
+  if (q->form == LAV_BODIES) return check_bodies(q, at);
+  if (q->form == LAV_VELOCITIES) return check_velocities(q, at);
+  if (m > 0 && (!q->b || !q->value)) return refuse(at, LAV_ERROR_NULL, q->b ? "value" : "b", 0);
+  if (q->index_ptr) GIVE_BACK(check_columns(q->index_ptr, q->index, q->n_rows, q->n_rows, q->n_entries, 0, "index_ptr", at));
+  NEEDED(value, q->n_entries);
   return LAV_OK;
 }
 
 int32_t lav_takes(const lav_problem *problem, const lav_options *options) {
+  where_t at;
   if (!problem || !options) return LAV_ERROR_NULL;
   GIVE_BACK(check_options(options));
   GIVE_BACK(check_counts(problem));
-  GIVE_BACK(check_blocks(problem));
+  GIVE_BACK(check_blocks(problem, &at));
   return takes(problem, options);
 }

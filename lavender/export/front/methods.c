@@ -2,8 +2,16 @@
 #ifndef LAV_SWEEPS_ONLY
 /* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
 
+/* Some contact has more than its normal: the law counts, and which sweeps know it, however rough the contacts are. */
+static int32_t has_tangents(const blocks_t *p) {
+  int32_t i;
+  for (i = 0; i < p->n_blocks; i++)
+    if (p->kind[i] != LAV_ROW && p->ptr[i + 1] - p->ptr[i] > 1) return 1;
+  return 0;
+}
+
 static int32_t prepare_accelerated(lav_solver *s) {
-  const int32_t rubs = core_block_has_friction(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
+  const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
   const int32_t convex = rubs && !is_cone ? s->options.convex : 0;
   const int64_t n = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
@@ -107,11 +115,26 @@ static int32_t prepare_newton(lav_solver *s) {
   return LAV_OK;
 }
 
+/* A run that its budget ended is no worse than where it began, and no worse than doing nothing. */
+static void keep_better(lav_solver *s, const double *begin) {
+  lav_verdict now, then;
+  double nothing[3];
+  judge(s, s->impulse, 0, &now);
+  judge(s, begin, 0, &then);
+  if (!(now.relative <= then.relative)) {
+    COPY(s->impulse, begin, s->p.n_rows);
+    now = then;
+  }
+  if (!(now.relative <= 1.0))
+    judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, 0, nothing);
+}
+
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
   struct driver_driver_said_t said = {0, 0.0, NULL};
   double closer = 1.0;
   int32_t how = newton_plan_MORE, before = 0;
   lav_verdict now;
+  COPY(s->compare, s->impulse, s->p.n_rows);
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
     how = start_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
@@ -132,6 +155,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
     else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
+  if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare);
   s->newton_options.tol = budget->tol;
   s->newton_options.budget = budget->iterations;
   out->restarts = out->iterations;
@@ -195,101 +219,5 @@ static int32_t prepare_admm(lav_solver *s) {
   s->context = s;
   s->step = admm_step;
   return LAV_OK;
-}
-
-/* -- auto: one method after the other, each for its share ------------------------------------------------------------- */
-
-/* Turns of the library's own, by form, size and what the blocks are; returns how many. */
-static int32_t usual_turns(const lav_problem *q, int32_t rows, int32_t *turns) {
-  const int32_t few = q->n_rows <= FEW_ROWS;
-  int32_t n = 0;
-  if (q->form == LAV_VELOCITIES) turns[n++] = LAV_NEWTON, turns[n++] = 200;
-  else if (rows && few) turns[n++] = LAV_DIRECT, turns[n++] = 100;
-  turns[n++] = LAV_ANDERSON, turns[n++] = 200;
-  if (q->form == LAV_BODIES || (q->form == LAV_MATRIX && few)) turns[n++] = LAV_NEWTON, turns[n++] = 100;
-  turns[n++] = LAV_NNCG, turns[n++] = 200;
-  if (q->form != LAV_VELOCITIES && few) {
-    turns[n++] = LAV_ADMM, turns[n++] = 400;
-    if (rows) turns[n++] = LAV_LEMKE, turns[n++] = 8 * q->n_rows;
-  }
-  return n / 2;
-}
-
-/* The method of turn i laid out in the memory behind the problem. */
-static int32_t take_turn(lav_solver *s, int32_t i) {
-  s->options.method = s->turns[2 * i];
-  s->used = s->common;
-  s->is_short = 0;
-  return prepare(s);
-}
-
-static int32_t prepare_auto(lav_solver *s, const lav_problem *q) {
-  int32_t i, kept = 0, code = LAV_ERROR_UNSUPPORTED;
-  s->n_turns = s->options.n_turns;
-  if (s->n_turns > 0) COPY(s->turns, s->given_turns, 2 * s->n_turns);
-  else s->n_turns = usual_turns(q, are_rows(q), s->turns);
-  s->chosen = TAKE(s, double, s->p.n_rows);
-  s->common = s->used;
-  for (i = 0; i < s->n_turns; i++) { /* those that take it */
-    s->options.method = s->turns[2 * i];
-    if (takes(q, &s->options) != LAV_OK) continue;
-    s->turns[2 * kept] = s->turns[2 * i];
-    s->turns[2 * kept++ + 1] = s->turns[2 * i + 1];
-  }
-  s->n_turns = kept;
-  if (kept > 0) code = s->is_short ? LAV_ERROR_ROOM : take_turn(s, 0);
-  s->options.method = LAV_AUTO;
-  s->at_turn = 0;
-  return code;
-}
-
-static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  double best = INFINITY;
-  int32_t i = 0, n, round = 1, worked, code = LAV_OK, short_of = 0;
-  COPY(s->chosen, s->impulse, s->p.n_rows);
-  out->method = s->turns[0];
-  for (worked = 0;; i++) {
-    lav_budget turn = *budget;
-    lav_result part = *out;
-    lav_verdict found;
-    if (i == s->n_turns) { /* again, four times as long; none of them works: there is nothing to do */
-      if (!worked || out->iterations >= budget->iterations) break;
-      i = worked = 0;
-      if (round < 1 << 20) round *= 4;
-    }
-    n = s->turns[2 * i + 1] < (1 << 30) / round ? round * s->turns[2 * i + 1] : 1 << 30;
-    turn.iterations = n < budget->iterations - out->iterations ? n : budget->iterations - out->iterations;
-    if (turn.iterations <= 0 || is_late(s, budget)) break;
-    if (s->at_turn != i) {
-      COPY(s->impulse, s->chosen, s->p.n_rows);
-      code = take_turn(s, i);
-      if (code == LAV_ERROR_ROOM) short_of = s->used + 32 > s->needed ? (s->needed = s->used + 32, 1) : 1;
-      s->at_turn = code == LAV_OK ? i : -1;
-      if (code != LAV_OK) continue;
-    } else s->options.method = s->turns[2 * i];
-    part.outcome = LAV_MAX_ITERATIONS;
-    part.iterations = part.sweeps = part.restarts = 0;
-    begin_method(s);
-    run_method(s, &turn, &part);
-    s->at_turn = -1;
-    out->iterations += part.iterations;
-    out->sweeps += part.sweeps;
-    worked += part.iterations;
-    judge(s, s->impulse, 1, &found);
-    if (found.relative < best || best == INFINITY) {
-      best = found.relative;
-      COPY(s->chosen, s->impulse, s->p.n_rows);
-      out->method = s->options.method;
-    }
-    if (best <= budget->tol || (judge_score_is_at_floor(best, found.floor) && found.relative == best)) {
-      out->outcome = best <= budget->tol ? LAV_CONVERGED : LAV_FLOOR;
-      break;
-    }
-  }
-  COPY(s->impulse, s->chosen, s->p.n_rows);
-  s->options.method = LAV_AUTO;
-  if (out->outcome == LAV_MAX_ITERATIONS && is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
-  else if (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) out->outcome = LAV_STALLED;
-  return short_of && out->outcome != LAV_CONVERGED ? LAV_ERROR_ROOM : LAV_OK;
 }
 #endif

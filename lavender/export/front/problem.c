@@ -153,7 +153,8 @@ static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
   if (q->order) {
     memset(s->marks, 0, (size_t)k * sizeof(int32_t));
     for (i = 0; i < k; i++) {
-      if (q->order[i] < 0 || q->order[i] >= k || s->marks[q->order[i]]++) return LAV_ERROR_INDEX;
+      if (q->order[i] < 0 || q->order[i] >= k || s->marks[q->order[i]]++)
+        return refuse(&s->refused, LAV_ERROR_INDEX, "order", i);
       s->order[i] = q->order[i];
     }
   } else if (s->options.order == LAV_REVERSE) {
@@ -187,6 +188,23 @@ static void fill_matrix(const int32_t *to_ptr, const int32_t *to_index, const do
   }
 }
 
+/* Frames that float32 left a little off, made whole: n / |n|, then t without its part along n, over its length. */
+static void fill_frames(lav_solver *s, const lav_problem *q) {
+  double *normal = (double *)(uintptr_t)s->r.normal, *tangent = (double *)(uintptr_t)s->r.tangent, size, along;
+  int32_t i, k;
+  COPY(normal, q->normal, 3 * (int64_t)s->r.n_contacts);
+  COPY(tangent, q->tangent, 3 * (int64_t)s->r.n_contacts);
+  for (i = 0; i < s->r.n_contacts; i++, normal += 3, tangent += 3) {
+    if (off_frame(normal, tangent) <= EXACT) continue;
+    size = sqrt(core_rows_dot3(normal, normal));
+    for (k = 0; k < 3; k++) normal[k] /= size;
+    along = core_rows_dot3(normal, tangent);
+    for (k = 0; k < 3; k++) tangent[k] -= along * normal[k];
+    size = sqrt(core_rows_dot3(tangent, tangent));
+    for (k = 0; k < 3; k++) tangent[k] /= size;
+  }
+}
+
 static void fill_bodies(lav_solver *s, const lav_problem *q) {
   const int64_t n = q->n_bodies, c = s->r.n_contacts, mj = s->p.ptr[q->n_joints];
   double *b = (double *)(uintptr_t)s->p.b;
@@ -196,8 +214,7 @@ static void fill_bodies(lav_solver *s, const lav_problem *q) {
   COPY(s->r.joint_body, q->joint_body, 2 * (int64_t)q->n_joints);
   COPY(s->r.jac, q->jac, 12 * mj);
   COPY(s->r.contact_body, q->contact_body, 2 * c);
-  COPY(s->r.normal, q->normal, 3 * c);
-  COPY(s->r.tangent, q->tangent, 3 * c);
+  fill_frames(s, q);
   COPY(s->r.arm_a, q->arm_a, 3 * c);
   COPY(s->r.arm_b, q->arm_b, 3 * c);
   copy_or(s->r.compliance, q->compliance, q->n_rows, 0.0);

@@ -13,6 +13,31 @@ static void keep_impulses(lav_solver *s) {
   kept->n_rows = s->p.n_rows;
 }
 
+/* Impulses that are carried, in arrays for a larger problem: these move towards its end, the last one first. */
+static int32_t grow_kept(lav_solver *s, const lav_problem *q) {
+  const kept_t old = s->kept;
+  const uint64_t used = s->used;
+  lav_problem most = *q;
+  if (q->n_blocks <= old.most_blocks && q->n_rows <= old.most_rows) return LAV_OK;
+  if (most.n_blocks < old.most_blocks) most.n_blocks = old.most_blocks;
+  if (most.n_rows < old.most_rows) most.n_rows = old.most_rows;
+  s->used = sizeof(lav_solver);
+  s->is_short = 0;
+  take_kept(s, &most);
+  if (s->is_short) {
+    s->kept = old;
+    s->used = used;
+    return LAV_ERROR_ROOM;
+  }
+  s->begin = s->used;
+  s->kept.n_blocks = old.n_blocks;
+  s->kept.n_rows = old.n_rows;
+  memmove(s->kept.impulse, old.impulse, (size_t)old.n_rows * sizeof *old.impulse);
+  memmove(s->kept.kind, old.kind, (size_t)old.n_blocks * sizeof *old.kind);
+  memmove(s->kept.ptr, old.ptr, ((size_t)old.n_blocks + 1) * sizeof *old.ptr);
+  return LAV_OK;
+}
+
 static uint32_t place_of(uint64_t key, uint32_t mask) {
   key = (key ^ key >> 30) * 0xBF58476D1CE4E5B9u;
   return (uint32_t)(key ^ key >> 31) & mask;
@@ -138,11 +163,8 @@ static int32_t prepare_sweeps(lav_solver *s) {
 static int32_t prepare_newton(lav_solver *s);
 static int32_t prepare_pivots(lav_solver *s);
 static int32_t prepare_admm(lav_solver *s);
-static int32_t usual_turns(const lav_problem *q, int32_t rows, int32_t *turns);
-static int32_t prepare_auto(lav_solver *s, const lav_problem *q);
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
 static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
-static int32_t run_auto(lav_solver *s, const lav_budget *budget, lav_result *out);
 static int32_t restarts_of(const lav_solver *s);
 static int32_t begins_again(lav_solver *s);
 #endif
@@ -241,7 +263,8 @@ static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out)
 
 #ifndef LAV_SWEEPS_ONLY
 /* Numbers that a method has beside the problem; what depends on arrays is guessed. */
-static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t method, int32_t n_v) {
+static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int32_t method = o->method;
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
   const int32_t bodies = q->form == LAV_BODIES, mj = bodies ? joint_rows(q) : 0, mc = bodies ? contact_rows(q) : 0;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
@@ -283,7 +306,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
   if (!problem || !options || !bytes) return LAV_ERROR_NULL;
   GIVE_BACK(check_counts(problem));
   GIVE_BACK(check_options(options));
-  if (!takes_form(options->method, problem->form)) return LAV_ERROR_UNSUPPORTED;
+  GIVE_BACK(takes_counts(problem, options));
   memset(&s, 0, sizeof s);
   s.used = sizeof(lav_solver);
   m = problem->n_rows, k = problem->n_blocks, n = problem->n_bodies, nv = problem->n_velocities;
@@ -297,57 +320,71 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     numbers += nv + 2 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
 #ifndef LAV_SWEEPS_ONLY
-  {
-    int32_t turns[2 * MOST_TURNS] = {0}, count = 1, i;
-    int64_t most = 0;
-    turns[0] = options->method;
-    if (options->method == LAV_AUTO && options->n_turns > 0) COPY(turns, options->turns, 2 * (count = options->n_turns));
-    else if (options->method == LAV_AUTO) /* kinds are not read: rows alone, unless contacts have tangents */
-      count = usual_turns(problem, problem->form != LAV_BODIES || contact_rows(problem) <= k - problem->n_joints, turns);
-    for (i = 0; i < count; i++) {
-      const int64_t here = numbers_of(problem, options, turns[2 * i], s.n_v);
-      if (here > most) most = here;
-    }
-    numbers += most + (options->method == LAV_AUTO ? m : 0);
-  }
+  numbers += numbers_of(problem, options, s.n_v);
 #endif
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
   return LAV_OK;
 }
 
 int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const lav_options *options, lav_solver **out) {
-  lav_solver *s;
+  lav_solver *s, probe;
   uint64_t skip;
   if (!memory || !largest || !options || !out) return LAV_ERROR_NULL;
   GIVE_BACK(check_counts(largest));
   GIVE_BACK(check_options(options));
-  if (!takes_form(options->method, largest->form)) return LAV_ERROR_UNSUPPORTED;
+  GIVE_BACK(takes_counts(largest, options));
   skip = (16 - (uintptr_t)memory % 16) % 16;
-  if (bytes < skip + sizeof(lav_solver)) return LAV_ERROR_ROOM;
+  memset(&probe, 0, sizeof probe);
+  probe.used = sizeof(lav_solver);
+  take_kept(&probe, largest);
+  if (bytes < skip + probe.used) return LAV_ERROR_ROOM;
   s = (lav_solver *)(void *)((char *)memory + skip);
-  {
-    lav_solver probe;
-    memset(&probe, 0, sizeof probe);
-    probe.used = sizeof(lav_solver);
-    take_kept(&probe, largest);
-    if (probe.used > bytes - skip) return LAV_ERROR_ROOM;
-  }
   memset(s, 0, sizeof *s);
   s->base = (char *)s;
   s->bytes = bytes - skip;
   s->used = sizeof(lav_solver);
   s->options = *options;
+  s->form = largest->form;
   take_kept(s, largest);
   s->begin = s->used;
 #ifndef LAV_SWEEPS_ONLY
   s->newton_options.tol = 1e-6;
   s->newton_options.budget = 1000;
-  if (options->n_turns > 0) COPY(s->given_turns, options->turns, 2 * options->n_turns);
-  s->options.turns = s->given_turns; /* `lav_set` reads them when the caller's may be gone */
 #endif
   s->magic = MAGIC;
   *out = s;
   return LAV_OK;
+}
+
+int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out) {
+  lav_problem most;
+  lav_solver *to;
+  int32_t code;
+  GIVE_BACK(enter(solver));
+  if (!memory || !out) return leave(solver, LAV_ERROR_NULL);
+  keep_impulses(solver);
+  memset(&most, 0, sizeof most);
+  most.size = (uint32_t)sizeof most;
+  most.form = solver->form;
+  most.n_blocks = solver->kept.most_blocks;
+  most.n_rows = solver->kept.most_rows;
+  most.n_velocities = most.n_rows;
+  code = lav_open(memory, bytes, &most, &solver->options, &to);
+  if (code != LAV_OK) return leave(solver, code);
+  COPY(to->kept.key, solver->kept.key, solver->kept.n_blocks);
+  COPY(to->kept.ptr, solver->kept.ptr, solver->kept.n_blocks + 1);
+  COPY(to->kept.kind, solver->kept.kind, solver->kept.n_blocks);
+  COPY(to->kept.impulse, solver->kept.impulse, solver->kept.n_rows);
+  to->kept.n_blocks = solver->kept.n_blocks;
+  to->kept.n_rows = solver->kept.n_rows;
+  *out = to;
+  return leave(solver, LAV_OK);
+}
+
+const char *lav_refused(const lav_solver *solver, int32_t *index) {
+  if (!solver || (uintptr_t)solver % 16 != 0 || solver->magic != MAGIC || !solver->refused.array) return NULL;
+  if (index) *index = solver->refused.index;
+  return solver->refused.array;
 }
 
 uint64_t lav_needed(const lav_solver *solver) {
@@ -358,9 +395,10 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   int32_t code = LAV_OK;
   keep_impulses(s);
   s->ready = s->begun = 0; /* whatever is wrong below: no answer of the problem before passes for this one's */
-  GIVE_BACK(check_problem(q));
+  s->refused.array = NULL;
+  GIVE_BACK(check_problem(q, &s->refused));
   GIVE_BACK(takes(q, &s->options));
-  if (q->n_blocks > s->kept.most_blocks || q->n_rows > s->kept.most_rows) return LAV_ERROR_ROOM;
+  GIVE_BACK(grow_kept(s, q));
   s->used = s->peak = s->begin;
   s->is_short = 0;
   take_blocks(s, q);
@@ -388,10 +426,8 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else carry(s);
 #ifndef LAV_SWEEPS_ONLY
   s->is_broken = 0;
-  if (s->options.method == LAV_AUTO) GIVE_BACK(prepare_auto(s, q));
-  else
 #endif
-    GIVE_BACK(prepare(s));
+  GIVE_BACK(prepare(s));
   s->ready = 1;
   return LAV_OK;
 }
@@ -411,7 +447,6 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 }
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  int32_t code = LAV_OK;
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -419,7 +454,6 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   if (budget->seconds > 0.0 && !budget->clock) return LAV_ERROR_NULL;
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
-  out->method = s->options.method;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
   if (!s->begun) begin_method(s);
   s->begun = 1;
@@ -427,13 +461,10 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;
     else out->iterations = budget->iterations;
   }
-#ifndef LAV_SWEEPS_ONLY
-  else if (s->options.method == LAV_AUTO) code = run_auto(s, budget, out);
-#endif
   else run_method(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
   judge(s, s->impulse, 1, &out->verdict);
-  return code;
+  return LAV_OK;
 }
 
 int32_t lav_run(lav_solver *solver, const lav_budget *budget, lav_result *out) {

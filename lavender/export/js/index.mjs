@@ -18,7 +18,6 @@ const LENGTHS = {
       jac: 12 * (given.block_ptr?.[joints] ?? joints),
     };
   },
-  lav_options: (options) => ({ turns: 2 * options.get('n_turns') }),
 };
 
 export class LavenderError extends Error {
@@ -59,8 +58,8 @@ export class Library {
     while (bytes[end]) end++;
     return new TextDecoder().decode(bytes.slice(at, end));
   }
-  check(code) {
-    if (code < 0) throw new LavenderError(code, this.text(this.c.lav_text(code)));
+  check(code, where = '') {
+    if (code < 0) throw new LavenderError(code, `${where || ''}${this.text(this.c.lav_text(code))}`);
     return code;
   }
   struct(name) {
@@ -106,7 +105,7 @@ class Struct {
   }
 }
 
-/** One solver; its memory grows where a problem asks for more, and impulses then start anew. */
+/** One solver; its memory at least doubles where a problem asks for more, and impulses move with it. */
 export class Solver {
   constructor(library, method, options) {
     Object.assign(this, { library, c: library.c, at: 0, bytes: 0, rows: 0, speeds: 0 });
@@ -121,13 +120,14 @@ export class Solver {
     const q = this.problem;
     this.library.check(this.c.lav_default_problem(given.form ?? LAV_BODIES, q.at));
     this.fill(q, given);
-    if (!this.at) this.open(0n);
+    if (!this.at) this.open();
     let code = this.c.lav_set(this.at, q.at);
     for (let turn = 0; code === LAV_ERROR_ROOM && turn < 40; turn++) {
-      this.open(BigInt.asUintN(64, this.c.lav_needed(this.at)));
+      this.grow();
       code = this.c.lav_set(this.at, q.at);
     }
-    this.library.check(code);
+    const array = this.c.lav_refused(this.at, this.pointer), index = this.library.view('int32_t*', this.pointer, 1)[0];
+    this.library.check(code, array && `${this.library.text(array)}[${index}]: `);
     this.rows = q.get('n_rows');
     this.speeds = q.get('form') === LAV_BODIES ? 6 * q.get('n_bodies') : q.get('n_velocities');
   }
@@ -155,11 +155,17 @@ export class Solver {
     this.library.view(kind, held.at, values.length).set(values);
     return held.at;
   }
-  open(needed) {
+  open() {
     this.library.check(this.c.lav_room(this.problem.at, this.options.at, this.pointer));
-    const wanted = this.library.view('uint64_t*', this.pointer, 1)[0], bytes = wanted > needed ? wanted : needed;
-    const memory = this.library.take(Number(bytes) + 16);
-    this.library.check(this.c.lav_open(memory, bytes + 16n, this.problem.at, this.options.at, this.pointer));
+    this.bytes = Number(this.library.view('uint64_t*', this.pointer, 1)[0]) + 16;
+    const memory = this.library.take(this.bytes);
+    this.library.check(this.c.lav_open(memory, BigInt(this.bytes), this.problem.at, this.options.at, this.pointer));
+    this.at = this.library.view('int32_t*', this.pointer, 1)[0];
+  }
+  grow() {
+    this.bytes = Math.max(Number(BigInt.asUintN(64, this.c.lav_needed(this.at))), 2 * this.bytes);
+    const memory = this.library.take(this.bytes);
+    this.library.check(this.c.lav_move(this.at, memory, BigInt(this.bytes), this.pointer));
     this.at = this.library.view('int32_t*', this.pointer, 1)[0];
   }
   run(budget = {}) {

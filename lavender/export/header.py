@@ -1,20 +1,12 @@
-"""What other languages need of lavender.h, made of the header itself: constants, structs field by field, functions."""
+"""lavender.h read: its constants, structs field by field, functions; and these as a module of JavaScript."""
 
 from __future__ import annotations
 
 import re
 
-__all__ = ["constants", "functions", "javascript", "rust", "struct_fields"]
+__all__ = ["STRUCTS", "constants", "functions", "javascript", "struct_fields"]
 
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
-RUST = {
-    "int32_t": "i32",
-    "uint32_t": "u32",
-    "uint64_t": "u64",
-    "double": "f64",
-    "void": "c_void",
-    "char": "c_char",
-}
 
 
 def _bare(header: str) -> str:
@@ -55,45 +47,6 @@ def functions(header: str) -> list[tuple[str, str, list[str]]]:
         (kind.strip(), name, [] if args.strip() == "void" else [" ".join(a.split()) for a in args.split(",")])
         for kind, name, args in found
     ]
-
-
-def _rust_type(words: str) -> str:
-    if words.startswith("lav_solver *const *"):
-        return "*const *mut lav_solver"
-    name = words.replace("const", " ").replace("*", " ").split()[0]
-    stars, constant = words.count("*"), words.startswith("const")
-    if not stars:
-        return RUST.get(name, name)
-    return "*mut " * (stars - 1) + ("*const " if constant else "*mut ") + RUST.get(name, name)
-
-
-def rust(header: str) -> str:
-    """lavender-sys: the header in Rust."""
-    out = [
-        "//! The functions and structs of lavender.h, as they are; `lavender` wraps them safely. Made of the header.",
-        "#![no_std]",
-        "#![allow(non_camel_case_types)]",
-        "use core::ffi::{c_char, c_void};",
-        "",
-        *(f"pub const {name}: i32 = {value};" for name, value in constants(header).items()),
-    ]
-    for name in ("lav_solver", "lav_engine"):
-        out += ["", "#[repr(C)]", f"pub struct {name} {{", "    _opaque: [u8; 0],", "}"]
-    for name in STRUCTS:
-        out += ["", "#[repr(C)]", "#[derive(Clone, Copy)]", f"pub struct {name} {{"]
-        for kind, field in struct_fields(header, name):
-            clock = 'Option<unsafe extern "C" fn(*mut c_void) -> f64>'
-            out.append(f"    pub {field}: {clock if kind == '(*)' else _rust_type(kind)},")
-        out.append("}")
-    out += ["", 'extern "C" {']
-    for kind, name, arguments in functions(header):
-        given = []
-        for words in arguments:
-            match = re.fullmatch(r"(.*?)(\w+)", words)
-            assert match is not None
-            given.append(f"{match[2]}: {_rust_type(match[1].strip())}")
-        out.append(f"    pub fn {name}({', '.join(given)}) -> {_rust_type(kind)};")
-    return "\n".join([*out, "}", ""])
 
 
 def _typescript(header: str) -> list[str]:
