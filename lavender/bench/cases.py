@@ -33,6 +33,7 @@ RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a s
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
 ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
+SOLVED = 1e-6  # relative residual at which `lv.solve` ends by default
 
 
 @dataclass(eq=False)
@@ -299,7 +300,18 @@ def describe(item: Item, run: str) -> CaseInfo:
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
         nothing_to_do=nothing_to_do(p),
         suspicions=tuple(map(str, diagnose(p))),
+        guess=_guess_of(item),
     )
+
+
+def _guess_of(item: Item) -> str:
+    """As `CaseInfo.guess`. An answer is the one stored beside the problem, or any at which a solve would end."""
+    guess = item.problem.guess
+    if guess is None:
+        return ""
+    stored = item.stored()
+    is_stored = stored is not None and np.array_equal(guess, stored)
+    return "answer" if is_stored or residual(item.problem, guess).relative <= SOLVED else "start"
 
 
 def fingerprint(problem: Problem) -> str:

@@ -14,7 +14,7 @@ from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Choice
-from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
+from lavender.report.tables.finals import STARTS, WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds
 from lavender.report.text import times as times_of
@@ -81,7 +81,7 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
         return Verdict((f"Nobody brings any of {what} {reached}.",), (), near)
     final, first = race.ranking[0]
-    said = [_head(first, reached, what), *_sure(race)]
+    said = [_head(first, f"{STARTS[final.line.start]}, {reached}", what), *_sure(race)]
     code = _told(records, final, first.score, WAYS[subject.way])
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
@@ -177,7 +177,7 @@ def _not_in_c(records: Records, final: Final) -> str:
 def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     """Lines to copy, with what they were timed at."""
     *before, last = final.code
-    timed = f"{seconds(time)}, {what}"
+    timed = f"{seconds(time)}, {what}, {STARTS[final.line.start]}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
     calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
     made = "lavender export c"
@@ -203,7 +203,8 @@ def _by_advice(records: Records) -> Verdict:
     tol = _tolerance(records, first.solver, best.target)
     asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
     code = f'lv.solve(problem, "{first.solver}", {asked})'
-    return Verdict((_head(first, reached, what), *ties), (code,), leaders)
+    start = STARTS["carried" if "carried" in first.how else "cold"]
+    return Verdict((_head(first, f"{start}, {reached}", what), *ties), (code,), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:
