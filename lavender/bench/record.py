@@ -163,6 +163,7 @@ class Skip(_Texts):
     case: str
     solver: str
     reason: str
+    sequence: str = ""  # that a case which did not load is a step of
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Choice
 from lavender.report.tables.finals import STARTS, WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
-from lavender.report.text import count, residual, seconds
+from lavender.report.text import count, residual, seconds, without
 from lavender.report.text import times as times_of
 from lavender.suite import FAMILIES
 
@@ -118,10 +118,11 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
 
 
 def _what(records: Records, subject: Subject) -> str:
+    names, lost = subject.names, records.left_out
     if subject.way == "call":
-        return _name(records, subject.names)
-    names = subject.names
-    return f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
+        return _name(records, names) + without(len(lost.get("", ())))
+    told = f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
+    return told + without(sum(len(lost.get(name, ())) for name in names))
 
 
 def _head(first: Choice, reached: str, what: str) -> str:

@@ -592,6 +592,50 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
 
 
+def test_what_is_left_out_stands_beside_what_is_left(lavender, tmp_path, monkeypatch):
+    """Steps that could not be recorded: on the page, in the summary, the terminal, the files, and the exit code."""
+    recording = pytest.importorskip("lavender.io.recording")
+    pytest.importorskip("mujoco")
+    (tmp_path / "box.xml").write_text(MODEL.format(height=0.1, kind="box"))
+    true = recording.adapter.from_mujoco
+
+    def some(model, data, name):
+        if int(name.split()[1]) % 15 == 0:
+            raise lv.CapabilityError(f"{name} is of another <problem>")
+        return true(model, data, name=name)
+
+    monkeypatch.setattr(recording.adapter, "from_mujoco", some)
+    more = ("--solvers", "auto", "pgs", "--repeats", 1, "--time-limit", 0.02)
+    more += ("--no-figures", "--tables", "--paper", "--out", tmp_path / "o")
+    model = (tmp_path / "box.xml", "--steps", 45)
+    for _ in range(2):  # recorded, and found recorded
+        code, out, _ = lavender("report", *model, *more)
+        assert code == cli.EXIT_UNMET
+        summary, page = ((tmp_path / "o" / name).read_text() for name in ("summary.md", "index.html"))
+        (name,) = {info.sequence for info in bench.read(tmp_path / "o").cases.values()}
+        for said in (out, summary, page):
+            assert f"on a step of {name} (3 left out)" in said  # the headline
+            assert said.count("(3 left out)") >= 3  # and the tables
+            assert f"3 steps of {name}" in said
+        assert "step 15 is of another <problem>" in " ".join(out.split())
+        assert all(f"step {k} is of another &lt;problem&gt;" in page for k in (15, 30, 45))
+        assert "6 problems (3 left out)" in (tmp_path / "o" / "paper" / "method.tex").read_text()
+        skips = json.loads((tmp_path / "o" / "records.json").read_text())["skips"]
+        assert [(s["sequence"], s["solver"]) for s in skips if "of another" in s["reason"]] == [
+            (name, "")
+        ] * 3
+    assert lavender("report", tmp_path / "o" / "records.jsonl", *more[7:])[0] == 0  # shown again
+    (folder,) = (tmp_path / "o" / "recorded").iterdir()
+    code, out, _ = lavender(
+        "report", "--campaign", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
+    )
+    assert code == cli.EXIT_UNMET and "of another" in " ".join(out.split())
+    assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
+    monkeypatch.setattr(recording.adapter, "from_mujoco", true)
+    code, out, _ = lavender("report", *model, *more, "--fresh")
+    assert (code, "left out" in out) == (0, False)
+
+
 def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
     mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
     if not hasattr(mujoco, "mju_getXMLDependencies"):
