@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -552,6 +553,53 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
     assert done.returncode == 130
     assert "lavender: stopped" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+WORKER = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "joblib.hashing":
+            os.killpg(0, signal.SIGINT)
+if "popen_loky" in " ".join(sys.orig_argv):
+    sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
+def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alone(tmp_path):
+    """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
+    (tmp_path / "sitecustomize.py").write_text(WORKER)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "lavender", "report", "--campaign", "granular(n=2)", "--seeds", "20"]
+    command += ["--workers", "2", "--solvers", "pgs", "--no-figures", "--out", str(tmp_path / "out")]
+    more = {"env": environment, "capture_output": True, "text": True, "timeout": 600, "check": False}
+    done = subprocess.run(command, start_new_session=True, **more)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert "continues from here" in done.stdout
+
+
+@pytest.mark.parametrize("columns", ["0", "1", "19"])
+@pytest.mark.parametrize(
+    "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]
+)
+def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words, columns):
+    wide = lavender(*words)[1]
+    monkeypatch.setenv("COLUMNS", columns)
+    code, narrow, _ = lavender(*words)
+    assert code == 0
+    names = re.findall(r"^\w+", wide, re.MULTILINE)
+    assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no folder in use can be removed")
+@pytest.mark.parametrize("words", [("report", "stack(n=4)"), ("report", "F.npz")])
+def test_a_working_directory_that_is_gone_is_named(lavender, tmp_path, words):
+    (tmp_path / "here").rmdir()
+    code, _, said = lavender(*words)
+    assert code == cli.EXIT_BAD_INPUT
+    assert "working directory is gone" in said
 
 
 def test_another_program_keeps_its_own_ctrl_c():
