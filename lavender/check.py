@@ -13,7 +13,7 @@ the difference of velocities, which is unique where impulses are not.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -121,9 +121,9 @@ class CrossCheck:
             for line in (head, *body)
         ]
         name = self.problem.name or f"{self.problem.m} rows"
-        reference = f"reference {self.reference}" if self.reference else "no reference"
+        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
         return "\n".join(
-            [f"{name} ({self.problem.law}), tol {self.tol:g}: {reference}, {self.reference_note}", *lines]
+            [f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}", *lines]
         )
 
 
@@ -140,7 +140,7 @@ def cross_check(
     max_iter: int | None = None,
     time_limit: float | None = None,
 ) -> CrossCheck:
-    """Solve with every solver and compare each with a judged reference.
+    """Solve with every solver, from doing nothing, and compare each with a judged reference.
 
     The reference must reach max(1e-9, 10 floor), and 1e-5, by the judge; otherwise the next of osqp, clarabel, piqp,
     direct (relaxed friction: clarabel_cone, block_gauss_seidel) is taken, and named.
@@ -172,6 +172,8 @@ def cross_check(
         Wrong `tol` or limits.
     """
     check_problem(problem)
+    if problem.guess is not None:  # solvers are compared by what they do, not by where they begin
+        problem = replace(problem, guess=None, copy=False)
     names = (
         available(problem) if solvers is None else [solvers] if isinstance(solvers, str) else list(solvers)
     )

@@ -86,10 +86,14 @@ def solve_many(
         if type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse
     ]
 
+    stop = bytearray(1)  # not 0: nothing more is begun
+
     def batch(part: list[int]) -> None:
-        _batch(given, starts, part, tol, spec, made)
+        _batch(given, starts, part, tol, spec, made, stop)
 
     def alone(i: int) -> None:
+        if stop[0]:
+            return
         found = solve(given[i], solver, impulse=starts[i], **more)
         made[i] = found if "callback" in options else uninterrupted(found)
 
@@ -102,8 +106,11 @@ def solve_many(
                 alone(i)
     else:
         with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(batch, parts))
-            list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
+            try:
+                list(pool.map(batch, parts))
+                list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
+            finally:
+                stop[0] = 1  # of Ctrl-C the other threads hear nothing
     return [solution for solution in made if solution is not None]
 
 
@@ -114,16 +121,19 @@ def _batch(
     tol: float,
     spec: SolverSpec,
     made: list[Solution | None],
+    stop: bytearray,
 ) -> None:
     """Into `made` the solutions of those of the problems `at` that the compiled loop ends, with their share of time."""
     begin = perf_counter()
     views, given = [], []
     for i in at:
+        if stop[0]:
+            return
         p, start = problems[i], starts[i]
         views.append(p.derived.view)
         given.append(p.guess if start is None else p.impulse_array(start))
     assert spec.small is not None
-    work = Batch(views, given, tol, spec.small.limits)
+    work = Batch(views, given, tol, spec.small.limits, stop)
     seconds = (perf_counter() - begin) / max(1, len(at))
     common = _Solved(
         batch=work, problems=[problems[i] for i in at], spec=spec, tol=tol, seconds=seconds, given=given

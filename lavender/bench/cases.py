@@ -33,6 +33,7 @@ RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a s
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
 ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
+SOLVED = 1e-6  # relative residual at which `lv.solve` ends by default
 
 
 @dataclass(eq=False)
@@ -117,15 +118,17 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         elif isinstance(word, Case):
             items.append(_from_case(word, word.name))
         elif sequences or (sequences is None and _holds_steps(Path(word))):
-            items += _another(steps_in(word), items)
+            steps = _another(steps_in(word), items)
+            name, lost = steps[0].sequence, map(_from_file, _left_out(Path(word)))
+            items += [*steps, *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in lost)]
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
             if not paths:
                 kept = Path(word) / "records.jsonl"
                 shown = f": {kept} shows its report again" if kept.is_file() else ""
                 raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")
-            items += [_from_file(path) for path in paths]
-        elif Path(word).exists():
+            items += [_from_file(path) for path in (*paths, *_left_out(Path(word)))]
+        elif Path(word).exists() or Path(word) in _left_out(Path(word).parent):
             items.append(replace(_from_file(Path(word)), named=True))
         elif is_path(word):
             raise InputError(
@@ -176,7 +179,7 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
     numbered = [(m[1], int(m[2])) for p in paths if (m := re.fullmatch(r"(.*?)(\d+)", p.stem))]
     series = [prefix for prefix, n in Counter(prefix for prefix, _ in numbered).items() if n > 1]
     twice = len(numbered) > len(set(numbered))
-    listed = _listed(folder / ENGINE)
+    listed = {str(line["file"]) for line in _told(folder)}
     strange = [p.name for p in paths if listed and p.name not in listed]
     if twice or len(series) > 1 or strange:
         why = (
@@ -191,12 +194,20 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
         )
 
 
-def _listed(path: Path) -> set[str]:
+def _told(folder: Path) -> list[dict[str, Any]]:
+    """What an engine said of the steps in a folder, each with its "file"; nothing if a line of it cannot be read."""
     try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        return {str(json.loads(line)["file"]) for line in lines}
-    except (OSError, ValueError, KeyError, TypeError):
-        return set()
+        text = (folder / ENGINE).read_text(encoding="utf-8", errors="replace")
+        lines = [dict(json.loads(line)) for line in text.splitlines()]
+        return lines if all("file" in line for line in lines) else []
+    except (OSError, ValueError, TypeError):
+        return []
+
+
+def _left_out(folder: Path) -> dict[Path, str]:
+    """Files that a recording should have made and could not, with the reason of each."""
+    found = {folder / Path(str(t["file"])).name: str(t["left_out"]) for t in _told(folder) if "left_out" in t}
+    return {path: why for path, why in found.items() if not path.exists()}
 
 
 def _problem_files(folder: Path) -> list[Path]:
@@ -251,6 +262,8 @@ def _from_file(path: Path) -> Item:
             raise InputError(
                 f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed"
             )  # a pipe never ends
+        if not path.exists() and (why := _left_out(path.parent).get(path)):
+            raise InputError(f"{path}: left out of its recording: {why}")
         return io.load(path)
 
     def stored() -> FloatArray | None:
@@ -299,7 +312,18 @@ def describe(item: Item, run: str) -> CaseInfo:
         stored_verdict=answer.verdict_in_words if answer and answer.rounding else "",
         nothing_to_do=nothing_to_do(p),
         suspicions=tuple(map(str, diagnose(p))),
+        guess=_guess_of(item),
     )
+
+
+def _guess_of(item: Item) -> str:
+    """As `CaseInfo.guess`. An answer is the one stored beside the problem, or any at which a solve would end."""
+    guess = item.problem.guess
+    if guess is None:
+        return ""
+    stored = item.stored()
+    is_stored = stored is not None and np.array_equal(guess, stored)
+    return "answer" if is_stored or residual(item.problem, guess).relative <= SOLVED else "start"
 
 
 def fingerprint(problem: Problem) -> str:

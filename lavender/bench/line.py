@@ -19,6 +19,7 @@ C_WORDS = {
     ("sweep", "blocks"): "sweep = LAV_BLOCK_SWEEP", ("restart", "against"): "keeps = 1",
 }  # fmt: skip
 
+COLD = "dataclasses.replace({}, guess=None)"  # a problem without the start that came with it
 CARRIED = (
     "before, impulse = problems[0], None",
     "for problem in problems:",
@@ -54,8 +55,11 @@ def _exact(x: float, short: str) -> str:
     return short if float(short) == x else repr(x)
 
 
-def code_of(record: Record) -> tuple[str, ...]:
-    """The lines that a record is of."""
+def code_of(record: Record, guessed: bool = False) -> tuple[str, ...]:
+    """The lines that a record is of; the last one was timed.
+
+    `guessed`: there are problems that bring a guess, which a cold start leaves out.
+    """
     asked = asked_of(record, record.iterations)
     text = {
         name: str(x) if name == "max_iter" else _exact(x, level_name(x) if x else "0")
@@ -63,9 +67,11 @@ def code_of(record: Record) -> tuple[str, ...]:
     }
     words = ", ".join(f"{name}={value}" for name, value in text.items())
     if record.way == "batch":
-        return (f'solutions = lv.solve_many(problems, "{record.solver}", {words})',)
+        cold = (f"problems = [{COLD.format('p')} for p in problems]",) if guessed else ()
+        return (*cold, f'solutions = lv.solve_many(problems, "{record.solver}", {words})')
     if record.start != "carried":
-        return (f'lv.solve(problem, "{record.solver}", {words})',)
+        cold = (f"problem = {COLD.format('problem')}",) if guessed and record.start == "cold" else ()
+        return (*cold, f'lv.solve(problem, "{record.solver}", {words})')
     return (
         *CARRIED,
         f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {words})',

@@ -152,6 +152,7 @@ class CaseInfo(_Texts):
         ""  # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
     )
     suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
+    guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
 
 
 @dataclass(frozen=True)
@@ -162,6 +163,7 @@ class Skip(_Texts):
     case: str
     solver: str
     reason: str
+    sequence: str = ""  # that a case which did not load is a step of
 
 
 @dataclass(frozen=True)

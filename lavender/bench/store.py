@@ -48,6 +48,15 @@ class Records:
         """Pairs that did not run, and cases that did not load."""
         return list(self._skips.values())
 
+    @property
+    def left_out(self) -> dict[str, list[Skip]]:
+        """Cases that did not load, by sequence ("" of none): no number holds them, and each has to say so."""
+        found: dict[str, list[Skip]] = {}
+        for skip in self._skips.values():
+            if not skip.solver:
+                found.setdefault(skip.sequence, []).append(skip)
+        return found
+
     def add(self, entry: Entry) -> None:
         """Take one entry; a description, note or run given again replaces the earlier one."""
         if isinstance(entry, Run):
@@ -62,6 +71,7 @@ class Records:
                 self.cases = {n: i for n, i in self.cases.items() if i.sequence != entry.sequence}
                 self._sequences[entry.sequence] = entry.identity
             self.cases[entry.case] = entry
+            self._skips.pop((entry.run, entry.case, ""), None)  # it loads now
         elif isinstance(entry, Skip):
             self._skips[entry.run, entry.case, entry.solver] = entry
         elif isinstance(entry, Done):
@@ -111,7 +121,7 @@ class Records:
 
     def rows(self) -> list[dict[str, Any]]:
         """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
-        out = []
+        out, left_out = [], self.left_out
         for r in self.records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
             row = {f.name: getattr(r, f.name) for f in fields(r) if f.name != "sha"}
@@ -121,6 +131,7 @@ class Records:
                 "law": info.law if info else "",
                 "rows": info.rows if info else 0,
                 "structure": ", ".join(info.structure) if info else "",
+                "left_out": len(left_out.get(info.sequence if info else "", ())),
                 "lavender": run.lavender if run else "",
                 "python": run.python if run else "",
                 "platform": run.platform if run else "",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +42,7 @@ EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file 
 EXIT_BAD_INPUT = 2  # or a folder that another process writes
 EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms
 EXIT_INTERRUPTED = 130
+LEAST_WIDTH = 60  # columns of a terminal
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -156,13 +158,14 @@ def one_thread() -> None:
 
 
 def console(stderr: bool = False) -> Console:
-    """A terminal to print on; into a file or a pipe as wide as tables need."""
+    """A terminal to print on, never so narrow that names are cut; into a file or a pipe as wide as tables need."""
     from rich.console import Console
 
-    made = Console(stderr=stderr)
-    if not made.is_terminal and "COLUMNS" not in os.environ:
-        made = Console(stderr=stderr, width=10_000)  # a file or a pipe: nothing is folded or cut
-    return made
+    known = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
+    width = (
+        max(shutil.get_terminal_size().columns, LEAST_WIDTH) if known else 10_000
+    )  # nothing is folded or cut
+    return Console(stderr=stderr, width=width)
 
 
 def was_given(context: click.Context, name: str) -> bool:

@@ -101,8 +101,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     and its steps are recorded in the folder of the report. A records.jsonl is shown again
     without solving. After an interruption, the same command continues where it stopped.
 
-    Exit code 1: a file in a folder cannot be read. Exit code 2: a named file cannot be read, or another report
-    is writing to the folder.
+    Exit code 1: a file in a folder cannot be read, or a step could not be recorded. Exit code 2: a named file cannot
+    be read, or another report is writing to the folder.
     """
     from lavender import bench
     from lavender.report.engine import contestants
@@ -145,7 +145,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         console().print("[yellow]Stopped; the same command continues from here.[/]")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if done.lost and not again:
-        _say(f"{count(done.lost, 'case')} of a folder did not load", style="yellow")
+        _say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
 
 

@@ -59,7 +59,8 @@ def record(
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
     file, step, rows, the engine's iterations, the time of its constraint solver [s] and, by our judge, its
-    residual, the floor of its precision and the verdict.
+    residual, the floor of its precision and the verdict. A step that cannot be exported has no file, and `left_out`
+    in its line says why: whatever is measured on the others names it.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def record(
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
     drive = drive_of(model, control, seed)
     kept: list[dict[str, Any]] = []
-    left_out: list[str] = []
+    left_out: list[dict[str, Any]] = []
     without = 0
     width = len(str(steps))
     with folder_for_steps(folder, replace) as folder:
@@ -113,7 +114,7 @@ def record(
             try:
                 found = _solved(mj, model, data, f"step {step + 1}", precision)
             except LavenderError as error:
-                left_out.append(f"step {step + 1}: {error}")
+                left_out.append({"file": file.name, "step": step + 1, "left_out": str(error)})
                 continue
             if found is None:
                 without += 1
@@ -121,8 +122,9 @@ def record(
             problem, own, told = found
             npz.write(problem, file, impulse=own)
             kept.append({"file": file.name, "step": step + 1, **told})
-        write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in kept))
-    return Recording(folder, tuple(line["file"] for line in kept), without, tuple(left_out))
+        write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
+    reasons = tuple(f"step {line['step']}: {line['left_out']}" for line in left_out)
+    return Recording(folder, tuple(line["file"] for line in kept), without, reasons)
 
 
 def _solved(
@@ -168,9 +170,8 @@ def record_file(
         control = _controls(control)
     found = record(made, mj.MjData(made), folder, steps, control=control, **options)
     if not found.files:
-        raise InputError(
-            f"{path}: no step had a constraint that could be kept: more steps, or other controls"
-        )
+        why = f" ({found.left_out[0]})" if found.left_out else ": more steps, or other controls"
+        raise InputError(f"{path}: no step had a constraint that could be kept{why}")
     return found
 
 

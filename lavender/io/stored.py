@@ -99,14 +99,14 @@ def destination(path: str | os.PathLike[str]) -> Path:
 
     InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
     """
-    path = as_path(path)
+    path, target = as_path(path), None
     try:
         target = Path(os.path.realpath(path))
         found = os.stat(path)
-    except FileNotFoundError:
-        return target
     except (OSError, ValueError) as error:
-        what = f"{getattr(error, 'strerror', None) or error}"
+        if target is not None and isinstance(error, FileNotFoundError):
+            return target
+        what = f"{getattr(error, 'strerror', None) or error}" if target else "the working directory is gone"
         raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
     if not stat.S_ISREG(found.st_mode):
         what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"

@@ -18,7 +18,7 @@ from lavender.report.findings import Report
 from lavender.report.moved import idle, speed_name
 from lavender.report.table import WORDS, Cell, Table
 from lavender.report.tables import Advice, Line
-from lavender.report.text import NONE, count, percent, residual, seconds, share, times, who
+from lavender.report.text import NONE, count, percent, residual, seconds, share, times, who, without
 
 __all__ = [
     "Section",
@@ -74,8 +74,8 @@ def sections(report: Report) -> list[Section]:
         ]
     else:
         by_structure = (
-            "to a level: mean time, share of cases that get there, budget; in a time or with sweeps: share of cases "
-            "served, residual at the 90th percentile; ≈ as good within noise"
+            "to a level: mean time (cold, if not carried), share of cases that get there, budget; in a time or with "
+            "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
@@ -134,6 +134,7 @@ def advice_table(report: Report, links: Mapping[str, str] | None = None) -> Tabl
         [
             Cell(
                 line.name,
+                after=without(line.left_out),
                 more=count(line.size, "step" if line.sequence else "case"),
                 link=(links or {}).get(line.name, ""),
             ),
@@ -150,7 +151,9 @@ def sweeps_table(lines: Sequence[Line]) -> Table:
     budgets = sorted({n for line in lines for n in line.by_sweeps})
     heads = [count(int(n), "sweep") for n in budgets]
     rows: Rows = [
-        [line.name, *(advised(line.by_sweeps[n], True) for n in budgets)] for line in lines if line.by_sweeps
+        [Cell(line.name, after=without(line.left_out)), *(advised(x, True) for x in line.by_sweeps.values())]
+        for line in lines
+        if line.by_sweeps
     ]
     return Table(["structure", *heads], rows, folds=True)
 
@@ -353,7 +356,7 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
     for w in passes:
         rows.append(
             [
-                w.sequence, w.solver, w.asked, str(w.steps),
+                w.sequence, w.solver, w.asked, f"{w.steps}{without(w.left_out)}",
                 f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
                 *(residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
                 *(seconds(w.time[s]) + share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
@@ -370,7 +373,7 @@ def engine_table(found: Sequence[Contestant]) -> Table:
     for c in found:
         own = [
             c.folder,
-            str(c.steps),
+            f"{c.steps}{without(c.left_out)}",
             f"{c.rows:g}",
             c.solver,
             seconds(c.seconds),

@@ -31,6 +31,7 @@ class Contestant:
     folder: str
     solver: str  # of the engine
     steps: int
+    left_out: int  # steps of the recording that could not be kept
     rows: float  # median
     seconds: float  # median, inside the engine
     relative: float  # median
@@ -50,10 +51,11 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
         path = Path(word) / ENGINE
         if not path.is_file():
             continue
-        found = []
+        found, lost = [], 0
         for line in whole_file(path, "the engine's answers").decode(errors="replace").splitlines():
             try:
                 entry = json.loads(line)
+                lost += "left_out" in entry
                 numbers = [float(entry[name]) for name in _NUMBERS]
                 early = entry["verdict"] != AT_FLOOR if entry.get("precision") == "float32" else None
                 found.append((*numbers, early, str(entry["solver"])))
@@ -68,6 +70,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 folder=Path(word).name,
                 solver=f"{max(set(solvers), key=solvers.count).capitalize()} (inside the engine)",
                 steps=len(found),
+                left_out=lost,
                 rows=float(np.median(rows)),
                 seconds=float(np.median(seconds)),
                 relative=float(np.median(relative)),

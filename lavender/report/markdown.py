@@ -6,6 +6,7 @@ from lavender.report import tables
 from lavender.report.contents import sections
 from lavender.report.findings import Report
 from lavender.report.table import markdown, plain
+from lavender.report.text import left_out
 
 __all__ = ["summary"]
 
@@ -19,6 +20,9 @@ def summary(report: Report) -> str:
         lines += [plain(f"{machine}; run {run.run}, {run.started}"), ""]
     if found.sentences:
         lines += [plain(found.text), "", "```python", *found.code, "```", ""]
+    lines += [
+        plain(f"Left out, and in no number here: {what}: {reason}") for what, reason in left_out(records)
+    ]
     for section in sections(report):
         lines += [f"**{plain(section.title)}** ({plain(section.note)})", ""]
         lines += [*(markdown(section.table) if section.table.rows else [section.empty]), ""]

@@ -15,7 +15,7 @@ from lavender.report.findings import Report
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.report.tables.finals import WAYS, line_table
-from lavender.report.text import count, residual, seconds, suspicions
+from lavender.report.text import count, left_out, residual, seconds, suspicions, without
 from lavender.report.verdict import Verdict
 
 __all__ = ["page"]
@@ -70,6 +70,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "others": _others(report),
         "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
+        "left_out": left_out(records),
         "engines": contents.engine_table(report.engines),
         "moved": None if campaign else contents.moved_table(report),
         "speed_advice": None if campaign else contents.speed_table(report),
@@ -105,7 +106,10 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
             name: contents.pass_table(passes).without("sequence", "steps")
             for name, passes in tables.by_sequence(records).items()
         },
-        "steps": {name: passes[0].steps for name, passes in tables.by_sequence(records).items()},
+        "steps": {
+            name: f"{passes[0].steps} steps{without(passes[0].left_out)}"
+            for name, passes in tables.by_sequence(records).items()
+        },
         "n_records": len(records),
         "n_cases": len({r.case for r in records if r.step < 0}),
     }

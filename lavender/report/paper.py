@@ -24,7 +24,7 @@ from lavender.report.findings import Report
 from lavender.report.style import looks
 from lavender.report.table import Cell, Table, latex, tex
 from lavender.report.tables.advice import NOISE
-from lavender.report.text import count, seconds
+from lavender.report.text import count, seconds, without
 
 __all__ = ["write_paper"]
 
@@ -94,7 +94,7 @@ def _tables(report: Report) -> str:
     rows: list[list[str | Cell]] = [
         [
             str(row[0]),
-            str(line.size),
+            f"{line.size}{without(line.left_out)}",
             *(replace(c, after="") for c in row[1:last] if isinstance(c, Cell)),
         ]
         for row, line in zip(advice.rows, report.lines, strict=True)
@@ -130,8 +130,9 @@ def _method(records: Records) -> str:
     least = f"the least of {repeats[0]}{f' to {repeats[-1]}' if len(repeats) > 1 else ''} repeats"
     limit, threads = seconds(tables.limit_of(records)), count(run.threads, "thread")
     solvers = count(len({r.solver for r in own}), "solver")
+    lost = without(sum(map(len, records.left_out.values())))
     parts = (
-        f"We ran {solvers} on {count(len(infos), 'problem')} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
+        f"We ran {solvers} on {count(len(infos), 'problem')}{lost} ({', '.join(laws)}; {rows[0]} to {rows[-1]} rows),",
         f"{count(len(own), 'run')} in all, to relative residuals of {levels}{swept}. The residual of an impulse is",
         "computed from the problem's data, whatever the solver reports: the larger of its errors in energy norm and",
         "in velocity, each over that of doing nothing, so that 1 is doing nothing and 0 a solution. Times are those",

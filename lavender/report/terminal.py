@@ -10,7 +10,7 @@ from lavender.report.contents import sections
 from lavender.report.findings import Report
 from lavender.report.moved import idle
 from lavender.report.table import print_table
-from lavender.report.text import count, residual, suspicions
+from lavender.report.text import count, left_out, residual, suspicions
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -59,10 +59,12 @@ def _print_idle(report: Report, console: Console) -> None:
 
 
 def _print_lost(records: Records, console: Console) -> None:
-    for skip in records.skips:
-        if not skip.solver:
-            console.print("[yellow]not run:[/]", end=" ")
-            console.print(f"{skip.case}: {skip.reason}", highlight=False, markup=False)
+    lost = left_out(records)
+    for what, reason in lost[:SHORT]:
+        console.print("[yellow]left out:[/]", end=" ")
+        console.print(f"{what}: {reason}", highlight=False, markup=False)
+    if len(lost) > SHORT:
+        console.print(f"and {len(lost) - SHORT} more, on the page", highlight=False, style="dim")
     refused = [s for s in records.skips if s.solver]
     if refused:
         console.print(

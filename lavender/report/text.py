@@ -6,7 +6,9 @@ import math
 
 from lavender.bench.store import Records
 
-__all__ = ["NONE", "count", "percent", "residual", "seconds", "share", "suspicions", "times", "who"]
+__all__ = [
+    "NONE", "count", "left_out", "percent", "residual", "seconds", "share", "suspicions", "times", "who", "without",
+]  # fmt: skip
 
 NONE = "–"  # where there is no number
 
@@ -56,6 +58,18 @@ def suspicions(records: Records) -> list[tuple[str, str]]:
         (f"{some[0][0]} and {count(len(some) - 1, 'more step')}" if len(some) > 1 else some[0][0], some[0][1])
         for some in seen.values()
     ]
+
+
+def left_out(records: Records) -> list[tuple[str, str]]:
+    """(what did not load, why): cases, and how many steps of each sequence, with the reason of the first."""
+    single = [(skip.case, skip.reason) for skip in records.left_out.get("", ())]
+    steps = {f"{count(len(some), 'step')} of {name}": some for name, some in records.left_out.items() if name}
+    return [*single, *((told, some[0].reason) for told, some in steps.items())]
+
+
+def without(lost: int) -> str:
+    """What stands beside a number that rests on what is left."""
+    return f" ({lost} left out)" if lost else ""
 
 
 def percent(part: int, whole: int, digits: int = 0) -> str:

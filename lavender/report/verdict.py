@@ -15,9 +15,9 @@ from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Choice
-from lavender.report.tables.finals import WAYS, Final, Race, in_time, lines
+from lavender.report.tables.finals import STARTS, WAYS, Final, Race, in_time, lines
 from lavender.report.tables.finals import to_level as race_to_level
-from lavender.report.text import count, residual, seconds
+from lavender.report.text import count, residual, seconds, without
 from lavender.report.text import times as times_of
 from lavender.suite import FAMILIES
 
@@ -82,7 +82,7 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
         return Verdict((f"Nobody brings any of {what} {reached}.",), (), near)
     final, first = race.ranking[0]
-    said = [_head(first, reached, what), *_sure(race)]
+    said = [_head(first, f"{STARTS[final.line.start]}, {reached}", what), *_sure(race)]
     code = _told(records, final, first.score, WAYS[subject.way])
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
@@ -119,10 +119,11 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
 
 
 def _what(records: Records, subject: Subject) -> str:
+    names, lost = subject.names, records.left_out
     if subject.way == "call":
-        return _name(records, subject.names)
-    names = subject.names
-    return f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
+        return _name(records, names) + without(len(lost.get("", ())))
+    told = f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
+    return told + without(sum(len(lost.get(name, ())) for name in names))
 
 
 def _head(first: Choice, reached: str, what: str) -> str:
@@ -178,7 +179,7 @@ def _not_in_c(records: Records, final: Final) -> str:
 def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     """Lines to copy, with what they were timed at."""
     *before, last = final.code
-    timed = f"{seconds(time)}, {what}"
+    timed = f"{seconds(time)}, {what}, {STARTS[final.line.start]}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
     calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
     in_c = [f"# in C (docs/c.md): {calls}, lav_run(solver, &budget, &result);"] if calls else []
@@ -203,7 +204,8 @@ def _by_advice(records: Records) -> Verdict:
     tol = _tolerance(records, first.solver, best.target)
     asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
     code = f'lv.solve(problem, "{first.solver}", {asked})'
-    return Verdict((_head(first, reached, what), *ties), (code,), leaders)
+    start = STARTS["carried" if "carried" in first.how else "cold"]
+    return Verdict((_head(first, f"{start}, {reached}", what), *ties), (code,), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:

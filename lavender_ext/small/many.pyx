@@ -218,13 +218,15 @@ cdef class Batch:
     starts : list of (m,) N s or None
         None: from doing nothing.
     limits : Limits
+    stop : (1,) bytes
+        What is not begun when it becomes nonzero is left to the caller: Ctrl-C comes to another thread than this.
     """
 
     cdef job_t* jobs
     cdef list data
     cdef object impulses, both
 
-    def __init__(self, list data, list starts, double tol, Limits limits):
+    def __init__(self, list data, list starts, double tol, Limits limits, const unsigned char[::1] stop):
         cdef Py_ssize_t i, end, done = 0, at = 0, n = len(data)
         cdef room_t room = room_t(0, 0, NULL, NULL)
         cdef Data p
@@ -243,10 +245,10 @@ cdef class Batch:
                 p = data[i]
                 take(&self.jobs[i], p, starts[i], &whole[0] + at, &measured[0] + 2 * at + i)
                 at += p.blocks.n_rows
-            while done < n:
+            while done < n and not stop[0]:
                 end = done + AT_A_TIME if done + AT_A_TIME < n else n
                 with nogil:
-                    while done < end:
+                    while done < end and not stop[0]:
                         solve_alone(&self.jobs[done], &room, &limits.at, tol)
                         done += 1
                 PyErr_CheckSignals()

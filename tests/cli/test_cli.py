@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -554,6 +555,53 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
     assert "Traceback" not in done.stderr
 
 
+WORKER = """
+import os, signal, sys
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == "joblib.hashing":
+            os.killpg(0, signal.SIGINT)
+if "popen_loky" in " ".join(sys.orig_argv):
+    sys.meta_path.insert(0, Finder())
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
+def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alone(tmp_path):
+    """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
+    (tmp_path / "sitecustomize.py").write_text(WORKER)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "lavender", "report", "--campaign", "granular(n=2)", "--seeds", "20"]
+    command += ["--workers", "2", "--solvers", "pgs", "--no-figures", "--out", str(tmp_path / "out")]
+    more = {"env": environment, "capture_output": True, "text": True, "timeout": 600, "check": False}
+    done = subprocess.run(command, start_new_session=True, **more)
+    assert done.returncode == 130
+    assert "Traceback" not in done.stderr
+    assert "continues from here" in done.stdout
+
+
+@pytest.mark.parametrize("columns", ["0", "1", "19"])
+@pytest.mark.parametrize(
+    "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]
+)
+def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words, columns):
+    wide = lavender(*words)[1]
+    monkeypatch.setenv("COLUMNS", columns)
+    code, narrow, _ = lavender(*words)
+    assert code == 0
+    names = re.findall(r"^\w+", wide, re.MULTILINE)
+    assert names and set(names) <= set(re.findall(r"^\w+", narrow, re.MULTILINE))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no folder in use can be removed")
+@pytest.mark.parametrize("words", [("report", "stack(n=4)"), ("report", "F.npz")])
+def test_a_working_directory_that_is_gone_is_named(lavender, tmp_path, words):
+    (tmp_path / "here").rmdir()
+    code, _, said = lavender(*words)
+    assert code == cli.EXIT_BAD_INPUT
+    assert "working directory is gone" in said
+
+
 def test_another_program_keeps_its_own_ctrl_c():
     words = "import signal, lavender, lavender.cli; assert signal.getsignal(2) is signal.default_int_handler"
     subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=600)
@@ -590,6 +638,50 @@ def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
     folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
     assert lavender("report", *models, *words)[0] == 0
     assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
+
+
+def test_what_is_left_out_stands_beside_what_is_left(lavender, tmp_path, monkeypatch):
+    """Steps that could not be recorded: on the page, in the summary, the terminal, the files, and the exit code."""
+    recording = pytest.importorskip("lavender.io.recording")
+    pytest.importorskip("mujoco")
+    (tmp_path / "box.xml").write_text(MODEL.format(height=0.1, kind="box"))
+    true = recording.adapter.from_mujoco
+
+    def some(model, data, name):
+        if int(name.split()[1]) % 15 == 0:
+            raise lv.CapabilityError(f"{name} is of another <problem>")
+        return true(model, data, name=name)
+
+    monkeypatch.setattr(recording.adapter, "from_mujoco", some)
+    more = ("--solvers", "auto", "pgs", "--repeats", 1, "--time-limit", 0.02)
+    more += ("--no-figures", "--tables", "--paper", "--out", tmp_path / "o")
+    model = (tmp_path / "box.xml", "--steps", 45)
+    for _ in range(2):  # recorded, and found recorded
+        code, out, _ = lavender("report", *model, *more)
+        assert code == cli.EXIT_UNMET
+        summary, page = ((tmp_path / "o" / name).read_text() for name in ("summary.md", "index.html"))
+        (name,) = {info.sequence for info in bench.read(tmp_path / "o").cases.values()}
+        for said in (out, summary, page):
+            assert f"on a step of {name} (3 left out)" in said  # the headline
+            assert said.count("(3 left out)") >= 3  # and the tables
+            assert f"3 steps of {name}" in said
+        assert "step 15 is of another <problem>" in " ".join(out.split())
+        assert all(f"step {k} is of another &lt;problem&gt;" in page for k in (15, 30, 45))
+        assert "6 problems (3 left out)" in (tmp_path / "o" / "paper" / "method.tex").read_text()
+        skips = json.loads((tmp_path / "o" / "records.json").read_text())["skips"]
+        assert [(s["sequence"], s["solver"]) for s in skips if "of another" in s["reason"]] == [
+            (name, "")
+        ] * 3
+    assert lavender("report", tmp_path / "o" / "records.jsonl", *more[7:])[0] == 0  # shown again
+    (folder,) = (tmp_path / "o" / "recorded").iterdir()
+    code, out, _ = lavender(
+        "report", "--campaign", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
+    )
+    assert code == cli.EXIT_UNMET and "of another" in " ".join(out.split())
+    assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
+    monkeypatch.setattr(recording.adapter, "from_mujoco", true)
+    code, out, _ = lavender("report", *model, *more, "--fresh")
+    assert (code, "left out" in out) == (0, False)
 
 
 def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):

@@ -223,16 +223,16 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     found.source = "my report/records.jsonl"
     said = verdict(found, [1e-3, 1.0])
     assert said.sentences == (
-        "Use auto: 12.7 ms to 1e-6 on your 2 stacks (at worst 40.0 ms: b).",
+        "Use auto: 12.7 ms cold, to 1e-6 on your 2 stacks (at worst 40.0 ms: b).",
         (
             "If you have only 1.00 ms, take pgs, 8 sweeps: it serves 2 of 2 (at most half of the start's residual), "
             "at the 90th percentile 1.0e-1."
         ),
     )
     assert said.code == (  # records of old: of prepare and solve
-        'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call',
+        'lv.solve(problem, "auto", tol=1e-6)  # not timed as a line: 12.7 ms, one call, cold',
         "# in C: lavender export c liblavender --solver auto --for 'my report/records.jsonl'",
-        'lv.solve(problem, "pgs", tol=0, max_iter=8)  # not timed as a line: 100 µs, for 1.00 ms',
+        'lv.solve(problem, "pgs", tol=0, max_iter=8)  # not timed as a line: 100 µs, for 1.00 ms, cold',
         (
             "# in C (docs/c.md): lav_default_options(LAV_PGS, &options), lav_default_budget(&budget), "
             "budget.tol = 0, budget.iterations = 8, lav_run(solver, &budget, &result);"

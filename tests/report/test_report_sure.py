@@ -147,7 +147,7 @@ def test_no_iteration_limit_of_a_factorising_solver_is_offered_for_a_time():
     newton = {"mode": "budget", "tol": 0.0, "max_iter": 8, "work": {"factorisations": 8}, "claims": False}
     found = records_of(record("a", "newton", 1.0, 1e-7), record("a", "newton", 1e-4, 1e-3, **newton))
     python, c = verdict(found, [1e-3]).code
-    assert python == 'lv.solve(problem, "newton", tol=1e-6)  # not timed as a line: 1.00 s, one call'
+    assert python == 'lv.solve(problem, "newton", tol=1e-6)  # not timed as a line: 1.00 s, one call, cold'
     assert "budget.iterations = 1500" in c
 
 
@@ -179,4 +179,5 @@ def test_the_headline_is_of_all_sequences():
     found = records_of(*made)
     for case, info in list(found.cases.items()):
         found.add(bench.CaseInfo(**{**vars(info), "sequence": case[0], "step": int(case[2])}))
-    assert verdict(found).sentences[0].startswith("Use auto: 1.00 ms to 1e-6 on a step of your 3 sequences")
+    said = "Use auto: 1.00 ms warm from the step before, to 1e-6 on a step of your 3 sequences"
+    assert verdict(found).sentences[0].startswith(said)

@@ -4,13 +4,16 @@ import copy
 import dataclasses
 import itertools
 import pickle
+import signal
+import threading
+import time
 
 import numpy as np
 import pytest
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
-from lavender import registry, suite
+from lavender import many, registry, suite
 from lavender.solution import Claim, Status
 from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
@@ -181,3 +184,40 @@ def test_a_set_up_that_was_stopped_begins_again(monkeypatch):
         prepared.solve(max_iter=50)
     assert prepared.solve(max_iter=50).iterations > 0
     assert len(calls) == 2
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkeypatch):
+    """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
+    n, begun, solve, batch = 2000, [], many.solve, many.Batch
+
+    def interrupt():
+        begun.append(form)
+        if len(begun) == 1:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        time.sleep(1e-3)
+
+    def slow(*args, **options):
+        interrupt()
+        return solve(*args, **options)
+
+    def slow_batch(data, starts, tol, limits, stop):
+        interrupt()
+        while not stop[0]:
+            time.sleep(1e-3)
+        found, left = batch(data, starts, tol, limits, stop), [None] * len(data)
+        found.hand_out(lv.Solution, None, None, list(range(len(data))), left)
+        assert left == [None] * len(data)
+        return found
+
+    monkeypatch.setattr(many, "solve", slow)
+    monkeypatch.setattr(many, "Batch", slow_batch)
+    problem = (
+        TINY
+        if form == "matrix"
+        else lv.Problem.from_jacobian(np.eye(2), np.eye(2), -np.ones(2), cones=TINY.cones)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        lv.solve_many([dataclasses.replace(problem, copy=False) for _ in range(n)], threads=2)
+    assert 1 <= len(begun) < n / 2

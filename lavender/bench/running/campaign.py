@@ -11,11 +11,13 @@ import contextlib
 import itertools
 import math
 import os
+import signal
 import threading
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -242,9 +244,31 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
                 while some := list(itertools.islice(calls, ROUND)):
                     yield from parallel(some)
                 return
-            yield from parallel(calls)
+            with _deaf():
+                found = parallel(calls)
+            yield from found
         except lost:
             return
+
+
+@contextlib.contextmanager
+def _deaf() -> Iterator[None]:
+    """Processes that begin here hear no Ctrl-C, which a terminal sends to all; this one does, and ends them."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    from joblib.externals.loky.backend import resource_tracker as lokys
+
+    for tracker in (
+        resource_tracker,
+        lokys,
+    ):  # each begins once, and leaves the process that begins it hearing
+        tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _backend(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:

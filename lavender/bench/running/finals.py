@@ -162,7 +162,7 @@ class _Stage:
         tasks = [self.task(ask, info) for _, info in some]
         if all(task.key in self.known for task in tasks):
             return
-        fresh = [just_written(item.problem) for item, _ in some]
+        fresh = [just_written(item.problem, ask.start) for item, _ in some]
         asked = ask.max_iter or None
         beside = pace()
         begun = perf_counter()

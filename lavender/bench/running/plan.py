@@ -37,7 +37,7 @@ class Plan:
     time_limit : s, of one solve
     pass_limit : s, of one solver over all steps of a sequence at one budget or level. The steps that are left over are
         not solved, and a note says so.
-    warm : also start from the problem's guess, where it has one
+    warm : also start from the problem's guess, where it has one that is no answer already
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
     motion : tell how wrong the bodies move, by a reference that is solved for once a case
@@ -122,7 +122,7 @@ class Plan:
             return make(Task.of(info, ask, **more))
 
         starts = ["cold"]
-        if self.warm and problem.guess is not None and spec.impulse and not spec.exact:
+        if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
             starts.append("warm")
         most = UNLIMITED if spec.resumable else 0
         for start in starts:

@@ -196,7 +196,7 @@ class Runner:
             if self.plan.motion:
                 load_reference(item.problem, item.source)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
-            self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error)))
+            self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error), item.sequence))
             self.done += len(self.names)
             self.tell(item.name, "")
             return None

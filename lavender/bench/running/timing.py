@@ -263,22 +263,21 @@ def pace() -> float:
     return perf_counter() - begun
 
 
-def just_written(problem: Problem) -> Problem:
-    """The problem in arrays of its own, written now, nothing derived from them: what a simulator hands over."""
+def just_written(problem: Problem, start: str) -> Problem:
+    """The problem in arrays of its own, written now, nothing derived from them: what a simulator hands over.
+
+    With `start` "cold" without the guess that came with it, as the line that is printed says.
+    """
     rows = None if problem.rows is None else replace(problem.rows, copy=True)
-    return replace(problem, rows=rows, copy=True)
+    return replace(problem, rows=rows, guess=None if start == "cold" else problem.guess, copy=True)
 
 
 def _line(problem: Problem, task: Task, impulse: Any, guard: Solution | None) -> tuple[Solution, float]:
     """One call of the line, and its time."""
     more = {**task.options, **asked_of(task, 0 if guard is None else guard.iterations)}
-    fresh = just_written(problem)
+    fresh = just_written(problem, task.start)
     if task.start == "carried":
         more["impulse"] = problem.start() if impulse is None else impulse
-    elif (
-        task.start == "cold" and not task.turns
-    ):  # in turns: what the line does, from the guess if there is one
-        fresh = replace(fresh, guess=None, copy=False)
     begun = perf_counter()
     solution = solve(fresh, task.solver, **more)
     return uninterrupted(solution), perf_counter() - begun + task.lead

@@ -117,6 +117,7 @@ class Line:
     name: str
     size: int
     sequence: bool
+    left_out: int  # steps that did not load
     by_level: Mapping[float, Advice]
     by_time: Mapping[float, Advice]
     by_sweeps: Mapping[float, Advice]
@@ -132,12 +133,13 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     if none are given.
     """
     times = tuple(times) or time_budgets(records)
-    ways, swept = _ways(records), _swept(records)
+    ways, swept, lost = _ways(records), _swept(records), records.left_out
     return [
         Line(
             name=name,
             size=len(cases),
             sequence=is_sequence,
+            left_out=len(lost.get(name, ())) if is_sequence else 0,
             by_level={x: to_level(records, name, cases, x, ways) for x in levels_of(records)},
             by_time={t: within(records, name, cases, t, ways) for t in times},
             by_sweeps={float(n): _with_sweeps(records, name, cases, n, some) for n, some in swept.items()},

@@ -20,7 +20,7 @@ from lavender.bench.store import Records
 from lavender.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
 from lavender.report.tables.means import SHIFT, limit_of
 
-__all__ = ["WAYS", "Final", "Race", "in_time", "line_table", "lines", "to_level"]
+__all__ = ["STARTS", "WAYS", "Final", "Race", "in_time", "line_table", "lines", "to_level"]
 
 SAMPLES = 500
 SURE = 0.8  # share of resamplings below which a second name is told
@@ -37,6 +37,7 @@ class Final:
     """One line on all of its cases."""
 
     runs: Mapping[str, Record]  # by case
+    guessed: bool  # some of these bring a guess
 
     @property
     def line(self) -> Record:
@@ -46,7 +47,7 @@ class Final:
     @property
     def code(self) -> tuple[str, ...]:
         """To copy."""
-        return code_of(self.line)
+        return code_of(self.line, self.guessed)
 
     @property
     def time(self) -> float:
@@ -91,9 +92,14 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
-    return [Final(runs) for runs in groups.values() if len(runs) == most]
+    return [
+        Final(runs, any(records.cases[c].guess for c in runs))
+        for runs in groups.values()
+        if len(runs) == most
+    ]
 
 
+STARTS = {"cold": "cold", "carried": "warm from the step before", "warm": "from its guess"}
 WAYS = {"call": "one call", "steps": "a step in its loop", "batch": "a problem of a batch"}
 
 

@@ -24,6 +24,7 @@ class Pass:
     tol: float
     max_iter: int
     steps: int  # of the sequence; a pass that was stopped has fewer
+    left_out: int  # steps of the sequence that did not load
     times: Mapping[str, tuple[float, ...]]  # start -> s of each step
     iterations: Mapping[str, int]
     residuals: Mapping[str, tuple[float, ...]]  # start -> of each step
@@ -64,7 +65,7 @@ def passes(records: Records) -> list[Pass]:
             name = records.cases[r.case].sequence
             groups[name, r.solver, r.mode, r.tol, r.max_iter][r.start].append(r)
     steps = Counter(info.sequence for info in records.cases.values())
-    out = []
+    out, lost = [], records.left_out
     for key, by_start in groups.items():
         for group in by_start.values():
             group.sort(key=lambda r: r.step)
@@ -72,6 +73,7 @@ def passes(records: Records) -> list[Pass]:
             Pass(
                 *key,
                 steps=steps[key[0]],
+                left_out=len(lost.get(key[0], ())),
                 times={s: tuple(_step_time(r) for r in g) for s, g in by_start.items()},
                 iterations={s: sum(r.iterations for r in g) for s, g in by_start.items()},
                 residuals={s: tuple(r.relative for r in g) for s, g in by_start.items()},
