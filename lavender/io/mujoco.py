@@ -102,9 +102,9 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     Returns
     -------
     Problem
-        In generalised coordinates, with v*, keys of blocks (geoms and number of a contact, joint, tendon, equality)
-        and, without `noslip_iterations`, MuJoCo's own impulses as `guess`. Law "cone" with elliptic friction cones,
-        "lcp" with pyramidal ones or without friction, "linear" with equalities alone.
+        In generalised coordinates, with v* and keys of blocks (geoms and number of a contact, joint, tendon,
+        equality). Law "cone" with elliptic friction cones, "lcp" with pyramidal ones or without friction, "linear"
+        with equalities alone. MuJoCo's own impulses are its answer, no start: `impulse(model, data)` has them.
 
     Raises
     ------
@@ -139,7 +139,6 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         generalized=general,
         compliance=softness if gap <= SAME else _compliance(data) * scale * scale,
         friction="cone",
-        guess=None if noslip else own,
         key=key,
         names=Names(cones.n_blocks, lambda: _words(mj, model, held)),
         name=f"{name} (noslip)" if noslip else name,

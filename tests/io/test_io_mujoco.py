@@ -180,15 +180,16 @@ def test_coefficients_that_differ_are_made_round_without_changing_the_problem(co
     assert np.abs(found - data.qacc).max() < 1e-5 * (1 + np.abs(data.qacc).max())
 
 
-def test_the_problem_knows_velocities_keys_and_the_engines_own_impulse():
+def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
     model, data = state()
     problem = lv.io.from_mujoco(model, data)
     assert problem.operator == "generalized"
     dt = model.opt.timestep
     after = problem.velocity(adapter.impulse(model, data))
     np.testing.assert_allclose(after, data.qvel + dt * data.qacc, atol=1e-6)
-    assert np.array_equal(problem.guess, adapter.impulse(model, data))
-    assert lv.solve(problem, "newton", tol=1e-6).iterations == 0
+    assert problem.guess is None  # MuJoCo's answer is no start: who times a solve from it times nothing
+    assert lv.solve(problem, "newton", tol=1e-6).iterations > 0
+    assert lv.solve(problem, "newton", tol=1e-6, impulse=adapter.impulse(model, data)).iterations == 0
     assert len(np.unique(problem.key)) == problem.n_blocks
     names, keys = list(problem.names), problem.key
     mj.mj_step(model, data)
@@ -238,13 +239,11 @@ def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
         lv.io.from_mujoco(model, data)
 
 
-def test_impulses_of_noslip_are_marked_and_no_guess():
+def test_impulses_of_noslip_are_marked():
     model, data = state()
     model.opt.noslip_iterations = 5
     mj.mj_forward(model, data)
-    problem = lv.io.from_mujoco(model, data)
-    assert problem.guess is None
-    assert "noslip" in problem.name
+    assert "noslip" in lv.io.from_mujoco(model, data).name
 
 
 def test_something_else_is_an_input_error():
