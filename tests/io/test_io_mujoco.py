@@ -216,17 +216,54 @@ def test_an_integrator_that_puts_damping_into_m_is_refused():
         data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
         mj.mj_forward(model, data)
         if refused:
-            with pytest.raises(lv.CapabilityError, match="integrator='discrete'"):
+            with pytest.raises(lv.CapabilityError, match=r"integrator='discrete'.*'euler', .* have M itself"):
                 lv.io.from_mujoco(model, data)
         else:
             assert lv.io.from_mujoco(model, data).m > 0
 
 
-def test_data_of_another_forward_pass_are_refused():
+@pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
+@pytest.mark.parametrize("solver", ["NEWTON", "CG", "PGS"])
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_judged(
+    jacobian, solver, integrator
+):
+    model, data = state(jacobian=jacobian)
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    model.opt.solver = getattr(mj.mjtSolver, f"mjSOL_{solver}")
+    mj.mj_forward(model, data)
+    whole = lv.io.from_mujoco(model, data)
+    done = lv.residual(whole, adapter.impulse(model, data))
+    model.opt.iterations, model.opt.tolerance, data.qacc_warmstart[:] = 1, 0.0, 0.0
+    mj.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    assert problem == whole
+    found = lv.residual(problem, adapter.impulse(model, data))
+    assert found.velocity > max(1e-3, 1e3 * done.velocity)  # m/s
+    assert found.verdict != "at its floor"
+    mj.mj_step(model, data)
+    if integrator != "RK4":  # whose last forward pass is that of another moment
+        assert np.array_equal(lv.io.from_mujoco(model, data).b, problem.b)
+
+
+def test_accelerations_that_hang_on_the_solver_are_no_part_of_the_problem():
     model, data = state()
+    right = lv.io.from_mujoco(model, data)
     data.qacc[:] = 0.7 * data.qacc
-    with pytest.raises(lv.CapabilityError, match="run mj_forward"):
+    assert lv.io.from_mujoco(model, data) == right
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST", "RK4"])
+@pytest.mark.parametrize("name", ["M", "qacc_smooth", "efc_R", "efc_aref", "efc_vel", "efc_J", "efc_force"])
+def test_data_that_were_changed_are_refused_without_blaming_the_integrator(name, integrator):
+    model, data = state()
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    mj.mj_forward(model, data)
+    given = getattr(data, name)
+    given[:] = (1.0 + 1e-6) * given
+    with pytest.raises(lv.CapabilityError, match="run mj_forward|Run mj_forward") as told:
         lv.io.from_mujoco(model, data)
+    assert "integrator" not in str(told.value)
 
 
 def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
