@@ -294,9 +294,7 @@ def _before(model: Any, data: Any) -> FloatArray:
     v, known = np.array(data.qvel), True
     for body in np.unique(bodies):
         own = np.flatnonzero(bodies == body)
-        v[own], _, rank, _ = np.linalg.lstsq(
-            axis[own].T, spatial[body] - spatial[parent[body]], rcond=ALIKE
-        )
+        v[own], _, rank, _ = np.linalg.lstsq(axis[own].T, spatial[body] - spatial[parent[body]], rcond=ALIKE)
         known &= bool(rank == len(own))
     if not known or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
         raise CapabilityError(
