@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import lavender as lv
+from lavender.cli import cli
 from lavender.io import mujoco as adapter
 from lavender.io import recording
 
@@ -295,8 +297,6 @@ def test_something_else_is_an_input_error():
 
 
 def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_path):
-    import json
-
     model, data = state(steps=1)
     found = lv.io.record(model, data, tmp_path / "steps", 40, every=10)
     assert len(found.files) == 4
@@ -311,6 +311,58 @@ def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_pat
         assert line["rows"] == stored.problem.m
         assert line["seconds"] > 0.0
         assert line["solver"] == "NEWTON"
+
+
+def test_a_step_on_which_mujoco_stopped_early_is_kept_and_told_in_metres_per_second(tmp_path):
+    text = scene(cone="pyramidal").replace('iterations="2000"', 'iterations="1"')
+    model = mj.MjModel.from_xml_string(text)
+    found = lv.io.record(model, mj.MjData(model), tmp_path / "early", 30)
+    assert (len(found.files), found.left_out) == (30, ())
+    lines = [json.loads(x) for x in (tmp_path / "early" / "engine.jsonl").read_text().splitlines()]
+    worst = max(lines, key=lambda line: line["velocity"])
+    assert worst["velocity"] > 1e-3
+    assert 0 < found.stopped == sum(line["velocity"] > 1e-6 for line in lines) <= found.above_floor
+    where = f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
+    assert str(found).endswith(f"MuJoCo stopped {where} in the worst")
+
+
+def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(tmp_path):
+    """All but exact answers are above the floor of float64, which rounding alone sets."""
+    model = mj.MjModel.from_xml_string(scene(solver="PGS").replace('"1e-15"', '"1e-12"'))
+    found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)
+    assert found.above_floor > 10
+    assert found.stopped == 0
+    assert str(found).endswith(f"{found.above_floor} above their floor, 0 more than 1e-06 m/s off")
+    strict = lv.io.record(model, mj.MjData(model), tmp_path / "b", 30, threshold=0.0)
+    assert (strict.above_floor, strict.stopped) == (found.above_floor, found.above_floor)
+    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
+    at = next(line for line in lines if line["verdict"] == "close enough")
+    stored = lv.io.read(tmp_path / "a" / at["file"])
+    for threshold, said in (
+        (at["velocity"], "close enough"),
+        (0.99 * at["velocity"], "stopped early"),
+        (0.0, "stopped early"),
+    ):
+        judged = lv.residual(stored.problem, stored.impulse, threshold=threshold)
+        assert (judged.verdict, judged.relative) == (said, at["relative"])
+    for wrong in (-1.0, np.nan, "near"):
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.residual(stored.problem, stored.impulse, threshold=wrong)
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
+    words = ["check", str(tmp_path / "a" / at["file"]), "--solvers", "auto", "--threshold"]
+    near, strict = (CliRunner().invoke(cli, [*words, x]) for x in ("1e-6", "0"))
+    assert (near.exit_code, strict.exit_code) == (0, 1)
+    assert "1 of 1 above their floor, 0 also more than 1e-06 m/s off" in near.output
+    assert "1 of 1 above their floor, 1 also more than 0 m/s off" in strict.output
+
+
+def test_record_and_report_take_the_same_options_with_the_same_defaults():
+    names = ("steps", "every", "control", "seed", "threshold")
+    both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
+    for name in names:
+        one, two = (options[name] for options in both)
+        assert (one.opts, one.default, one.type) == (two.opts, two.default, two.type)
 
 
 def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
@@ -354,10 +406,6 @@ def test_controls_are_played_drawn_or_called(tmp_path):
 
 
 def test_record_then_report_from_the_command_line(tmp_path):
-    from click.testing import CliRunner
-
-    from lavender.cli import cli
-
     model = tmp_path / "scene.xml"
     model.write_text(scene())
     out = tmp_path / "steps"
