@@ -189,7 +189,7 @@ def table(stops: Sequence[Stop]) -> str:
         over = np.percentile([s.relative / s.floor for s in some], [0, 50, 100])
         share = f"{100.0 * early / len(some):.1f} %"
         rows.append((kind, len(some), len(some) - early, early, share, *(f"{x:.2g}" for x in over)))
-    head = ("answer", "steps", AT_FLOOR, "called early", "share", "least over floor", "median", "most")
+    head = ("answer", "steps", AT_FLOOR, "above it", "share", "least over floor", "median", "most")
     return markdown(head, rows)
 
 

@@ -44,7 +44,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, as_array, read_only
+from lavender._arrays import ArrayLike, FloatArray, as_array, number, read_only
 from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender.generalized import Generalized
@@ -62,7 +62,8 @@ at_floor = (
     measure.at_floor
 )  # (relative, floor): the test of every solver and of the judge, its reason with it
 
-AT_FLOOR, EARLY, WRONG = "at its floor", "stopped early", "wrong"
+ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
+AT_FLOOR, CLOSE, EARLY, WRONG = "at its floor", "close enough", "stopped early", "wrong"
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,8 @@ class Residual:
         In which the answer was made.
     rounding : Rounding or None
         In float32: the parts of the floor.
+    threshold : float, m/s
+        Largest velocity error of an answer that is close enough.
     """
 
     relative: float
@@ -116,6 +119,7 @@ class Residual:
     _problem: Problem = field(repr=False)
     precision: str = "float64"
     rounding: Rounding | None = None
+    threshold: float = ENOUGH
 
     @property
     def at_floor(self) -> bool:
@@ -137,16 +141,19 @@ class Residual:
 
     @property
     def verdict(self) -> str:
-        """What to think of the answer: "at its floor", "stopped early" (by `excess`) or "wrong".
+        """What to think of the answer: "at its floor", "close enough", "stopped early" (by `excess`) or "wrong".
 
-        At its floor: within `at_floor`. Wrong: not finite, or as far off as doing
-        nothing. A residual tells no mistake that is smaller from an early stop: another mu, say, leaves the same error.
+        At its floor: within `at_floor`. Close enough: above it, and no row is further off than `threshold`. Wrong: not
+        finite, or as far off as doing nothing. A residual tells no mistake that is smaller from an early stop: another
+        mu, say, leaves the same error.
         """
         if self.at_floor:
             return AT_FLOOR
         if self.nothing_to_do and self.rounds:
             # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
             return AT_FLOOR if self.energy <= measure.rhs_norms(self._problem.disk.metric)[0] else WRONG
+        if self.velocity <= self.threshold:
+            return CLOSE
         return EARLY if self.relative < 1.0 else WRONG
 
     @property
@@ -257,7 +264,9 @@ def quick(
     return relative, left
 
 
-def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None) -> Residual:
+def residual(
+    problem: Problem, impulse: ArrayLike, precision: str | None = None, threshold: float = ENOUGH
+) -> Residual:
     """Measure the error of an impulse (m,) [N s]: the judge that every solve uses, for any impulse.
 
     Parameters
@@ -268,11 +277,13 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
     precision : {"float64", "float32"}, optional
         Precision in which the impulse was computed. It decides the floor, and with it the verdict. Default:
         `problem.precision`. The error itself is always measured in float64.
+    threshold : float, default 1e-6, m/s
+        Velocity error that is close enough for the verdict; rad/s on rows of rotations in generalised coordinates.
 
     Raises
     ------
     InputError
-        `impulse` has the wrong length or is not numeric, or `precision` is another word.
+        `impulse` has the wrong length or is not numeric, `precision` is another word, or `threshold` is negative.
 
     Examples
     --------
@@ -294,11 +305,13 @@ def residual(problem: Problem, impulse: ArrayLike, precision: str | None = None)
     if impulse.shape != (problem.m,):
         raise InputError(f"impulse has shape {impulse.shape}; ({problem.m},) is needed")
     if problem.cones.has_ellipse:
-        return unstretched(problem, residual(problem.disk, problem.on_disk(impulse), precision))
+        return unstretched(problem, residual(problem.disk, problem.on_disk(impulse), precision, threshold))
     last, problem.derived.judged = remembered(problem, impulse), None
     if last is None:
         last = judged(problem, impulse)
     found = told(problem, last)
+    if threshold != ENOUGH:
+        found = replace(found, threshold=number("threshold", threshold, low=0.0))
     return found if precision == "float64" else _in_float32(problem, found, impulse)
 
 

@@ -23,7 +23,7 @@ from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.io.stored import ENGINE, SUFFIXES
 from lavender.problem import Problem
-from lavender.residuals import Residual, nothing_to_do, residual
+from lavender.residuals import ENOUGH, Residual, nothing_to_do, residual
 from lavender.suite import Case
 from lavender.suspicions import diagnose
 
@@ -60,12 +60,12 @@ class Item:
         """The problem; loading errors come from here."""
         return self.load()
 
-    def judged(self, precision: str | None = None) -> Residual | None:
+    def judged(self, precision: str | None = None, threshold: float = ENOUGH) -> Residual | None:
         """The answer stored beside the problem, judged; None where there is none, or one of another problem."""
         impulse = self.stored()
         if impulse is None or impulse.shape != (self.problem.m,):
             return None
-        return residual(self.problem, impulse, precision)
+        return residual(self.problem, impulse, precision, threshold)
 
     def forget(self) -> None:
         """Let go of the problem's memory."""

@@ -14,6 +14,8 @@ from lavender.cli.options import (
     plain,
     precision_option,
     refuse_unused,
+    threshold_option,
+    was_given,
 )
 from lavender.errors import InputError, LavenderError
 
@@ -28,6 +30,7 @@ __all__ = ["check"]
 )
 @click.option("--tol", type=float, default=1e-6, show_default=True, help="Relative residual to reach.")
 @precision_option
+@threshold_option
 @click.pass_context
 def check(
     context: click.Context,
@@ -36,37 +39,43 @@ def check(
     reference: str,
     tol: float,
     precision: str | None,
+    threshold: float,
 ) -> None:
     """Compare solvers with a reference solver, and their claims with the judge.
 
-    A solution stored in a file is judged too: is it at the floor of its precision, or did its solver stop early?
+    A solution stored in a file is judged too: is it at the floor of its precision, close enough (--threshold), or did
+    its solver stop early?
 
     A records.jsonl of a report is verified: each run is repeated on the problems named after it (default: where the
     records say). Verdicts must agree; times are shown side by side.
 
     Exit code 1: a claim is contradicted; a verdict or problem differs from the records.jsonl; a file in a folder
-    cannot be read; or, with --precision, a stored solution is not at its floor. Exit code 2: a named file cannot be
-    read, or --precision finds no stored solution.
+    cannot be read; or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.
+    Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
     from lavender import bench
     from lavender._arrays import number
     from lavender.check import cross_check
-    from lavender.residuals import AT_FLOOR
+    from lavender.residuals import AT_FLOOR, CLOSE
 
     one_thread()
     out = console()
     if files and files[0].endswith(".jsonl"):
-        refuse_unused(context, ["reference", "tol", "precision"], "with a records.jsonl, which has its own")
+        refuse_unused(
+            context, ["reference", "tol", "precision", "threshold"], "with a records.jsonl, which has its own"
+        )
         submission = bench.verify(bench.read(files[0]), files[1:], solvers)
         out.print(str(submission), highlight=False, markup=False, soft_wrap=True)
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
-    contradicted = unread = missing = answers = unmet = 0
+    contradicted = unread = missing = answers = above = unmet = 0
+    asked = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
     number("tol", tol, low=0.0)
+    number("threshold", threshold, low=0.0)
     for item in bench.resolve(files):
         try:
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
-            stored = item.judged(precision)
+            stored = item.judged(precision, threshold)
         except LavenderError as error:
             out.print(plain(f"{item.name}: {error}"), style="yellow", highlight=False)
             unread += isinstance(error, InputError) and not item.named
@@ -78,15 +87,19 @@ def check(
         out.print(str(found), highlight=False, markup=False)
         if stored is not None:
             answers += 1
-            unmet += stored.verdict != AT_FLOOR
+            above += stored.verdict != AT_FLOOR
+            unmet += stored.verdict not in (AT_FLOOR, CLOSE)
             said = f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}"
             out.print(said, highlight=False, markup=False)
         contradicted += len(found.contradicted)
     if contradicted:
         out.print(f"[bold red]{contradicted} claims are contradicted[/]")
-    if precision is not None and not answers:
-        raise InputError("--precision: no file holds an answer to judge (an entry `impulse`)")
+    if asked and not answers:
+        raise InputError("--precision, --threshold: no file holds an answer to judge (an entry `impulse`)")
+    if answers:
+        shares = f"{above} of {answers} above their floor, {unmet} also more than {threshold:g} m/s off"
+        out.print(f"stored answers: {shares}", highlight=False, markup=False)
     if missing:
         raise click.exceptions.Exit(EXIT_BAD_INPUT)
-    if contradicted or unread or (precision is not None and unmet):
+    if contradicted or unread or (asked and unmet):
         raise click.exceptions.Exit(EXIT_UNMET)

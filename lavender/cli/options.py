@@ -35,7 +35,10 @@ __all__ = [
     "plain",
     "plan_options",
     "precision_option",
+    "recording_options",
     "refuse_unused",
+    "refuse_unused_recording",
+    "threshold_option",
 ]
 
 EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
@@ -179,6 +182,27 @@ def precision_option(command: Callable[..., Any]) -> Callable[..., Any]:
     return click.option("--precision", type=click.Choice(["float64", "float32"]), help=told)(command)
 
 
+def recording_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """How a MuJoCo model is simulated and recorded: the same options of every command that does so."""
+    for name, more in reversed(RECORDING_OPTIONS):
+        command = click.option(*name, show_default=True, **more)(command)
+    return threshold_option(command)
+
+
+def refuse_unused_recording(context: click.Context, recorded: bool) -> None:
+    """Refuse those that would be ignored."""
+    if not recorded:
+        refuse_unused(context, RECORDING, "without a MODEL.xml")
+    elif context.params["control"] != "random":
+        refuse_unused(context, ["seed"], "without --controls random")
+
+
+def threshold_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--threshold`, of answers that an engine made."""
+    told = "Velocity error [m/s] up to which an engine's solution is close enough."
+    return click.option("--threshold", type=float, default=1e-6, show_default=True, help=told)(command)
+
+
 def refuse_unused(context: click.Context, names: Sequence[str], where: str) -> None:
     """Refuse options that would be ignored.
 
@@ -213,6 +237,15 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
     if not any(map(is_foreign, specs)):
         refuse_unused(context, ["memory"], "where no solver of another package runs")
 
+
+RECORDING_OPTIONS: tuple[tuple[tuple[str, ...], dict[str, Any]], ...] = (
+    (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
+    (("--every",), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
+    (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
+                                 "help": "MODEL.xml: its controls. FILE: an .npy array of shape (any, nu)."}),
+    (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
+)  # fmt: skip
+RECORDING = ("steps", "every", "control", "seed", "threshold")  # their names
 
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": Names(), "help": "Solvers by name; default: all that are installed."}),

@@ -16,13 +16,16 @@ from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
+    RECORDING,
     ManyValues,
     Numbers,
     Seeds,
     console,
     plan_options,
+    recording_options,
     refuse_idle,
     refuse_unused,
+    refuse_unused_recording,
     was_given,
 )
 from lavender.errors import InputError
@@ -75,15 +78,7 @@ __all__ = ["report"]
     metavar="S,S,...",
     help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",
 )
-@click.option("--steps", default=500, show_default=True, help="MODEL.xml: number of simulation steps.")
-@click.option("--every", default=5, show_default=True, help="MODEL.xml: record every n-th step.")
-@click.option(
-    "--controls",
-    default="random",
-    show_default=True,
-    metavar="zero|random|FILE",
-    help="MODEL.xml: its controls.",
-)
+@recording_options
 @click.option("--tables", is_flag=True, help="Also print every case and sequence.")
 @click.option("--fresh", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option(
@@ -116,7 +111,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     _refuse_unused(context, files, asked["solvers"])
     taken: set[Path] = set()
-    how = {name: asked[name] for name in ("steps", "every", "controls")}
+    how = {name: asked[name] for name in RECORDING}
     files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
     old = None if asked["compare"] is None else bench.read(asked["compare"])
     sweeps = asked["budgets"] if was_given(context, "budgets") else ()
@@ -175,8 +170,7 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
         )
     else:
         refuse_unused(context, ["seeds", "workers", "backend"], "without --campaign")
-    if not any(Path(f).suffix.lower() == ".xml" for f in files):
-        refuse_unused(context, ["steps", "every", "controls"], "without a MODEL.xml")
+    refuse_unused_recording(context, any(Path(f).suffix.lower() == ".xml" for f in files))
     refuse_idle(context, solvers)
 
 
@@ -199,11 +193,10 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
         folder = first.with_name(f"{first.name}-{n}")
     taken.add(folder)
     kept = folder / "how.json"
-    asked = json.dumps({"model": model, "changed": _ages(path, how["controls"]), **how})
+    asked = json.dumps({"model": model, "changed": _ages(path, how["control"]), **how})
     if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
         kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
-        more = {"steps": how["steps"], "every": how["every"], "control": how["controls"]}
-        told = str(record_file(path, folder, **more, replace=True))
+        told = str(record_file(path, folder, **how, replace=True))
         console().print(told, highlight=False, markup=False)
         write_text(kept, asked)
     return str(folder)

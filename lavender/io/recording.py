@@ -14,13 +14,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, whole_number
+from lavender._arrays import FloatArray, as_array, number, whole_number
 from lavender.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
 from lavender.problem import PRECISIONS, Problem
-from lavender.residuals import residual
+from lavender.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
 
 __all__ = ["Recording", "record", "record_file"]
 
@@ -36,11 +36,22 @@ class Recording:
     files: tuple[str, ...]
     without: int  # steps looked at that had no constraint
     left_out: tuple[str, ...] = field(default=())  # why a step could not be exported, one line each
+    above_floor: int = 0  # of MuJoCo's answers, those that rounding does not explain
+    stopped: int = 0  # of these, those more than `threshold` off
+    threshold: float = ENOUGH  # m/s
+    worst: str = ""  # by how much the worst answer is off, and where
 
     def __str__(self) -> str:
         more = f", {self.without} steps without constraints" if self.without else ""
         lost = f", {len(self.left_out)} left out: {self.left_out[0]}" if self.left_out else ""
-        return f"{len(self.files)} problems in {self.folder}{more}{lost}"
+        made = f"{len(self.files)} problems in {self.folder}{more}{lost}"
+        if not self.above_floor:
+            return made
+        far = f": MuJoCo stopped {self.worst} in the worst" if self.stopped else ""
+        return (
+            f"{made}\nMuJoCo's own answers: {self.above_floor} above their floor, {self.stopped} more than "
+            f"{self.threshold:g} m/s off{far}"
+        )
 
 
 def record(
@@ -50,17 +61,19 @@ def record(
     steps: int,
     *,
     every: int = 1,
-    control: Control = "zero",
+    control: Control = "random",
     seed: int = 0,
     replace: bool = False,
     precision: str = "float64",
+    threshold: float = ENOUGH,
 ) -> Recording:
     """Step a MuJoCo simulation and keep the problem of every `every`-th step.
 
     Each file holds the problem with keys of its blocks and MuJoCo's own impulse. `engine.jsonl` has a line for each:
     file, step, rows, the engine's iterations, the time of its constraint solver [s] and, by our judge, its
-    residual, the floor of its precision and the verdict. A step that cannot be exported has no file, and `left_out`
-    in its line says why: whatever is measured on the others names it.
+    residual, velocity error [m/s] and worst row, the floor of its precision and the verdict. Where MuJoCo's solver
+    stopped early, that is said of its answer; the problem is kept like any other. A step that cannot be exported has no
+    file, and `left_out` in its line says why: whatever is measured on the others names it.
 
     Parameters
     ----------
@@ -72,7 +85,7 @@ def record(
     steps : int
         Steps of the simulation.
     every : int
-    control : {"zero", "random"}, array (any, nu), or callable (model, data, step)
+    control : {"random", "zero"}, array (any, nu), or callable (model, data, step)
         "random" draws uniformly within the ranges of the actuators. An array is played row by row, again from its
         start where it ends. What a callable returns is written to `data.ctrl`, unless it is None.
     seed : int
@@ -81,6 +94,8 @@ def record(
         Take the problem files of another recording out of the folder, which is refused otherwise.
     precision : {"float64", "float32"}
         In which this MuJoCo computes (`mjtNum`); written with each problem.
+    threshold : float, m/s
+        Velocity error up to which MuJoCo's answer is close enough.
 
     Returns
     -------
@@ -89,13 +104,14 @@ def record(
     Raises
     ------
     InputError
-        Not a model and its data, `steps` or `every` below 1, another control or precision, a folder that holds a
-        recording.
+        Not a model and its data, `steps` or `every` below 1, another control, precision or threshold, a folder
+        that holds a recording.
     """
     mj = adapter._mujoco(model, data)
     steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
+    threshold = number("threshold", threshold, low=0.0)
     drive = drive_of(model, control, seed)
     kept: list[dict[str, Any]] = []
     left_out: list[dict[str, Any]] = []
@@ -112,7 +128,7 @@ def record(
             mj.mj_forward(model, data)
             file = folder / f"step_{step + 1:0{width}d}.npz"
             try:
-                found = _solved(mj, model, data, f"step {step + 1}", precision)
+                found = _solved(mj, model, data, f"step {step + 1}", precision, threshold)
             except LavenderError as error:
                 left_out.append({"file": file.name, "step": step + 1, "left_out": str(error)})
                 continue
@@ -123,12 +139,24 @@ def record(
             npz.write(problem, file, impulse=own)
             kept.append({"file": file.name, "step": step + 1, **told})
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
-    reasons = tuple(f"step {line['step']}: {line['left_out']}" for line in left_out)
-    return Recording(folder, tuple(line["file"] for line in kept), without, reasons)
+    far = [line for line in kept if line["verdict"] in (EARLY, WRONG)]
+    worst = max(far, key=lambda line: float(line["velocity"]), default=None)
+    return Recording(
+        folder,
+        tuple(line["file"] for line in kept),
+        without,
+        tuple(f"step {line['step']}: {line['left_out']}" for line in left_out),
+        sum(line["verdict"] != AT_FLOOR for line in kept),
+        len(far),
+        threshold,
+        ""
+        if worst is None
+        else f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})",
+    )
 
 
 def _solved(
-    mj: Any, model: Any, data: Any, name: str, precision: str
+    mj: Any, model: Any, data: Any, name: str, precision: str, threshold: float
 ) -> tuple[Problem, FloatArray, dict[str, Any]] | None:
     """The problem of a step, MuJoCo's impulse, and what is told of both; None without constraints."""
     start = perf_counter()
@@ -139,10 +167,11 @@ def _solved(
     problem = adapter.from_mujoco(model, data, name=name)
     problem = dataclasses.replace(problem, precision=precision, copy=False)
     own = adapter.impulse(model, data)
-    judged = residual(problem, own)
+    judged = residual(problem, own, threshold=threshold)
     told = {
         "rows": problem.m, "iterations": int(np.sum(data.solver_niter)), "seconds": seconds,
-        "relative": judged.relative, "floor": judged.floor, "verdict": judged.verdict, "precision": precision,
+        "relative": judged.relative, "velocity": judged.velocity, "worst": judged.worst_name,
+        "floor": judged.floor, "verdict": judged.verdict, "precision": precision, "threshold": threshold,
         "solver": mj.mjtSolver(int(model.opt.solver)).name.removeprefix("mjSOL_"),
     }  # fmt: skip
     return problem, own, told
@@ -153,7 +182,7 @@ def record_file(
     folder: str | os.PathLike[str],
     steps: int,
     *,
-    control: Control = "zero",
+    control: Control = "random",
     **options: Any,
 ) -> Recording:
     """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""

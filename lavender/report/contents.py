@@ -385,7 +385,8 @@ def engine_table(found: Sequence[Contestant]) -> Table:
             if c.ours
             else ["none in every step", NONE, NONE]
         )
-        rows.append([*own, NONE if c.early is None else str(c.early), *here])
+        short = f"{c.velocity:.2g} m/s, {c.where}" if c.early and c.where else NONE
+        rows.append([*own, str(c.above_floor), str(c.early), short, *here])
     heads = [
         "recorded",
         "steps",
@@ -394,6 +395,8 @@ def engine_table(found: Sequence[Contestant]) -> Table:
         "time",
         "residual, median",
         "worst",
-        "early in float32",
+        "above floor",
+        "stopped early",
+        "furthest off",
     ]
     return Table([*heads, "fastest here", "time here", "worst here"], rows)

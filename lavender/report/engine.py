@@ -17,7 +17,7 @@ import numpy as np
 from lavender.bench.record import Record, printable
 from lavender.bench.store import Records
 from lavender.io.stored import ENGINE, whole_file
-from lavender.residuals import AT_FLOOR
+from lavender.residuals import AT_FLOOR, EARLY, WRONG
 
 __all__ = ["Contestant", "contestants"]
 
@@ -36,9 +36,12 @@ class Contestant:
     seconds: float  # median, inside the engine
     relative: float  # median
     worst: float
+    above_floor: int  # answers that rounding does not explain
     early: (
-        int | None
-    )  # answers of a float32 engine that stopped early or are wrong; None in float64, where tol ends all
+        int  # of these, answers that stopped early or are wrong, by more than the threshold of the recording
+    )
+    velocity: float  # m/s, of the worst row of all answers; nan where the recording does not say
+    where: str  # that row
     ours: str  # the fastest solver that reached the level in every step, its start, the level; empty if none did
     our_seconds: float  # median
     our_worst: float
@@ -57,13 +60,14 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 entry = json.loads(line)
                 lost += "left_out" in entry
                 numbers = [float(entry[name]) for name in _NUMBERS]
-                early = entry["verdict"] != AT_FLOOR if entry.get("precision") == "float32" else None
-                found.append((*numbers, early, str(entry["solver"])))
+                row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
+                found.append((*numbers, row, str(entry["verdict"]), str(entry["solver"])))
             except (ValueError, KeyError, TypeError):
                 continue
         if not found:
             continue
-        rows, seconds, relative, early, solvers = zip(*found, strict=True)
+        rows, seconds, relative, worst_rows, verdicts, solvers = zip(*found, strict=True)
+        velocity, where = max(worst_rows, key=lambda row: (row[0] == row[0], row[0]))
         name, ours, worst = _fastest(Path(word), records, float(np.max(relative)))
         out.append(
             Contestant(
@@ -75,7 +79,10 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 seconds=float(np.median(seconds)),
                 relative=float(np.median(relative)),
                 worst=float(np.max(relative)),
-                early=None if None in early else sum(early),
+                above_floor=sum(said != AT_FLOOR for said in verdicts),
+                early=sum(said in (EARLY, WRONG) for said in verdicts),
+                velocity=velocity,
+                where=where,
                 ours=name,
                 our_seconds=ours,
                 our_worst=worst,

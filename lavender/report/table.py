@@ -16,6 +16,7 @@ __all__ = ["Cell", "Table", "latex", "markdown", "print_table", "tex"]
 WORDS = frozenset({
     "case", "solver", "status", "claim", "form", "structure", "law", "change", "asked", "hardest", "sequence",
     "message", "worst row", "reason", "residual by order", "recorded", "engine's own", "fastest here",
+    "furthest off",
 })  # fmt: skip
 COLOURS = {"good": "green", "warn": "yellow", "bad": "red"}
 

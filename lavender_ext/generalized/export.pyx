@@ -301,71 +301,52 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
 
 
 def row_gaps(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale,
-             const double[::1] rhs, const double[::1] impulse, double dt, bint euler, const double[:] v,
-             const double[:] vel, const double[:] free, const double[:] b, const double[:] push, const double[:] a,
-             const double[:] reached):
+             const double[::1] rhs, const double[::1] impulse, double dt, const double[:] v, const double[:] vel,
+             const double[:] free, const double[:] b, const double[:] push, const double[:] a):
     """How far J, scaled by row, is from vectors that were made by it, each by the size of its terms.
 
-        J v = efc_vel   (1)      J a0 - aref = efc_b   (2)      f.(J a) = a.qfrc_constraint   (3)      J a = J a1   (4)
+        J v = efc_vel   (1)      J a0 - aref = efc_b   (2)      J^T f = qfrc_constraint   (3)
 
-    with rhs = dt (aref - J a0), free = dt a0, impulse = dt f, reached = a1 = a0 + M^-1 J^T f. 0 where such a vector is
-    all zeros: one that a copy did not fill. (1) only of the integrator `euler`, after whose step v has changed by
-    dt a: what 2 dt |J| (|a| + |a1|) explains is 0. (4) is NaN where a is not finite. The size of terms is
-    |J_i|_1 |x|_max for (1) to (3), |J| (|a| + |a1|) for (4).
+    with v before the step, rhs = dt (aref - J a0), free = dt a0, impulse = dt f. 0 where such a vector is all zeros: one
+    that a copy did not fill. The size of terms is |J_i|_1 |x|_max for (1) and (2), the largest of |J|^T |f| for (3).
+    The fourth number is 0, or NaN where a is not finite.
     """
-    cdef int32_t i, j, k, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>a.shape[0]
+    cdef int32_t i, j, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>v.shape[0]
     cdef Py_ssize_t q
-    cdef double c, size, terms, finite = 0.0, moved = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0, gap_4 = 0.0
+    cdef double c, size, s_v, finite = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
-    cdef double top_v = 0.0, top_free = 0.0, top_a = 0.0
-    cdef double s[4]
-    scratch = np.empty(6 * n + 1)
-    cdef double[::1] held = scratch
-    cdef double* w = &held[0]                           # of each velocity v, free, a, a - a1, |a| + |a1|
-    cdef const double* at
+    cdef double top_v = 0.0, top_free = 0.0
+    cdef double[::1] pushed = np.zeros(2 * n + 1)       # dt J^T f, and the same of absolute values
     for j in range(n):
-        w[6 * j] = v[j]
-        w[6 * j + 1] = free[j]
-        w[6 * j + 2] = a[j]
-        w[6 * j + 3] = a[j] - reached[j]
-        w[6 * j + 4] = fabs(a[j]) + fabs(reached[j])
         top_v = widest(top_v, v[j])
         top_free = widest(top_free, free[j])
-        top_a = widest(top_a, a[j])
-        c = dt * push[j] * a[j]
-        gap_3 -= c
-        big_3 += fabs(c)
         said_3 = widest(said_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
-        size = terms = 0.0
-        for k in range(4):
-            s[k] = 0.0
+        size = s_v = 0.0
         for q in range(jptr[i], jptr[i + 1]):
-            at = w + 6 * jidx[q]
+            j = jidx[q]
             c = jval[q]
-            for k in range(4):
-                s[k] += c * at[k]
+            s_v += c * v[j]
             size += fabs(c)
-            terms += fabs(c) * at[4]
+            c *= impulse[i]
+            pushed[j] += c
+            pushed[n + j] += fabs(c)
         c = scale[i] * vel[i]
-        gap_1 = widest(gap_1, s[0] - c)
+        gap_1 = widest(gap_1, s_v - c)
         big_1 = widest(big_1, size * top_v + fabs(c))
         said_1 = widest(said_1, vel[i])
         c = scale[i] * dt * b[i]
         gap_2 = widest(gap_2, rhs[i] + c)
         big_2 = widest(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
         said_2 = widest(said_2, b[i])
-        gap_3 += impulse[i] * s[2]
-        big_3 += fabs(impulse[i]) * size * top_a
-        gap_4 = widest(gap_4, s[3])
-        moved = widest(moved, terms)
-    if not euler or gap_1 <= 2.0 * dt * moved:
-        gap_1 = 0.0
+    for j in range(n):
+        c = dt * push[j]
+        gap_3 = widest(gap_3, pushed[j] - c)
+        big_3 = widest(big_3, pushed[n + j] + fabs(c))
     return (gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
             gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
-            fabs(gap_3) / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0,
-            (gap_4 / moved if moved > 0.0 else 0.0) + finite)
+            gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
 
 
 cdef inline double widest(double so_far, double x) noexcept nogil:

@@ -205,7 +205,15 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--skip", "3"), "--skip has no effect without --record"),
-        (("record", "a.xml", "--out", "o", "--seed", "3"), "--seed has no effect without --controls random"),
+        (
+            ("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"),
+            "--seed has no effect without --controls random",
+        ),
+        (
+            ("report", "a.xml", "--seed", "3", "--controls", "zero"),
+            "--seed has no effect without --controls random",
+        ),
+        (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
         (("nonsense",), "unknown command 'nonsense'"),

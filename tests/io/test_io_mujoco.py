@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 import lavender as lv
+from lavender.cli import cli
 from lavender.io import mujoco as adapter
 from lavender.io import recording
 
@@ -180,15 +182,16 @@ def test_coefficients_that_differ_are_made_round_without_changing_the_problem(co
     assert np.abs(found - data.qacc).max() < 1e-5 * (1 + np.abs(data.qacc).max())
 
 
-def test_the_problem_knows_velocities_keys_and_the_engines_own_impulse():
+def test_the_problem_knows_velocities_and_keys_and_starts_from_nothing():
     model, data = state()
     problem = lv.io.from_mujoco(model, data)
     assert problem.operator == "generalized"
     dt = model.opt.timestep
     after = problem.velocity(adapter.impulse(model, data))
     np.testing.assert_allclose(after, data.qvel + dt * data.qacc, atol=1e-6)
-    assert np.array_equal(problem.guess, adapter.impulse(model, data))
-    assert lv.solve(problem, "newton", tol=1e-6).iterations == 0
+    assert problem.guess is None  # MuJoCo's answer is no start: who times a solve from it times nothing
+    assert lv.solve(problem, "newton", tol=1e-6).iterations > 0
+    assert lv.solve(problem, "newton", tol=1e-6, impulse=adapter.impulse(model, data)).iterations == 0
     assert len(np.unique(problem.key)) == problem.n_blocks
     names, keys = list(problem.names), problem.key
     mj.mj_step(model, data)
@@ -215,17 +218,54 @@ def test_an_integrator_that_puts_damping_into_m_is_refused():
         data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
         mj.mj_forward(model, data)
         if refused:
-            with pytest.raises(lv.CapabilityError, match="integrator='discrete'"):
+            with pytest.raises(lv.CapabilityError, match=r"integrator='discrete'.*'euler', .* have M itself"):
                 lv.io.from_mujoco(model, data)
         else:
             assert lv.io.from_mujoco(model, data).m > 0
 
 
-def test_data_of_another_forward_pass_are_refused():
+@pytest.mark.parametrize("integrator", ["EULER", "RK4", "IMPLICIT", "IMPLICITFAST"])
+@pytest.mark.parametrize("solver", ["NEWTON", "CG", "PGS"])
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_judged(
+    jacobian, solver, integrator
+):
+    model, data = state(jacobian=jacobian)
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    model.opt.solver = getattr(mj.mjtSolver, f"mjSOL_{solver}")
+    mj.mj_forward(model, data)
+    whole = lv.io.from_mujoco(model, data)
+    done = lv.residual(whole, adapter.impulse(model, data))
+    model.opt.iterations, model.opt.tolerance, data.qacc_warmstart[:] = 1, 0.0, 0.0
+    mj.mj_forward(model, data)
+    problem = lv.io.from_mujoco(model, data)
+    assert problem == whole
+    found = lv.residual(problem, adapter.impulse(model, data))
+    assert found.velocity > max(1e-3, 1e3 * done.velocity)  # m/s
+    assert found.verdict != "at its floor"
+    mj.mj_step(model, data)
+    if integrator != "RK4":  # whose last forward pass is that of another moment
+        assert np.array_equal(lv.io.from_mujoco(model, data).b, problem.b)
+
+
+def test_accelerations_that_hang_on_the_solver_are_no_part_of_the_problem():
     model, data = state()
+    right = lv.io.from_mujoco(model, data)
     data.qacc[:] = 0.7 * data.qacc
-    with pytest.raises(lv.CapabilityError, match="run mj_forward"):
+    assert lv.io.from_mujoco(model, data) == right
+
+
+@pytest.mark.parametrize("integrator", ["EULER", "IMPLICITFAST", "RK4"])
+@pytest.mark.parametrize("name", ["M", "qacc_smooth", "efc_R", "efc_aref", "efc_vel", "efc_J", "efc_force"])
+def test_data_that_were_changed_are_refused_without_blaming_the_integrator(name, integrator):
+    model, data = state()
+    model.opt.integrator = getattr(mj.mjtIntegrator, f"mjINT_{integrator}")
+    mj.mj_forward(model, data)
+    given = getattr(data, name)
+    given[:] = (1.0 + 1e-6) * given
+    with pytest.raises(lv.CapabilityError, match=r"[Rr]un mj_forward") as told:
         lv.io.from_mujoco(model, data)
+    assert "integrator" not in str(told.value)
 
 
 def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
@@ -238,13 +278,11 @@ def test_softness_that_a_copy_did_not_fill_comes_from_its_inverse():
         lv.io.from_mujoco(model, data)
 
 
-def test_impulses_of_noslip_are_marked_and_no_guess():
+def test_impulses_of_noslip_are_marked():
     model, data = state()
     model.opt.noslip_iterations = 5
     mj.mj_forward(model, data)
-    problem = lv.io.from_mujoco(model, data)
-    assert problem.guess is None
-    assert "noslip" in problem.name
+    assert "noslip" in lv.io.from_mujoco(model, data).name
 
 
 def test_something_else_is_an_input_error():
@@ -259,8 +297,6 @@ def test_something_else_is_an_input_error():
 
 
 def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_path):
-    import json
-
     model, data = state(steps=1)
     found = lv.io.record(model, data, tmp_path / "steps", 40, every=10)
     assert len(found.files) == 4
@@ -275,6 +311,58 @@ def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_pat
         assert line["rows"] == stored.problem.m
         assert line["seconds"] > 0.0
         assert line["solver"] == "NEWTON"
+
+
+def test_a_step_on_which_mujoco_stopped_early_is_kept_and_told_in_metres_per_second(tmp_path):
+    text = scene(cone="pyramidal").replace('iterations="2000"', 'iterations="1"')
+    model = mj.MjModel.from_xml_string(text)
+    found = lv.io.record(model, mj.MjData(model), tmp_path / "early", 30)
+    assert (len(found.files), found.left_out) == (30, ())
+    lines = [json.loads(x) for x in (tmp_path / "early" / "engine.jsonl").read_text().splitlines()]
+    worst = max(lines, key=lambda line: line["velocity"])
+    assert worst["velocity"] > 1e-3
+    assert 0 < found.stopped == sum(line["velocity"] > 1e-6 for line in lines) <= found.above_floor
+    where = f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
+    assert str(found).endswith(f"MuJoCo stopped {where} in the worst")
+
+
+def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(tmp_path):
+    """All but exact answers are above the floor of float64, which rounding alone sets."""
+    model = mj.MjModel.from_xml_string(scene(solver="PGS").replace('"1e-15"', '"1e-12"'))
+    found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)
+    assert found.above_floor > 10
+    assert found.stopped == 0
+    assert str(found).endswith(f"{found.above_floor} above their floor, 0 more than 1e-06 m/s off")
+    strict = lv.io.record(model, mj.MjData(model), tmp_path / "b", 30, threshold=0.0)
+    assert (strict.above_floor, strict.stopped) == (found.above_floor, found.above_floor)
+    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
+    at = next(line for line in lines if line["verdict"] == "close enough")
+    stored = lv.io.read(tmp_path / "a" / at["file"])
+    for threshold, said in (
+        (at["velocity"], "close enough"),
+        (0.99 * at["velocity"], "stopped early"),
+        (0.0, "stopped early"),
+    ):
+        judged = lv.residual(stored.problem, stored.impulse, threshold=threshold)
+        assert (judged.verdict, judged.relative) == (said, at["relative"])
+    for wrong in (-1.0, np.nan, "near"):
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.residual(stored.problem, stored.impulse, threshold=wrong)
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
+    words = ["check", str(tmp_path / "a" / at["file"]), "--solvers", "auto", "--threshold"]
+    near, strict = (CliRunner().invoke(cli, [*words, x]) for x in ("1e-6", "0"))
+    assert (near.exit_code, strict.exit_code) == (0, 1)
+    assert "1 of 1 above their floor, 0 also more than 1e-06 m/s off" in near.output
+    assert "1 of 1 above their floor, 1 also more than 0 m/s off" in strict.output
+
+
+def test_record_and_report_take_the_same_options_with_the_same_defaults():
+    names = ("steps", "every", "control", "seed", "threshold")
+    both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
+    for name in names:
+        one, two = (options[name] for options in both)
+        assert (one.opts, one.default, one.type) == (two.opts, two.default, two.type)
 
 
 def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
@@ -318,10 +406,6 @@ def test_controls_are_played_drawn_or_called(tmp_path):
 
 
 def test_record_then_report_from_the_command_line(tmp_path):
-    from click.testing import CliRunner
-
-    from lavender.cli import cli
-
     model = tmp_path / "scene.xml"
     model.write_text(scene())
     out = tmp_path / "steps"
