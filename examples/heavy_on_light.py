@@ -6,7 +6,8 @@ row what the upper one pushed in the sweep before, so that the impulse grows to 
     A = [[1, -1], [-1, 1 + 1/R]],   (L + D)^-1 U has the one eigenvalue R/(1 + R) beside 0
 
 so that n sweeps leave (R/(1 + R))^n of all. In a scene each face has four corners with friction, and sweeps have to
-share the load among them first: what the judge sees rises before it falls, and the rate of R/(1 + R) is reached late.
+share the load among them first: what the judge sees rises before it falls. R/(1 + R) is a rate, which is come near to
+after some sweeps, and not what n sweeps leave.
 
     python examples/heavy_on_light.py [FIGURE.png]
 

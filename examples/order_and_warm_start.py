@@ -13,8 +13,8 @@ Stale impulses hurt for as long as sweeps take to remove what is wrong with them
 different rates: neighbours that disagree are put right in a few sweeps, an impulse that is missing or too much in all
 contacts together shrinks by cos^2(pi / 2n) a sweep (n = 8: 0.962), the slowest part of all. Matched to the wrong
 contacts (in reverse), the same numbers begin 9 times further off than nothing at all, but hardly any of that is of the
-slow part: they are behind for some sweeps and then ahead. Ten times too large, as after a load that is gone or in a step
-that is ten times shorter, they begin as far off, all of it of the slow part: behind nothing at all for good.
+slow part: they are behind for some sweeps and then ahead. Ten times too large, as after a load that is gone or in a
+step that is ten times shorter, they begin as far off, all of it of the slow part: behind nothing at all for good.
 
     python examples/order_and_warm_start.py [FIGURE.png]
 
