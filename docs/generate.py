@@ -434,7 +434,8 @@ def example_page(site, cache):
             source = f"Source: `examples/{path.name}`."
             parts += [f"## {path.stem}", f"**{first}**", docstrings.markdown(rest), source]
             continue
-        module.numbers = functools.cache(module.numbers)
+        if hasattr(module, "PANELS"):
+            module.numbers = functools.cache(module.numbers)
         figure = site.path(f"figures/example-{path.stem}.svg")
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
