@@ -155,7 +155,7 @@ class BuildWasm(Command):
             if reason:
                 self.announce(f"no WebAssembly module {name}: {reason}", level=logging.INFO)
             else:
-                WASM["build"](out, Path().resolve(), part.modules, largest=part.largest, beside=part.beside)
+                WASM["build"](out, Path().resolve(), part.modules, beside=part.beside)
 
     def get_outputs(self):
         """The modules, where they could be built."""

@@ -36,5 +36,5 @@ def build_sdist(sdist_directory, config_settings=None):
             raise SystemExit(
                 f"a source distribution holds {path}, which is not there, or of other sources: {reason}"
             )
-        WASM["build"](path, Path().resolve(), part.modules, largest=part.largest, beside=part.beside)
+        WASM["build"](path, Path().resolve(), part.modules, beside=part.beside)
     return build_meta.build_sdist(sdist_directory, config_settings)

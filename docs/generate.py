@@ -7,6 +7,7 @@ missing: another version, machine or plan.
 """
 
 import contextlib
+import functools
 import hashlib
 import importlib
 import importlib.util
@@ -433,6 +434,8 @@ def example_page(site, cache):
             source = f"Source: `examples/{path.name}`."
             parts += [f"## {path.stem}", f"**{first}**", docstrings.markdown(rest), source]
             continue
+        if hasattr(module, "PANELS"):
+            module.numbers = functools.cache(module.numbers)
         figure = site.path(f"figures/example-{path.stem}.svg")
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
@@ -445,11 +448,19 @@ def example_page(site, cache):
             f"## {path.stem}",
             f"**{first}**",
             docstrings.markdown(rest),
-            image(f"figures/{figure.name}", first),
+            *panels(site, path.stem, module, first),
             f"```text\n{output}\n```",
             f"Source: `examples/{path.name}`.",
         ]
     site.write("examples.md", "\n\n".join(p for p in parts if p))
+
+
+def panels(site, name, module, text):
+    """The figure of an example in markdown, panel by panel where it has any."""
+    files = [f"figures/{name}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
+    for file in files:
+        module.figure(module.numbers(), str(site.path(file)))
+    return [image(file, text) for file in files or [f"figures/example-{name}.svg"]]
 
 
 def _signature(function, leave=()):

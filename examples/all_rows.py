@@ -6,9 +6,12 @@ that slide, up to half of it is in the friction disks. `Simulation(scene, report
 relative residual, which kind of row its energy belongs to, and the worst row by name.
 
     python examples/all_rows.py [FIGURE.png]
+
+A file named after a panel holds it alone: judged.png, normals.png, bridge.png, pile.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -47,25 +50,54 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
+def draw_judged(axes, found):
+    """What the judge of all rows says."""
+    for i, (name, by) in enumerate(found.items()):
+        axes.semilogy(np.arange(1, STEPS + 1), by["relative"], f"C{i}", label=name)
+    axes.set(title="all rows, by the judge", xlabel="step", ylabel="relative residual [-]")
+    beside(axes)
+
+
+def draw_normals(axes, found):
+    """What the eight values say: the largest error of a normal."""
+    for i, (name, by) in enumerate(found.items()):
+        shown = np.where(by["normals"] > 0.0, by["normals"], np.nan)
+        axes.semilogy(np.arange(1, STEPS + 1), shown, f"C{i}", label=name)
+    axes.set(title="the normals alone, as published", xlabel="step", ylabel="max $|e_n|$ [N s]")
+    beside(axes)
+
+
+def shares(axes, name, by):
+    """Whose the error of one run is."""
+    steps = np.arange(1, STEPS + 1)
+    axes.stackplot(steps, by["shares"].T, labels=KINDS, colors=("C0", "C1", "C2", "C3"))
+    title = f"{name}: worst row at the end is {by['worst'][-1]}"
+    axes.set(title=title, xlabel="step", ylabel="share of the error [-]", ylim=(0, 1))
+    beside(axes)
+
+
+def draw_bridge(axes, found):
+    """Of the bridge."""
+    shares(axes, "bridge", found["bridge"])
+
+
+def draw_pile(axes, found):
+    """Of the pile."""
+    shares(axes, "pile", found["pile"])
+
+
+PANELS = {"judged": draw_judged, "normals": draw_normals, "bridge": draw_bridge, "pile": draw_pile}
+
+
 def figure(found, path):
-    """Both measures over the steps, and whose the error is."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 9), layout="constrained")
-    axes = canvas.subplots(2 * len(found), 1, sharex=True)
-    steps = np.arange(1, STEPS + 1)
-    for i, (name, by) in enumerate(found.items()):
-        top, bottom = axes[2 * i], axes[2 * i + 1]
-        top.semilogy(steps, by["relative"], "k", label="all rows,\nrelative")
-        top.semilogy(
-            steps, np.where(by["normals"] > 0.0, by["normals"], np.nan), "C1", label="max $|e_n|$ [N s]"
-        )
-        top.set(title=f"{name}: worst row at the end is {by['worst'][-1]}", ylabel="residual")
-        beside(top)
-        bottom.stackplot(steps, by["shares"].T, labels=KINDS, colors=("C0", "C1", "C2", "C3"))
-        bottom.set(ylabel="share of the error", ylim=(0, 1))
-        beside(bottom)
-    axes[-1].set_xlabel("step")
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 

@@ -6,9 +6,12 @@ every step, the mean of what the tolerance took. On average both cost the same. 
 lets the cost vary, which a frame time may not allow; the budget bounds the cost and lets the error vary.
 
     python examples/budget_or_tolerance.py [FIGURE.png]
+
+A file named after a panel holds it alone: cost.png, error.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -62,21 +65,35 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
+def draw_cost(axes, found):
+    """Sweeps of every step."""
+    for name, style in (("tolerance", "o"), ("fixed", "x")):
+        axes.plot(found[name][0], style, label=name, markersize=4)
+    axes.set(title="cost", xlabel="step", ylabel="sweeps", yscale="symlog")
+    beside(axes)
+
+
+def draw_error(axes, found):
+    """Error of every step."""
+    for name, style in (("tolerance", "o"), ("fixed", "x")):
+        axes.semilogy(found[name][1], style, label=name, markersize=4)
+    axes.axhline(TOL, color="0.6", linewidth=0.8, label=f"tolerance {TOL:g}")
+    axes.set(title="error", xlabel="step", ylabel="relative residual [-]")
+    beside(axes)
+
+
+PANELS = {"cost": draw_cost, "error": draw_error}
+
+
 def figure(found, path):
-    """Cost and error of every step."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 6), layout="constrained")
-    top, bottom = canvas.subplots(2, 1, sharex=True)
-    for name, style in (("tolerance", "o"), ("fixed", "x")):
-        sweeps, residuals = found[name]
-        top.plot(sweeps, style, label=name, markersize=4)
-        bottom.semilogy(residuals, style, label=name, markersize=4)
-    top.set(title="cost", ylabel="sweeps", yscale="symlog")
-    bottom.set(title="error", xlabel="step", ylabel="relative residual")
-    bottom.axhline(TOL, color="0.6", linewidth=0.8, label=f"tolerance {TOL:g}")
-    beside(top)
-    beside(bottom)
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 

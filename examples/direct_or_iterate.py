@@ -2,8 +2,12 @@
 
 A is symmetric positive definite with 40 rows, unit diagonal and a given condition number. The direct
 solver does the same work for each and ends at the floor of float64. Gauss-Seidel needs more sweeps the
-larger the condition number is, Jacobi (damped, so that it converges) more still. Row by row, a few sweeps
-find the rough shape of x; what is left is what neighbours must agree on.
+larger the condition number is, Jacobi more still. Row by row, a few sweeps find the rough shape of x; what is left
+is what neighbours must agree on.
+
+Jacobi is damped here: x <- x - omega D^-1 (A x - b) multiplies the error by I - omega D^-1 A, whose spectral radius
+must stay below 1. Undamped (omega = 1) it does not, on any of these systems. `jacobi` takes an omega that is safe for
+every positive semidefinite A; with the eigenvalues known, 2 / (smallest + largest) of D^-1 A is the best.
 
 What a factorisation costs is its structure. On a square lattice of n = k^2 rows, row i tied to its four
 neighbours, multiplications are counted:
@@ -13,9 +17,12 @@ neighbours, multiplications are counted:
     sweeps   nonzeros of A for each, until the relative residual is 1e-6
 
     python examples/direct_or_iterate.py [FIGURE.png]
+
+A file named after a panel holds it alone: sweeps.png, rows.png, cost.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 from scipy import sparse
@@ -79,6 +86,11 @@ def numbers():
         row = {"condition": float(np.linalg.cond(a)), "direct": lv.solve(problem, "direct", tol=1e-12)}
         for solver in SOLVERS:
             row[solver] = lv.solve(problem, solver, tol=TOL, max_iter=1_000_000, history=True)
+        ends = np.linalg.eigvalsh(a)[[0, -1]]  # of D^-1 A, since d = 1
+        row["best"] = 2.0 / ends.sum()
+        row["undamped"] = np.abs(1.0 - ends).max()  # spectral radius of Jacobi's sweep at omega = 1
+        for name, omega in (("jacobi, best", row["best"]), ("jacobi, undamped", 1.0)):
+            row[name] = lv.solve(problem, "jacobi", omega=omega, tol=TOL, max_iter=1_000_000)
         out[condition] = row
     shown = lv.Problem.linear(*spd(SHOWN))
     after = {n: lv.solve(shown, "gauss_seidel", tol=0.0, max_iter=n).impulse for n in SWEEPS}
@@ -90,36 +102,30 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def figure(found, path):
-    """Histories, one panel for each condition number; rows after some sweeps; cost against n."""
-    from matplotlib.figure import Figure
-
-    canvas = Figure(figsize=(8, 9), layout="constrained")
-    grid = canvas.add_gridspec(4, 2)
-    first = None
+def draw_sweeps(axes, found):
+    """Residual against sweeps at each condition number."""
     for i, row in enumerate(found["systems"].values()):
-        axes = canvas.add_subplot(grid[i // 2, i % 2], sharey=first)
-        first = first or axes
         for solver, style in zip(SOLVERS, ("-", "--"), strict=True):
             h = row[solver].history
-            axes.loglog(h.iterations[1:], h.relative[1:], style, label=SOLVERS[solver])
-        axes.axhline(
-            row["direct"].residual.relative, color="k", linestyle=":", label="direct, one\nfactorisation"
-        )
-        axes.set_title(f"condition number {row['condition']:,.0f}", fontsize=10)
-        axes.set_xlabel("sweeps")
-        if i % 2 == 0:
-            axes.set_ylabel("relative residual")
-        else:
-            beside(axes)
-    rows = canvas.add_subplot(grid[2, :])
+            label = f"{SOLVERS[solver]},\ncondition {row['condition']:,.0f}"
+            axes.loglog(h.iterations[1:], h.relative[1:], style, color=f"C{i}", label=label)
+        axes.axhline(row["direct"].residual.relative, color=f"C{i}", linestyle=":", linewidth=0.8)
+    axes.set(title="dotted: direct, one factorisation", xlabel="sweeps", ylabel="relative residual [-]")
+    beside(axes)
+
+
+def draw_rows(axes, found):
+    """Each row after some sweeps."""
     exact = found["systems"][SHOWN]["direct"].impulse
-    rows.plot(exact, "k_", markersize=10, label="direct")
+    axes.plot(exact, "k_", markersize=10, label="direct")
     for n, marker in zip(SWEEPS, "^so", strict=True):
-        rows.plot(found["after"][n], marker, markersize=4, fillstyle="none", label=f"{n} sweeps")
-    rows.set(title=f"each row, condition number near {SHOWN:.0f}", xlabel="row", ylabel="impulse [N s]")
-    beside(rows)
-    work = canvas.add_subplot(grid[3, :])
+        axes.plot(found["after"][n], marker, markersize=4, fillstyle="none", label=f"{n} sweeps")
+    axes.set(title=f"each row, condition number near {SHOWN:.0f}", xlabel="row", ylabel="impulse [N s]")
+    beside(axes)
+
+
+def draw_cost(axes, found):
+    """Multiplications against rows."""
     n = list(found["cost"])
     for (name, style), color in zip(
         (("dense", "s-"), ("banded", "o-"), ("sparse", "^-"), ("gauss_seidel", "x--"), ("jacobi", "+--")),
@@ -127,9 +133,23 @@ def figure(found, path):
         strict=True,
     ):
         label = f"{SOLVERS[name]} sweeps" if name in SOLVERS else f"{name} factorisation"
-        work.loglog(n, [found["cost"][i][name] for i in n], style, color=color, markersize=5, label=label)
-    work.set(title="a square lattice", xlabel="rows n", ylabel="multiplications")
-    beside(work)
+        axes.loglog(n, [found["cost"][i][name] for i in n], style, color=color, markersize=5, label=label)
+    axes.set(title="a square lattice", xlabel="rows n", ylabel="multiplications")
+    beside(axes)
+
+
+PANELS = {"sweeps": draw_sweeps, "rows": draw_rows, "cost": draw_cost}
+
+
+def figure(found, path):
+    """Every panel below the other, or alone the one that the file is named after."""
+    from matplotlib.figure import Figure
+
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 
@@ -143,6 +163,12 @@ def main(path="direct_or_iterate.png"):
         print(
             f"{row['condition']:>10.1e} {row['direct'].residual.relative:>9.1e} {sweeps[0]:>14} {sweeps[1]:>10} "
             f"{sweeps[1] / sweeps[0]:>7.1f}"
+        )
+    print("Jacobi: undamped spectral radius, how it ends; best omega and its sweeps")
+    for row in found["systems"].values():
+        print(
+            f"{row['condition']:>10.1e} {row['undamped']:>9.2f} {row['jacobi, undamped'].status.name.lower():>14} "
+            f"{row['best']:>10.2f} {row['jacobi, best'].work['sweeps']:>7}"
         )
     exact = found["systems"][SHOWN]["direct"].impulse
     for n, x in found["after"].items():

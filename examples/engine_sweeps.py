@@ -20,20 +20,26 @@ taken without friction, since the friction disks do not sweep like a matrix. Col
 run is not averaged over its fall: how long it stands is a number of its own. Warm ones stand on every budget.
 
 Order: with friction a cold run swept always the same way keeps a slow sway that 64 sweeps do not see. Turned round in
-every other substep (`alternating`, the default), they leave an order of magnitude less. How much depends on when one
-looks, so that each figure has its window: late in the run the stack on 4 sweeps leans.
+every other substep (`alternating`, the default), 64 sweeps leave several times less by the judge; 4 to 16 sweeps, which
+leave much of everything, gain nothing. How much depends on when one looks, so that each number has its window: late in
+the run the stack on 4 sweeps leans.
 
     python examples/engine_sweeps.py [FIGURE.png]
+
+A file named after a panel holds it alone: published.png, judged.png, residual.png, violation.png, rows.png, depth.png,
+stand.png, tail.png.
 """
 
+import functools
 import sys
+from pathlib import Path
 
 import numpy as np
 
 import lavender as lv
 
 BUDGETS = (4, 8, 16, 32, 64)
-ORDERS = ("bottom_up", "top_down", "random", "colored", "symmetric")
+ORDERS = ("alternating", "bottom_up", "top_down", "random", "colored", "symmetric")
 RUNS = ("alternating", "bottom_up", "top_down")
 FIRST, LAST = 20, 60  # steps of which medians are taken; no cold stack tips before
 MOST = 0.05  # m: a stack of which a box has moved so far no longer stands
@@ -47,44 +53,54 @@ STARTS = ((20, 90), (90, 120))
 def first_solve(sweeps, order):
     """Of the first solve: max |e_n| [N s], and the judge's relative residual of all rows [-]."""
     problem = lv.Simulation(lv.Scene("stack", warm_start=False)).constraint_problem()
+    order = (
+        "given" if order == "alternating" else order
+    )  # the problem of a substep lists its contacts in that order
     impulse = lv.solve(problem, "sequential_impulses", tol=0, max_iter=sweeps, order=order).impulse
     judged = lv.residual(problem, impulse)
     return np.abs(judged.error[problem.cones.ptr[:-1]]).max(), judged.relative
 
 
+@functools.cache
 def run(sweeps, order="alternating", warm=False):
-    """Medians of residual [N s], violation [m/s] and relative residual of all rows [-]; largest depth [m]."""
+    """Of each of TRAIL steps the columns COLUMNS."""
     scene = lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm)
     sim = lv.Simulation(scene, report_residual=True)
-    rows, depth = [], []
-    for _ in range(LAST):
+    start = sim.reset()[0]["positions"]
+    rows = []
+    for _ in range(TRAIL):
         observation, *_, info = sim.step()
         values = dict(zip(lv.SOLVER_FIELDS, observation["solver"], strict=True))
-        rows.append((values["residual_final"], values["violation_final"], info["residual"]["relative"]))
-        depth.append(observation["contacts"]["depth"].max())
-    return (*np.median(rows[FIRST:], axis=0), max(depth))
+        rows.append(
+            (
+                values["residual_initial"],  # N s, before the first sweep
+                values["residual_final"],  # N s
+                values["violation_final"],  # m/s
+                info["residual"]["relative"],  # -, of all rows
+                observation["contacts"]["depth"].max(),  # m
+                np.abs(observation["positions"] - start).max(),  # m, how far a box has moved
+            )
+        )
+    return np.array(rows)
 
 
-def trail(sweeps, order, warm=False):
-    """Of TRAIL steps: residual before the first sweep and after the last [N s], and how far a box has moved [m]."""
-    sim = lv.Simulation(lv.Scene("stack", solver_iterations=sweeps, order=order, warm_start=warm))
-    start = sim.reset()[0]["positions"]
-    fields = [lv.SOLVER_FIELDS.index(f"residual_{k}") for k in ("initial", "final")]
-    seen = (sim.step()[0] for _ in range(TRAIL))
-    return np.array([(*o["solver"][fields], np.abs(o["positions"] - start).max()) for o in seen])
+def summary(sweeps, order="alternating", warm=False):
+    """Of the steps FIRST to LAST: medians of residual, violation and judge; of all up to LAST the largest depth."""
+    rows = run(sweeps, order, warm)[:LAST]
+    return (*np.median(rows[FIRST:, 1:4], axis=0), rows[:, 4].max())
 
 
 def alternation():
-    """By order: tails 4 -> 64 in the windows TAILS, starts cold over warm in STARTS, m moved on 64, and the trails."""
+    """By order: tails 4 -> 64 in the windows TAILS, starts cold over warm in STARTS, m moved on 64, judged (2, 5)."""
     out = {}
     for order in ("bottom_up", "alternating"):
-        few, many = (trail(n, order) for n in ENDS)
-        warm = trail(ENDS[0], order, warm=True)
+        few, many = (run(n, order) for n in ENDS)
+        warm = run(ENDS[0], order, warm=True)
         out[order] = {
             "tails": [np.median(few[a:b, 1]) / np.median(many[a:b, 1]) for a, b in TAILS],
             "starts": [np.median(few[a:b, 0]) / np.median(warm[a:b, 0]) for a, b in STARTS],
-            "moved": many[-1, 2],
-            "trails": dict(zip(ENDS, (few, many), strict=True)),
+            "moved": many[-1, 5],
+            "judged": np.array([[np.median(run(n, order)[a:b, 3]) for n in BUDGETS] for a, b in TAILS]),
         }
     return out
 
@@ -123,8 +139,8 @@ def numbers():
     """First solves and runs by order and budget, how long stacks stand, and the twin beside its run."""
     return {
         "first": {order: np.array([first_solve(n, order) for n in BUDGETS]) for order in ORDERS},  # (5, 2)
-        "cold": {order: np.array([run(n, order) for n in BUDGETS]) for order in RUNS},  # (5, 4)
-        "warm": np.array([run(n, warm=True) for n in BUDGETS]),  # (5, 4)
+        "cold": {order: np.array([summary(n, order) for n in BUDGETS]) for order in RUNS},  # (5, 4)
+        "warm": np.array([summary(n, warm=True) for n in BUDGETS]),  # (5, 4)
         "standing": {warm: np.array([standing(n, warm) for n in BUDGETS]) for warm in (False, True)},
         "alternation": alternation(),
         "twin": np.array([twin(n) for n in BUDGETS]),
@@ -145,44 +161,102 @@ def against_budget(axes):
     axes.set_xticks([], minor=True)
 
 
-def figure(found, path):
-    """First solve; run: residual, violation, penetration; how long stacks stand."""
-    from matplotlib.figure import Figure
-
-    canvas = Figure(figsize=(8, 17), layout="constrained")
-    published, judged, residual, violation, depth, rows, stand, tail = canvas.subplots(8, 1)
+def first(axes, found, at, **looks):
+    """A column of the first solve by order."""
     for i, (order, by) in enumerate(found["first"].items()):
-        for column, axes in enumerate((published, judged)):
-            axes.plot(BUDGETS, by[:, column], "o^svx"[i] + "-", markersize=4, label=order.replace("_", " "))
-    published.set(
-        title="first solve, published: a velocity at the ground counts twice", ylabel="max $|e_n|$ [N s]"
+        axes.plot(BUDGETS, by[:, at], "P^vsxD"[i] + "-", markersize=4, label=order.replace("_", " "))
+    against_budget(axes)
+    axes.set(xlabel="sweeps", **looks)
+    beside(axes)
+
+
+def draw_published(axes, found):
+    """First solve, as published."""
+    first(
+        axes, found, 0, title="first solve: a velocity at the ground counts twice", ylabel="max $|e_n|$ [N s]"
     )
-    judged.set(title="first solve, judged: all rows", ylabel="relative residual")
+
+
+def draw_judged(axes, found):
+    """First solve, as judged."""
+    first(axes, found, 1, title="first solve, all rows, by the judge", ylabel="relative residual [-]")
+
+
+def in_the_run(axes, found, at, scale=1.0, **looks):
+    """A column of the runs by order."""
     curves = {f"cold,\n{order.replace('_', ' ')}": by for order, by in found["cold"].items()}
-    curves["warm"] = found["warm"]
+    curves["warm,\nalternating"] = found["warm"]
     for i, (name, by) in enumerate(curves.items()):
-        style = "o^vs"[i] + ("-" if name == "warm" else "--")
-        for column, axes, scale in ((0, residual, 1.0), (1, violation, 1.0), (3, depth, 1e3), (2, rows, 1.0)):
-            axes.plot(BUDGETS, scale * by[:, column], style, markersize=4, label=name)
-    residual.set(title=f"the run, steps {FIRST} to {LAST}: residual", ylabel="max $|e_n|$ [N s]")
-    rows.set(title="judged: all rows", ylabel="relative residual")
-    violation.set(title="approach velocity left", ylabel="[m/s]")
-    depth.set(title="largest depth", ylabel="[mm]")
+        style = "o^vs"[i] + ("-" if name.startswith("warm") else "--")
+        axes.plot(BUDGETS, scale * by[:, at], style, markersize=4, label=name)
+    against_budget(axes)
+    axes.set(xlabel="sweeps", **looks)
+    beside(axes)
+
+
+def draw_residual(axes, found):
+    """The run: what is published."""
+    title = f"the run, steps {FIRST} to {LAST}: the normals alone"
+    in_the_run(axes, found, 0, title=title, ylabel="max $|e_n|$ [N s]")
+
+
+def draw_violation(axes, found):
+    """The run: approach velocity."""
+    in_the_run(axes, found, 1, title="the run: approach velocity that is left", ylabel="[m/s]")
+
+
+def draw_rows(axes, found):
+    """The run: what the judge says."""
+    in_the_run(axes, found, 2, title="the run: all rows, by the judge", ylabel="relative residual [-]")
+
+
+def draw_depth(axes, found):
+    """The run: penetration."""
+    in_the_run(axes, found, 3, 1e3, title="the run: largest depth", ylabel="[mm]")
+
+
+def draw_stand(axes, found):
+    """How long stacks stand."""
     for warm, style in ((False, "o--"), (True, "s-")):
-        stand.plot(BUDGETS, found["standing"][warm], style, markersize=4, label="warm" if warm else "cold")
-    stand.set(title=f"how long the stack stands (looked at for {LONG:.0f} s)", xlabel="sweeps", ylabel="[s]")
-    for axes in (published, judged, residual, violation, depth, rows, stand):
-        against_budget(axes)
-        beside(axes)
+        axes.plot(BUDGETS, found["standing"][warm], style, markersize=4, label="warm" if warm else "cold")
+    against_budget(axes)
+    axes.set(title=f"how long the stack stands (looked at for {LONG:.0f} s)", xlabel="sweeps", ylabel="[s]")
+    axes.set_yticks([2, 5, 10, 20, 60], ["2", "5", "10", "20", "60"])
+    axes.set_yticks([], minor=True)
+    beside(axes)
+
+
+def draw_tail(axes, found):
+    """The cold run step by step."""
     for order, color in (("bottom_up", "C1"), ("alternating", "C0")):
         for n, style in zip(ENDS, ("--", "-"), strict=True):
-            trace = found["alternation"][order]["trails"][n][:, 1]
             label = f"{order.replace('_', ' ')},\n{n} sweeps"
-            tail.semilogy(np.arange(1, TRAIL + 1), trace, style, color=color, label=label)
-    tail.set(title="the cold run, step by step", xlabel="step", ylabel="max $|e_n|$ [N s]")
-    beside(tail)
-    stand.set_yticks([2, 5, 10, 20, 60], ["2", "5", "10", "20", "60"])
-    stand.set_yticks([], minor=True)
+            axes.semilogy(np.arange(1, TRAIL + 1), run(n, order)[:, 1], style, color=color, label=label)
+    axes.set(title="the cold run, step by step", xlabel="step", ylabel="max $|e_n|$ [N s]")
+    beside(axes)
+
+
+PANELS = {
+    "published": draw_published,
+    "judged": draw_judged,
+    "residual": draw_residual,
+    "violation": draw_violation,
+    "rows": draw_rows,
+    "depth": draw_depth,
+    "stand": draw_stand,
+    "tail": draw_tail,
+}
+
+
+def figure(found, path):
+    """Every panel below the other, or alone the one that the file is named after."""
+    from matplotlib.figure import Figure
+
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 
@@ -217,6 +291,16 @@ def main(path="engine_sweeps.png"):
         moved = 1e3 * found["alternation"][order]["moved"]
         print(f"{order + ':':<13}" + "".join(f"{x:>12.0f}" for x in values) + f"{moved:>10.1f}")
     print(f"{'ratio':<13}" + "".join(f"{b / a:>12.1f}" for a, b in zip(*found_in.values(), strict=True)))
+    print(
+        f"\njudged, cold: what is left of doing nothing, medians{'':>7}" + "".join(f"{n:>9}" for n in BUDGETS)
+    )
+    one_way, turned = (found["alternation"][order]["judged"] for order in found_in)
+    for (a, b), *both in zip(TAILS, one_way, turned, strict=True):
+        for name, values in zip(
+            ("bottom_up", "alternating", "gain"), (*both, both[0] / both[1]), strict=True
+        ):
+            digits = ".1f" if name == "gain" else ".3f"
+            print(f"{f'steps {a}-{b}':<14} {name:<46}" + "".join(f"{x:>9{digits}}" for x in values))
     for warm in (False, True):
         times = "  ".join(
             f"{n}: {'all' if t >= LONG else f'{t:.1f}'}"

@@ -11,9 +11,12 @@ where the tangents do not change the normals, and the iteration N <- l_n ends af
 Coulomb's law solves for both at once.
 
     python examples/friction_bounds.py [FIGURE.png]
+
+A file named after a panel holds it alone: friction.png, motion.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -21,7 +24,7 @@ import lavender as lv
 
 N = 6
 MU = 0.5
-GRAVITY_STEP = 9.81 / 60.0  # m/s
+GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 PUSH = 0.4  # m/s, top box sideways
 TOL = 1e-10
 
@@ -67,27 +70,52 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def figure(found, path):
-    """Tangential impulses against their bounds, and what the boxes do."""
-    from matplotlib.figure import Figure
+WAYS = (("no friction", "o:"), ("glued", "s--"), ("bounded", "D-"), ("Coulomb", "x"))
 
-    canvas = Figure(figsize=(8, 6), layout="constrained")
-    left, right = canvas.subplots(2, 1)
+
+def ways(found):
+    """Impulses (12,) by name."""
+    rounds = found["rounds"]
+    return dict(
+        zip(
+            (name for name, _ in WAYS),
+            (rounds[0], found["glued"], rounds[-1], found["coulomb"].impulse),
+            strict=True,
+        )
+    )
+
+
+def draw_friction(axes, found):
+    """Tangential impulses against their bounds."""
     contacts = np.arange(1, N + 1)
     bound = MU * found["rounds"][-1][0::2]
-    left.fill_between(contacts, -bound, bound, alpha=0.2, label=r"$|\lambda_t| \leq \mu \lambda_n$")
-    for name, impulse, style in (
-        ("no friction", found["rounds"][0], "o:"),
-        ("glued", found["glued"], "s--"),
-        ("bounded", found["rounds"][-1], "D-"),
-        ("Coulomb", found["coulomb"].impulse, "x"),
-    ):
-        left.plot(contacts, impulse[1::2], style, label=name)
-        right.plot(contacts, sideways_velocity(impulse), style, label=name)
-    left.set(title="friction", xlabel="contact, from the ground", ylabel="tangential impulse [N s]")
-    right.set(title="what the boxes do", xlabel="box, from the ground", ylabel="velocity sideways [m/s]")
-    beside(left)
-    beside(right)
+    axes.fill_between(contacts, -bound, bound, alpha=0.2, label=r"$|\lambda_t| \leq \mu \lambda_n$")
+    for name, style in WAYS:
+        axes.plot(contacts, ways(found)[name][1::2], style, label=name)
+    axes.set(title="friction", xlabel="contact, from the ground", ylabel="tangential impulse [N s]")
+    beside(axes)
+
+
+def draw_motion(axes, found):
+    """What the boxes do."""
+    for name, style in WAYS:
+        axes.plot(np.arange(1, N + 1), sideways_velocity(ways(found)[name]), style, label=name)
+    axes.set(title="what the boxes do", xlabel="box, from the ground", ylabel="velocity sideways [m/s]")
+    beside(axes)
+
+
+PANELS = {"friction": draw_friction, "motion": draw_motion}
+
+
+def figure(found, path):
+    """Every panel below the other, or alone the one that the file is named after."""
+    from matplotlib.figure import Figure
+
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 

@@ -5,7 +5,9 @@ the sweep before has left, so all rows can go at once, and one thread each is no
 Gauss-Seidel stands between: rows of one colour share no body, and a stack of boxes needs two colours.
 
 The price is in sweeps. On a stack (A tridiagonal) the error of a Gauss-Seidel sweep shrinks by the square of
-what undamped Jacobi's does: twice the sweeps. Where rows of one contact repeat each other, undamped Jacobi
+what undamped Jacobi's does: twice the sweeps. So two colours with half as many threads wait as long as Jacobi with a
+thread for each row, and with as many threads as rows no longer than that: Jacobi wins nothing here. Where rows of
+one contact repeat each other, undamped Jacobi
 does not end at all (k equal rows: it is k - 1 times too strong); the damping that makes it safe for every
 problem costs more sweeps again.
 
@@ -14,16 +16,19 @@ This counts; it measures no time, for `jacobi` itself runs on one thread: sweep 
 Rows done one after the other, with T threads: sweeps x the sum over the colours of ceil(rows of it / T).
 
     python examples/jacobi.py [FIGURE.png]
+
+A file named after a panel holds it alone: sweeps.png, threads.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
 import lavender as lv
 
 N = 32  # contacts of the stack
-GRAVITY_STEP = 9.81 / 60.0  # m/s
+GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 TOL = 1e-3  # relative residual
 MOST = 100_000  # sweeps
 THREADS = (1, 2, 4, 8, 16, 32)
@@ -77,24 +82,38 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def figure(found, path):
-    """Residual against sweeps; rows one after the other against threads."""
-    from matplotlib.figure import Figure
-
-    canvas = Figure(figsize=(8, 6), layout="constrained")
-    top, bottom = canvas.subplots(2, 1)
+def draw_sweeps(axes, found):
+    """Residual against sweeps."""
     for i, (name, solution) in enumerate(found["stack"].items()):
         h = solution.history
-        top.loglog(h.iterations[1:], h.relative[1:], ("-", "--", "-.", ":")[i], color=f"C{i}", label=name)
-        bottom.loglog(THREADS, found["waiting"][name], "o^sx"[i] + "-", color=f"C{i}", label=name)
-    top.set(title=f"a stack of {N} boxes", xlabel="sweeps", ylabel="relative residual")
-    bottom.set(
-        title=f"until the relative residual is {TOL:g}", xlabel="threads", ylabel="rows one after the other"
-    )
-    bottom.set_xticks(THREADS, [str(t) for t in THREADS])
-    bottom.minorticks_off()
-    beside(top)
-    beside(bottom)
+        axes.loglog(h.iterations[1:], h.relative[1:], ("-", "--", "-.", ":")[i], color=f"C{i}", label=name)
+    axes.set(title=f"a stack of {N} boxes", xlabel="sweeps", ylabel="relative residual [-]")
+    beside(axes)
+
+
+def draw_threads(axes, found):
+    """Rows one after the other against threads."""
+    for i, (name, waiting) in enumerate(found["waiting"].items()):
+        axes.loglog(THREADS, waiting, "o^sx"[i] + "-", color=f"C{i}", label=name)
+    title = f"until the relative residual is {TOL:g}"
+    axes.set(title=title, xlabel="threads", ylabel="rows one after the other")
+    axes.set_xticks(THREADS, [str(t) for t in THREADS])
+    axes.minorticks_off()
+    beside(axes)
+
+
+PANELS = {"sweeps": draw_sweeps, "threads": draw_threads}
+
+
+def figure(found, path):
+    """Every panel below the other, or alone the one that the file is named after."""
+    from matplotlib.figure import Figure
+
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 
@@ -109,6 +128,11 @@ def main(path="jacobi.png"):
             + "".join(f"{x:>9}" for x in found["waiting"][name])
             + f"   {found['repeated'][name].status.name.lower().replace('_', ' ')}"
         )
+    coloured, jacobi = found["waiting"]["Gauss-Seidel, coloured"], found["waiting"]["Jacobi, undamped"]
+    print(
+        f"coloured Gauss-Seidel on {THREADS[-2]} threads waits for {coloured[-2]} rows, "
+        f"Jacobi on {THREADS[-1]} for {jacobi[-1]}"
+    )
     for name in ("Gauss-Seidel", "Jacobi, safe damping"):
         impulse = found["repeated"][name].impulse
         print(

@@ -7,13 +7,22 @@ Where each box stands on a heavier one, little comes back, and few passes are en
 comes back, and the order matters little. A random order does it in pieces, each seed otherwise.
 
 Warm start: a small change of load, from the exact impulses before it, begins as much closer as the load has
-changed little: 20 times for 5 %, before the first sweep. Stale impulses hurt: the same numbers, matched to the
-wrong contacts (in reverse), begin 9 times further off than nothing at all, and stay behind for some sweeps.
+changed little: 20 times for 5 %, before the first sweep.
+
+Stale impulses hurt for as long as sweeps take to remove what is wrong with them. The error has parts that die at
+different rates: neighbours that disagree are put right in a few sweeps, an impulse that is missing or too much in all
+contacts together shrinks by cos^2(pi / 2n) a sweep (n = 8: 0.962), the slowest part of all. Matched to the wrong
+contacts (in reverse), the same numbers begin 9 times further off than nothing at all, but hardly any of that is of the
+slow part: they are behind for some sweeps and then ahead. Ten times too large, as after a load that is gone or in a
+step that is ten times shorter, they begin as far off, all of it of the slow part: behind nothing at all for good.
 
     python examples/order_and_warm_start.py [FIGURE.png]
+
+A file named after a panel holds it alone: lighter.png, equal.png, orders.png, starts.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +31,7 @@ import lavender as lv
 N = 8
 BUDGET = 8
 SEEDS = range(20)
-GRAVITY_STEP = 9.81 / 60.0  # m/s
+GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 BLOW = 1.0  # m/s, top box downwards
 RATIO = 3.0  # mass of a box over that of the one on it
 CHANGE = 0.05  # relative change of the load
@@ -63,6 +72,17 @@ def error(problem, impulse=None, sweeps=BUDGET, solver="pgs", **order):
     return lv.solve(problem, solver, tol=0.0, max_iter=sweeps, impulse=impulse, **order).residual.relative
 
 
+def slow_part(problem, impulse, exact):
+    """The slowest part of an impulse's error, of that of no impulse [-]: as that part is left, sweep after sweep.
+
+    A sweep from the bottom up multiplies the error by G = I - (L + D)^-1 A; a left eigenvector of G picks one part.
+    """
+    a = problem.dense()
+    values, vectors = np.linalg.eig((np.eye(N) - np.linalg.solve(np.tril(a), a)).T)
+    slow = np.real(vectors[:, np.argmax(np.abs(values))])
+    return abs(slow @ (impulse - exact)) / abs(slow @ exact)
+
+
 def histories(problem):
     """Residual after each of SWEEPS by order, of Jacobi, and of random orders (seeds, sweeps)."""
     out = {name: [error(problem, sweeps=n, order=order) for n in SWEEPS] for name, order in ORDERS.items()}
@@ -84,14 +104,25 @@ def numbers():
         }
     before = lv.solve(falling(np.ones(N)), "direct", tol=1e-12).impulse
     changed = falling(np.ones(N), 1.0 + CHANGE)
-    starts = {"cold": np.zeros(N), "warm": before, "stale": before[::-1].copy()}
+    exact = lv.solve(changed, "direct", tol=1e-12).impulse
+    starts = {
+        "cold": np.zeros(N),
+        "warm": before,
+        "in reverse": before[::-1],
+        "10 x too large": 10.0 * before,
+    }
     return {
         "orders": orders,
         "histories": {
             name: histories(cases()[name]) for name in ("falling, lighter above", "falling, equal")
         },
-        **{name: np.array([error(changed, start, n) for n in SWEEPS]) for name, start in starts.items()},
-        "behind": np.array([[error(changed, starts[k], n) for n in range(16)] for k in ("cold", "stale")]),
+        "starts": {
+            name: np.array([error(changed, start, n) for n in SWEEPS]) for name, start in starts.items()
+        },
+        "slow": {name: slow_part(changed, start, exact) for name, start in starts.items()},
+        "behind": np.array(
+            [[error(changed, starts[k], n) for n in range(16)] for k in ("cold", "in reverse")]
+        ),
     }
 
 
@@ -106,53 +137,67 @@ def against_sweeps(axes):
     axes.set_yscale("log")
     axes.set_xticks([0, 1, 4, 8, 16, 32, 64], ["0", "1", "4", "8", "16", "32", "64"])
     axes.minorticks_off()
-    axes.set(xlabel="sweeps", ylabel="relative residual")
+    axes.set(xlabel="sweeps", ylabel="relative residual [-]")
+    beside(axes)
+
+
+def by_order(axes, name, by):
+    """Histories of one stack."""
+    low, high = by["random"].min(axis=0), by["random"].max(axis=0)
+    axes.fill_between(SWEEPS, low, high, color="0.85", label=f"random, {len(SEEDS)} seeds")
+    for (key, style), color in zip(
+        (("bottom up", "^-"), ("top down", "v-"), ("colored", "s-"), ("Jacobi", "x--")),
+        ("C0", "C1", "C2", "k"),
+        strict=True,
+    ):
+        axes.plot(SWEEPS, by[key], style, color=color, markersize=4, label=key)
+    axes.set_title(f"eight boxes {name}")
+    against_sweeps(axes)
+
+
+def draw_lighter(axes, found):
+    """Each box stands on one that is three times as heavy."""
+    by_order(axes, "falling, lighter above", found["histories"]["falling, lighter above"])
+
+
+def draw_equal(axes, found):
+    """All boxes weigh the same."""
+    by_order(axes, "falling, equal", found["histories"]["falling, equal"])
+
+
+def draw_orders(axes, found):
+    """Three stacks at one budget."""
+    for x, by in enumerate(found["orders"].values()):
+        first = x == 0
+        axes.plot([x] * len(by["random"]), by["random"], "o", color="0.7", label="random" if first else None)
+        axes.plot(x, by["bottom up"], "^", color="C0", label="bottom up" if first else None)
+        axes.plot(x, by["top down"], "v", color="C1", label="top down" if first else None)
+    axes.set(yscale="log", title=f"after {BUDGET} sweeps", ylabel="relative residual [-]", xlim=(-0.5, 2.5))
+    axes.set_xticks(range(3), list(found["orders"]))
+    beside(axes)
+
+
+def draw_starts(axes, found):
+    """Where a solve begins, and what becomes of it."""
+    looks = {"10 x too large": "C3D-", "in reverse": "C1s-", "cold": "ko-", "warm": "C0^-"}
+    for name, style in looks.items():
+        axes.plot(SWEEPS, found["starts"][name], style, markersize=4, label=name)
+    axes.set_title(f"the load has changed by {100 * CHANGE:g} %")
+    against_sweeps(axes)
+
+
+PANELS = {"lighter": draw_lighter, "equal": draw_equal, "orders": draw_orders, "starts": draw_starts}
 
 
 def figure(found, path):
-    """Histories by order, the orders of three stacks at one budget, and where a solve begins."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 11), layout="constrained")
-    axes = canvas.subplots(4, 1)
-    for ax, (name, by) in zip(axes, found["histories"].items(), strict=False):
-        ax.fill_between(
-            SWEEPS,
-            by["random"].min(axis=0),
-            by["random"].max(axis=0),
-            color="0.85",
-            label=f"random, {len(SEEDS)} seeds",
-        )
-        for (key, style), color in zip(
-            (("bottom up", "^-"), ("top down", "v-"), ("colored", "s-"), ("Jacobi", "x--")),
-            ("C0", "C1", "C2", "k"),
-            strict=True,
-        ):
-            ax.plot(SWEEPS, by[key], style, color=color, markersize=4, label=key)
-        ax.set_title(f"eight boxes {name}")
-        against_sweeps(ax)
-        beside(ax)
-    places = axes[2]
-    for x, by in enumerate(found["orders"].values()):
-        first = x == 0
-        places.plot(
-            [x] * len(by["random"]), by["random"], "o", color="0.7", label="random" if first else None
-        )
-        places.plot(x, by["bottom up"], "^", color="C0", label="bottom up" if first else None)
-        places.plot(x, by["top down"], "v", color="C1", label="top down" if first else None)
-    places.set(yscale="log", title=f"after {BUDGET} sweeps", ylabel="relative residual", xlim=(-0.5, 2.5))
-    places.set_xticks(range(3), list(found["orders"]))
-    beside(places)
-    start = axes[3]
-    for (name, label), style in zip(
-        (("stale", "matched to the\nwrong contacts"), ("cold", "cold"), ("warm", "warm")),
-        ("rs-", "ko-", "C0^-"),
-        strict=True,
-    ):
-        start.plot(SWEEPS, found[name], style, markersize=4, label=label)
-    start.set_title(f"the load has changed by {100 * CHANGE:g} %")
-    against_sweeps(start)
-    beside(start)
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 
@@ -171,14 +216,21 @@ def main(path="order_and_warm_start.png"):
         f"fall, lighter above,\n{100 * (equal['top down'] / equal['bottom up'] - 1):.1f} % among equal ones; "
         f"struck from above, top down is {struck['bottom up'] / struck['top down']:.1f} times closer"
     )
-    print(f"\n{'sweeps':>6}{'cold':>12}{'warm':>12}{'stale':>12}")
+    starts = found["starts"]
+    print(f"\n{'sweeps':>9}" + "".join(f"{name:>16}" for name in starts))
     for i, n in enumerate(SWEEPS):
-        print(f"{n:>6}" + "".join(f"{found[k][i]:>12.2e}" for k in ("cold", "warm", "stale")))
+        print(f"{n:>9}" + "".join(f"{by[i]:>16.3g}" for by in starts.values()))
+    print("slow part" + "".join(f"{x:>16.3g}" for x in found["slow"].values()))
     cold, stale = found["behind"]
-    behind = np.argmax(stale <= cold) - 1
     print(
-        f"before the first sweep: warm {found['cold'][0] / found['warm'][0]:.0f} times closer than cold, "
-        f"stale {found['stale'][0] / found['cold'][0]:.0f} times further, and behind for {behind} sweeps"
+        f"before the first sweep: warm {starts['cold'][0] / starts['warm'][0]:.0f} times closer than cold, in reverse "
+        f"{starts['in reverse'][0] / starts['cold'][0]:.0f} times further, and behind for "
+        f"{np.argmax(stale <= cold) - 1} sweeps"
+    )
+    last = {name: by[-1] for name, by in starts.items()}
+    print(
+        f"after {SWEEPS[-1]} sweeps: 10 x too large {last['10 x too large']:.3f} against {last['cold']:.3f} cold, "
+        f"in reverse {last['in reverse']:.5f} against {last['warm']:.5f} warm"
     )
     figure(found, path)
     print(f"figure: {path}")

@@ -6,6 +6,10 @@ the impulses and J the difference of neighbours,
 
     w = A l - b,   A = J J^T,   b = -J v*,       0 <= l  complementary to  w >= 0
 
+The same as a quadratic program: minimise 1/2 l.A l - b.l over l >= 0. Its optimality conditions are the line above,
+with w as the gradient, so a QP solver such as OSQP and a solver of the LCP have the same answer. At rest:
+the eight impulses are the weights above each contact, and every slack is 0.
+
 At contact 5 the ordinary residual |w| is 0 for A^-1 b, which pulls there, and is not 0 at the solution, where
 the contact opens; r_p = |l - max(0, l - w)| is the other way round. That is why projections are measured by r_p.
 
@@ -20,9 +24,13 @@ Wrong too: a residual of 0 means no penetration. The conditions are on velocitie
 deep and does not approach is a solution. Depth is removed by the position projection, step by step.
 
     python examples/toy_stack.py [FIGURE.png]
+
+A file named after a panel holds it alone: impulses.png, slacks.png, sweeps.png, sweeps_slack.png, r_p.png,
+ordinary.png, projected.png, deep.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -31,9 +39,11 @@ from lavender.measures import natural_map
 
 N = 8
 OPEN = 4  # index of the contact that opens
-GRAVITY_STEP = 9.81 / 60.0  # m/s, gravity over one step
+GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
 KICK = 1.0  # m/s, box 5 upwards
 SWEEPS = 400
+SOLVERS = ("osqp", "direct", "pgs", "jacobi")
+TOL = 1e-10  # relative residual
 DEEP = 0.05  # m, penetration of the box at the start
 STEPS = 40
 
@@ -90,6 +100,7 @@ def numbers():
     return {
         "problem": toy,
         "resting": lv.solve(problem(0.0), "direct", tol=1e-12).impulse,
+        "as_qp": {name: lv.solve(problem(0.0), name, tol=TOL, max_iter=100_000) for name in SOLVERS},
         "late": late,
         "late_r_p": natural_map(toy, late),
         "lowest": lowest,
@@ -115,38 +126,107 @@ def beside(axes):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
+def bars(axes, found, values):
+    """A value of each contact, at rest and hit."""
+    place = np.arange(1, N + 1)
+    for shift, (name, impulse) in zip(
+        (-0.2, 0.2), (("at rest", "resting"), ("hit from below", "exact")), strict=True
+    ):
+        axes.bar(place + shift, values(name, found[impulse]), 0.4, label=name)
+    axes.axhline(0.0, color="k", linewidth=0.8)
+    axes.set_xticks(place)
+    beside(axes)
+
+
+def draw_impulses(axes, found):
+    """The solution's eight impulses, at rest with every solver's beside them."""
+    bars(axes, found, lambda _, impulse: impulse)
+    for (name, solution), marker in zip(found["as_qp"].items(), "x+1|", strict=True):
+        axes.plot(np.arange(1, N + 1) - 0.2, solution.impulse, "k" + marker, markersize=8, label=name)
+    axes.set(title="eight impulses, none negative", xlabel="contact, from the ground", ylabel="impulse [N s]")
+    beside(axes)
+
+
+def draw_slacks(axes, found):
+    """The solution's eight slacks."""
+    problems = {"at rest": problem(0.0), "hit from below": found["problem"]}
+    bars(axes, found, lambda name, impulse: problems[name].slack(impulse))
+    title = "eight slacks: 0 where an impulse acts, positive where the contact opens"
+    axes.set(title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None))
+
+
+def draw_sweeps(axes, found):
+    """Impulse of each contact against sweeps."""
+    for i in range(N):
+        axes.plot(np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
+        axes.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
+    axes.set(title="crosses: solved, then clamped", xlabel="sweeps", ylabel="impulse [N s]", xscale="symlog")
+    beside(axes)
+
+
+def draw_sweeps_slack(axes, found):
+    """Slack of each contact against sweeps."""
+    for i in range(N):
+        axes.plot(np.arange(SWEEPS + 1), found["slack"][:, i], color=f"C{i}", label=f"contact {i + 1}")
+    axes.set(title="slack, sweep by sweep", xlabel="sweeps", ylabel="slack w [m/s]", xscale="symlog")
+    beside(axes)
+
+
+def draw_r_p(axes, found):
+    """r_p against sweeps."""
+    axes.semilogy(np.maximum(found["r_p"], 1e-17), label="projected\nGauss-Seidel")
+    axes.axhline(found["clamped_r_p"], color="k", linestyle="--", label="solved, then\nclamped once")
+    axes.set(title="$r_p$ over all contacts", xlabel="sweeps", ylabel="$r_p$ [N s]")
+    beside(axes)
+
+
+def points(axes, found, key):
+    """One residual at three points, where contact 5 opens."""
+    names = ["$A^{-1}b$, which pulls" if k == "A^-1 b" else k for k in found["points"]]
+    axes.barh(names, list(found[key].values()), 0.5)
+    axes.invert_yaxis()
+
+
+def draw_ordinary(axes, found):
+    """The ordinary residual."""
+    points(axes, found, "ordinary")
+    axes.set(title="contact 5, the ordinary residual: 0 at the wrong point", xlabel="|w| [m/s]")
+
+
+def draw_projected(axes, found):
+    """The residual of the projection."""
+    points(axes, found, "projected")
+    axes.set(title="contact 5, the projected one: 0 where it opens", xlabel="$r_p$ [N s]")
+
+
+def draw_deep(axes, found):
+    """The deep box."""
+    axes.plot(1e3 * found["deep"][:, 1])
+    title = f"a box in the ground: relative residual at most {found['deep'][:, 0].max():.0e}"
+    axes.set(title=title, xlabel="step", ylabel="depth [mm]", ylim=(0, None))
+
+
+PANELS = {
+    "impulses": draw_impulses,
+    "slacks": draw_slacks,
+    "sweeps": draw_sweeps,
+    "sweeps_slack": draw_sweeps_slack,
+    "r_p": draw_r_p,
+    "ordinary": draw_ordinary,
+    "projected": draw_projected,
+    "deep": draw_deep,
+}
+
+
 def figure(found, path):
-    """Impulse and slack against sweeps; r_p; both residuals at the contact that opens; the deep box."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 9), layout="constrained")
-    grid = canvas.add_gridspec(4, 2)
-    left, middle = canvas.add_subplot(grid[0, :]), canvas.add_subplot(grid[1, :])
-    sweeps = np.arange(SWEEPS + 1)
-    for i in range(N):
-        left.plot(sweeps, found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
-        left.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
-        middle.plot(sweeps, found["slack"][:, i], color=f"C{i}", label=f"contact {i + 1}")
-    left.set(title="impulse (crosses: solved, then clamped)", ylabel="[N s]", xscale="symlog")
-    middle.set(title="slack", ylabel="[m/s]", xlabel="sweeps", xscale="symlog")
-    beside(left)
-    beside(middle)
-    curve = canvas.add_subplot(grid[2, :])
-    curve.semilogy(sweeps, np.maximum(found["r_p"], 1e-17), label="projected\nGauss-Seidel")
-    curve.axhline(found["clamped_r_p"], color="k", linestyle="--", label="solved, then\nclamped once")
-    curve.set(title="$r_p$ over all contacts", xlabel="sweeps", ylabel="[N s]")
-    beside(curve)
-    bars = canvas.add_subplot(grid[3, 0])
-    place = np.arange(len(found["points"]))
-    bars.bar(place - 0.2, list(found["ordinary"].values()), 0.4, label="|w|  [m/s]")
-    bars.bar(place + 0.2, list(found["projected"].values()), 0.4, label="$r_p$  [N s]")
-    bars.set_xticks(place, ["$A^{-1}b$" if k == "A^-1 b" else k for k in found["points"]])
-    bars.set_title("two residuals where contact 5 opens", fontsize=10)
-    bars.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, frameon=False)
-    deep = canvas.add_subplot(grid[3, 1])
-    deep.plot(1e3 * found["deep"][:, 1])
-    deep.set(xlabel="step", ylabel="depth [mm]", ylim=(0, None))
-    deep.set_title(f"a box in the ground: residual at most {found['deep'][:, 0].max():.0e}", fontsize=10)
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 
@@ -156,6 +236,12 @@ def main(path="toy_stack.png"):
     print(f"{'contact':<14}" + "".join(f"{i + 1:>9}" for i in range(N)))
     for name in ("resting", "exact", "clamped", "clamped_slack"):
         print(f"{name:<14}" + "".join(f"{x + 0.0:>9.4f}" for x in found[name]))
+    print(f"\nat rest, to {TOL:g}: largest difference from OSQP's optimum of the QP, and largest |slack|")
+    optimum = found["as_qp"]["osqp"].impulse
+    for name, solution in found["as_qp"].items():
+        apart = np.abs(solution.impulse - optimum).max()
+        still = np.abs(solution.slack).max()
+        print(f"{name:<14}{apart:>9.1e} N s{still:>9.1e} m/s   {solution.status.name.lower()}")
     for sweep in (0, 1, 4, 16, 64, SWEEPS):
         print(f"after {sweep:>3} sweeps  r_p {found['r_p'][sweep]:.2e}")
     print(

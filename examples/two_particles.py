@@ -9,20 +9,23 @@ Positions x1, x2, masses m1, m2, velocities v1*, v2* before the constraint acts.
     lambda = b / A,  b = -J v* = -n.(v2* - v1*)
 
 A is a number here; b is the speed at which the joint would come apart. Particle 1 (1 kg) stands still,
-particle 2 (3 kg) flies off at an angle. One impulse along n makes their speeds along n equal; what is across
+particle 2 (2 kg) flies off at an angle. One impulse along n makes their speeds along n equal; what is across
 stays, and so does momentum: J^T lambda adds up to zero over both. The engine's problem is the same
 number, and its pair turns about the common centre from then on.
 
     python examples/two_particles.py [FIGURE.png]
+
+A file named after a panel holds it alone: tracks.png, distance.png.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 
 import lavender as lv
 
-MASS = np.array([1.0, 3.0])  # kg
+MASS = np.array([1.0, 2.0])  # kg
 PLACE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])  # m
 SPEED = np.array([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]])  # m/s
 STEPS = 1200
@@ -69,18 +72,32 @@ def numbers():
     }
 
 
+def draw_tracks(axes, found):
+    """Where the particles go."""
+    for i in range(2):
+        axes.plot(found["track"][:, i, 0], found["track"][:, i, 1], label=f"{MASS[i]:g} kg")
+    axes.set(title="tracks", xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+def draw_distance(axes, found):
+    """The distance over time."""
+    axes.plot(1e6 * (found["apart"] - 1.0))
+    axes.set(title="distance minus 1 m", xlabel="step", ylabel="[µm]")
+
+
+PANELS = {"tracks": draw_tracks, "distance": draw_distance}
+
+
 def figure(found, path):
-    """Tracks, and the distance over time."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 3.6), layout="constrained")
-    left, right = canvas.subplots(1, 2)
-    for i in range(2):
-        left.plot(found["track"][:, i, 0], found["track"][:, i, 1], label=f"{MASS[i]:g} kg")
-    left.set(title="tracks", xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    left.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2, frameon=False)
-    right.plot(1e6 * (found["apart"] - 1.0))
-    right.set(title="distance from 1 m", xlabel="step", ylabel="[µm]")
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
     canvas.savefig(path)
 
 

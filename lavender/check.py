@@ -21,7 +21,7 @@ import numpy as np
 from lavender._later import load
 from lavender.errors import InputError, LavenderError
 from lavender.problem import Problem, check_problem
-from lavender.registry import available, get, known
+from lavender.registry import available, get, known, specs
 from lavender.residuals import FLOOR_MOST, WRONG
 from lavender.solution import Solution, Status, uninterrupted
 from lavender.solve import solve
@@ -46,7 +46,7 @@ REFUSED = "refused"
 class CrossCheckRow:
     """One solver beside the reference; numbers are None where they mean nothing."""
 
-    solver: str
+    solver: str  # as asked for
     verdict: str
     status: str = ""
     relative: float | None = None  # -, the judge's
@@ -57,6 +57,7 @@ class CrossCheckRow:
     objective: float | None = None  # J, 1/2 l.A l - b.l minus that of the reference
     time: float | None = None  # s, set-up and solve
     note: str = ""  # form, message, reason
+    ran: str = ""  # the solver that is the one asked for with bounds, where that one takes free rows alone
     solution: Solution | None = None
 
     @property
@@ -110,7 +111,8 @@ class CrossCheck:
         )  # fmt: skip
         body = [
             (
-                r.solver, r.verdict, r.status, _short(r.relative), _short(r.floor), _short(r.distance),
+                f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
+                _short(r.relative), _short(r.floor), _short(r.distance),
                 _short(r.allowed), _short(r.objective), "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
             )
             for r in self.rows
@@ -162,7 +164,8 @@ def cross_check(
     Returns
     -------
     CrossCheck
-        Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction.
+        A solver of free rows is run as the one that is the same method with bounds ("gauss_seidel → pgs"), and `ran`
+        names it. Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction.
 
     Raises
     ------
@@ -185,18 +188,20 @@ def cross_check(
     rows = []
     for name in names:
         reason = reasons[name]
-        if reason is not None:
+        other = None if reason is None else specs()[name].standing_in(problem)
+        if reason is not None and other is None:
             rows.append(CrossCheckRow(name, REFUSED, note=reason))
             continue
+        run = name if other is None else other.name
         try:
-            load(*get(name).requires)  # what the time of a first solve would hold besides
-            solution = uninterrupted(solve(problem, name, tol=tol, max_iter=max_iter, time_limit=time_limit))
+            load(*get(run).requires)  # what the time of a first solve would hold besides
+            solution = uninterrupted(solve(problem, run, tol=tol, max_iter=max_iter, time_limit=time_limit))
         except InputError:
             raise
         except LavenderError as error:  # refused only after a look at the numbers
             rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
             continue
-        rows.append(compare(problem, name, solution, optimum))
+        rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
     return CrossCheck(problem, tol, chosen, note, tuple(rows))
 
 

@@ -125,6 +125,7 @@ class SolverSpec:
     requires: tuple[str, ...] = ()  # modules that must be importable
     install: str = ""  # what to install where they are not
     bounded: str = ""  # of a solver for free rows: what to use for bounded rows
+    with_bounds: str = ""  # the solver that is this very method with bounds, for `standing_in`
     refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
     small: SmallCall | None = (
         None  # problems of few rows with default options, in one compiled call; asked of our own alone
@@ -209,6 +210,12 @@ class SolverSpec:
                 "them, or leave the rows that roll out"
             )
         return self.refusal(problem) if self.refusal is not None else None
+
+    def standing_in(self, problem: Problem) -> SolverSpec | None:
+        """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
+        other = registered.get(self.with_bounds)
+        bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
+        return other if bounds else None
 
     def load(self) -> Callable[..., Solver]:
         """The factory, imported now if it was not before."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from lavender.bench.store import Records
@@ -65,7 +66,11 @@ def _print_lost(records: Records, console: Console) -> None:
         console.print(f"{what}: {reason}", highlight=False, markup=False)
     if len(lost) > SHORT:
         console.print(f"and {len(lost) - SHORT} more, on the page", highlight=False, style="dim")
-    refused = [s for s in records.skips if s.solver]
+    pairs = [(s.reason.partition(":")[0], s) for s in records.skips if s.solver]
+    for pair, n in Counter(pair for pair, _ in pairs if " → " in pair).items():
+        said = f"{pair} on {count(n, 'case')} with bounds: the same method; the first takes free rows alone"
+        console.print(said, highlight=False, markup=False)
+    refused = [s for pair, s in pairs if " → " not in pair]
     if refused:
         console.print(
             f"{count(len(refused), 'pair')} of case and solver not run, or not to the end: the page says why",

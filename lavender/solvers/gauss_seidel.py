@@ -24,6 +24,7 @@ SPEC = SolverSpec(
     seed=True,
     max_iter=1000,
     bounded=": 'pgs' is this method with bounds",
+    with_bounds="pgs",
     summary="Gauss-Seidel iteration of a linear system",
     reference="Saad 2003, Iterative Methods for Sparse Linear Systems, section 4.1",
 )

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from lavender.cli.options import EXIT_UNMET
+
 __all__ = ["view", "web"]
 
 PORT = click.option(
@@ -73,6 +75,18 @@ def page(folder: Path) -> None:
     from lavender.web import pages
 
     click.echo(str(pages.write_page(folder, _say)))
+
+
+@web.command()
+def check() -> None:
+    """Hold both WebAssembly modules to the bits of the native kernels under Node; builds what is missing.
+
+    Needs a checkout of the project, whose tests/wasm it runs, and Node 18 or newer. Exit code 1: a bit differs.
+    """
+    from lavender.web import pages
+
+    if not pages.check(_say):
+        raise click.exceptions.Exit(EXIT_UNMET)
 
 
 @click.command()

@@ -62,15 +62,14 @@ LARGEST = 200_000
 
 @dataclass(frozen=True)
 class Part:
-    """One module of the page: its kernels, how large it may be [bytes], whether it works in the memory of the first."""
+    """One module of the page: its kernels, whether it works in the memory of the first."""
 
     modules: tuple[str, ...]
-    largest: int
     beside: bool = False
 
 
 #: Modules of the page by name; the first stands alone.
-PARTS = {"lavender": Part(MODULES, LARGEST), "newton": Part(("warm.substep",), 180_000, beside=True)}
+PARTS = {"lavender": Part(MODULES), "newton": Part(("warm.substep",), beside=True)}
 CUT: dict[str, Any] = runpy.run_path(str(Path(__file__).resolve().with_name("cut.py")))
 #: Name of the custom section with the hash of the sources, which ends the file.
 SECTION = "lavender.sources"
@@ -269,6 +268,6 @@ if __name__ == "__main__":
     try:
         for name, part in PARTS.items():
             out = Path(sys.argv[1], f"{name}.wasm")
-            print(build(out, ROOT, part.modules, largest=part.largest, beside=part.beside))
+            print(build(out, ROOT, part.modules, beside=part.beside))
     except BuildFailed as failure:
         sys.exit(str(failure))

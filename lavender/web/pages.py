@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
 from http import HTTPStatus
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import lavender_ext
@@ -17,7 +21,7 @@ from lavender.io.stored import write_bytes, write_text
 from lavender.web import compile as wasm
 from lavender.web.scenes import page_scenes
 
-__all__ = ["build_module", "module", "server", "write_page"]
+__all__ = ["build_module", "check", "module", "server", "write_page"]
 
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
@@ -30,7 +34,7 @@ def build_module(out: Path, name: str = "lavender") -> wasm.Built:
         raise InputError(f"the folder {out.resolve().parent} does not exist; make it first")
     part = wasm.PARTS[name]
     try:
-        return wasm.build(out, ROOT, part.modules, largest=part.largest, beside=part.beside)
+        return wasm.build(out, ROOT, part.modules, beside=part.beside)
     except wasm.BuildFailed as error:
         raise LavenderError(str(error)) from None
 
@@ -54,8 +58,6 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
     except LavenderError as error:
         if not str(error).startswith("cannot write"):
             raise
-    from tempfile import TemporaryDirectory
-
     with TemporaryDirectory() as folder:  # the package is read-only
         out = Path(folder, shipped.name)
         build_module(out, name)
@@ -74,6 +76,34 @@ def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> P
     except (OSError, shutil.Error) as error:
         raise InputError(f"cannot write the page into {folder}: {error}") from None
     return folder / "index.html"
+
+
+def check(say: Callable[[str], Any] = lambda text: None) -> bool:
+    """Whether the modules repeat under Node what the native kernels do, bit by bit; what it finds is printed.
+
+    Raises
+    ------
+    LavenderError
+        No checkout, no Node, or a module that is missing and cannot be built.
+    """
+    script = ROOT / "tests" / "wasm" / "check_wasm_exports.mjs"
+    if not script.is_file():
+        raise LavenderError(
+            f"{script.name} is in tests/wasm of a checkout of the project, and not in this installation: clone the "
+            "project and install it from there with pip install -e '.[wasm]'"
+        )
+    node = shutil.which("node")
+    if node is None:
+        raise LavenderError(
+            "node is not there, which runs the check: install Node 18 or newer (nodejs.org, or apt)"
+        )
+    modules = {name: module(say, name) for name in wasm.PARTS}
+    with TemporaryDirectory(prefix="lavender-web-") as folder:
+        for name, data in modules.items():
+            Path(folder, f"{name}.wasm").write_bytes(data)
+        command = [node, str(script), str(Path(folder, "lavender.wasm"))]
+        env = {**os.environ, "PYTHON": sys.executable}
+        return subprocess.run(command, env=env, check=False).returncode == 0
 
 
 def _copy(source: str, target: str) -> None:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from random_problems import spd, touching
+from rich.console import Console
 from stacks import chain, moving_stack, stack
 from worked import python
 
@@ -20,6 +21,8 @@ from lavender.bench import machine, store
 from lavender.bench.line import c_of, code_of
 from lavender.bench.record import Record, from_json, to_json
 from lavender.bench.running import runner, timing
+from lavender.report.findings import Report
+from lavender.report.terminal import print_report
 
 QUICK = bench.Plan(levels=(1e-3, 1e-8), budgets=(2, 5), repeats=2, time_limit=60.0, orders=("reverse",))
 
@@ -135,13 +138,31 @@ def test_a_solver_that_raises_costs_its_own_record(plug_in):
 
 def test_a_refused_case_and_a_file_that_does_not_load_are_named(tmp_path):
     (tmp_path / "bad.npz").write_bytes(b"not an archive")
-    records = bench.run([tmp_path, stack(4)], ["gauss_seidel"], QUICK)
+    records = bench.run([tmp_path, stack(4)], ["sor"], QUICK)
     assert len(records) == 0
     lost, refused = records.skips
     assert (lost.case, lost.solver) == ("bad", "")
     assert "bad.npz" in lost.reason
-    assert (refused.case, refused.solver) == ("stack", "gauss_seidel")
+    assert (refused.case, refused.solver) == ("stack", "sor")
     assert "lcp" in refused.reason
+
+
+def test_a_method_of_free_rows_is_measured_as_its_method_with_bounds_and_a_note_says_so(tmp_path, capsys):
+    free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
+    records = bench.run([stack(4), free], ["gauss_seidel"], QUICK)
+    assert {(r.case, r.solver) for r in records} == {("stack", "pgs"), ("free", "gauss_seidel")}
+    (moved,) = records.skips
+    assert (moved.case, moved.solver) == ("stack", "gauss_seidel")
+    assert moved.reason.startswith("gauss_seidel → pgs: takes laws linear, not 'lcp'")
+    print_report(Report(records), Console(width=100))
+    assert "gauss_seidel → pgs on 1 case with bounds" in capsys.readouterr().out
+    both = bench.run([stack(4)], ["gauss_seidel", "pgs"], QUICK)  # once, where both are named
+    assert [r.key for r in both] == [r.key for r in bench.run([stack(4)], ["pgs"], QUICK)]
+    assert "→" not in both.skips[0].reason
+    steps = bench.run(
+        bench.sequence(moving_stack(2), "load"), ["gauss_seidel"], bench.Plan((), budgets=(4,), repeats=1)
+    )
+    assert {r.solver for r in steps} == {"pgs"} and steps.skips[0].solver == "gauss_seidel"
 
 
 def test_each_record_is_on_disk_when_it_is_made(tmp_path):

@@ -33,14 +33,17 @@ def test_more_sweeps_help_in_the_first_solve_and_in_the_run(sweeps):
     assert 0.6 < ratio < 1.6
 
 
-def test_turning_the_sweeps_round_is_worth_a_factor(sweeps):
+def test_turning_the_sweeps_round_is_worth_a_factor_on_many_sweeps(sweeps):
     module, found = sweeps
     one_way, turned = found["alternation"].values()
-    for key in ("tails", "starts"):
-        assert all(3.0 * a < b < 8.0 * a for a, b in zip(one_way[key], turned[key], strict=True))
+    gain = one_way["judged"] / turned["judged"]  # windows, budgets
+    assert np.all((gain[:, :3] > 0.8) & (gain[:, :3] < 1.4))  # nothing on few sweeps
+    assert np.all(gain[:, -1] > 4.0)
     # The slow sway that 64 sweeps always the same way leave: an order of magnitude, from step 20 on.
-    one_way, turned = (by["trails"][module.ENDS[1]][20:] for by in (one_way, turned))
-    assert np.all(5.0 * turned[:, 1] < one_way[:, 1]) and np.all(3.0 * turned[:, 2] < one_way[:, 2])
+    one_way, turned = (module.run(module.ENDS[1], order)[20:] for order in found["alternation"])
+    assert np.all(5.0 * turned[:, 1] < one_way[:, 1]) and np.all(3.0 * turned[:, 5] < one_way[:, 5])
+    # The first solve is the same in both orders.
+    assert (found["first"]["alternating"] == found["first"]["bottom_up"]).all()
 
 
 def test_the_published_residual_misleads_across_orders_and_the_judge_does_not(sweeps):
@@ -99,11 +102,11 @@ def test_warm_starts_keep_their_matches_for_ten_minutes():
 def test_two_particles_agree_with_the_closed_form():
     module = example("two_particles")
     found = module.numbers()
-    assert found["impulse"] == pytest.approx(-1.5, rel=1e-15)  # -2 m/s over 4/3 kg^-1
+    assert found["impulse"] == pytest.approx(-4.0 / 3.0, rel=1e-15)  # -2 m/s over 3/2 kg^-1
     assert found["engine"] == pytest.approx(found["impulse"], rel=1e-15)
     assert found["problem"].m == 1 and found["problem"].law == "linear"
     assert found["problem"].row_name(0) == "distance 0"
-    assert found["after"][0, 0] == found["after"][1, 0] == pytest.approx(1.5, rel=1e-15)
+    assert found["after"][0, 0] == found["after"][1, 0] == pytest.approx(4.0 / 3.0, rel=1e-15)
     # A substep turns the pair by 1/240 rad: (1/240)^2 / 2 of 1 m, a fifth of the error removed each time.
     assert np.abs(found["apart"] - 1.0).max() < 5 * 0.5 / 240**2
     np.testing.assert_allclose(

@@ -2,7 +2,7 @@
 
     python tests/parity/export.py FOLDER [STEPS]
 
-The scenes and problems are those of the WebAssembly build (tests/wasm/record.py). Starts and problems are recorded as
+The scenes are those of the WebAssembly build (tests/wasm/record.py). Starts and problems are recorded as
 numbers, so that nothing that builds them is part of what is compared. Scenes start from the same bits everywhere (but
 for `pile`, whose turns NumPy draws, now and then by the logarithm of the mathematical library); the problems pass
 through NumPy's matrix products.
@@ -17,7 +17,8 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE.parent / "wasm")]
 
-from record import SCENES, STEPS, problems  # noqa: E402
+from random_problems import as_matrix, random_contact_problem, random_lcp  # noqa: E402
+from record import SCENES, STEPS  # noqa: E402
 
 import lavender as lv  # noqa: E402
 from lavender.export import engine_image, vectors  # noqa: E402
@@ -90,6 +91,25 @@ def solved(given, number):
                 yield vectors.pack(given, solver, tol, iterations, options)
             except (NotTaken, lv.CapabilityError):
                 continue
+
+
+def problems():
+    """Linear, boxed, with contacts in two and three dimensions, with spin, factored, recorded from scenes."""
+    for seed in range(40):
+        yield random_lcp(seed, m=8 + seed, rank=6 if seed % 5 == 4 else None)
+        tangents = (0, 1, 2, None)[seed % 4]
+        factored = random_contact_problem(seed, tangents=tangents, spin=seed % 3 == 0, bodies=4 + seed % 9)
+        yield factored
+        yield as_matrix(factored)
+    rng = np.random.default_rng(40)
+    for n in (1, 7, 30):
+        g = rng.normal(size=(n, n + 2))
+        yield lv.Problem.linear(g @ g.T, rng.normal(size=n), name=f"linear {n}")
+    for name in ("stack", "pyramid", "bridge"):
+        simulation = lv.Simulation(name)
+        for _ in range(5):
+            simulation.step()
+        yield simulation.constraint_problem()
 
 
 def record(folder, steps=STEPS, scenes=SCENES):

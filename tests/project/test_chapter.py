@@ -2,7 +2,8 @@
 
 Comments in the page hold the claims, section by section: a command in the first line, then `numbers | line`, the line
 as it is printed with `{}` for a number, `_` for a word, `…` for anything and blanks of any width. A number is held to
-half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise.
+half a unit of its last digit, or to a tolerance after `±` where libraries of other machines may round otherwise; `<0.1`
+holds where what is printed is less.
 `given:` lists settings and numbers of theory, `measured once:` those of another project's engine; a section has no
 further numbers but those claimed elsewhere on the page.
 """
@@ -77,6 +78,9 @@ def check(numbers, tolerance, line, text):
     found = next(filter(None, (re.fullmatch(pattern, " ".join(x.split())) for x in text.splitlines())), None)
     assert found, f"no line {line!r} in\n{text}"
     for number, shown in zip(numbers, found.groups(), strict=True):
+        if number.startswith("<"):
+            assert value(shown) < value(number[1:]), f"{number}, but {found[0]!r} is printed"
+            continue
         mantissa, _, exponent = number.replace(",", "").partition("e")
         unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
         allowed = float(tolerance) / 100.0 * value(number) if tolerance else 0.5 * unit
@@ -88,7 +92,7 @@ def check(numbers, tolerance, line, text):
 
 def claimed(by):
     """The numbers of all claims of some commands."""
-    return {number for found in by.values() for numbers, *_ in found for number in numbers}
+    return {number.lstrip("<") for found in by.values() for numbers, *_ in found for number in numbers}
 
 
 CLAIMS = claims(PAGE)[0]
@@ -108,6 +112,27 @@ def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
     assert claimed(by) | others <= stand <= claimed(CLAIMS) | others
 
 
+def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
+    shown = re.findall(r"generated/figures/(\w+)/(\w+)\.svg", PAGE)
+    assert len(shown) > 12
+    for name, panel in shown:
+        assert panel in example(name).PANELS
+        assert f"`python examples/{name}.py {panel}.png`" in PAGE
+    for name, panel in re.findall(r"`python examples/(\w+)\.py (\w+)\.png`", PAGE):
+        assert panel in example(name).PANELS
+    named = {re.match(r"python examples/(\w+)\.py", command) for command in CLAIMS}
+    for module in (example(found[1]) for found in named if found):
+        assert all(f"{panel}.png" in module.__doc__ for panel in module.PANELS)
+
+
+def test_a_file_named_after_a_panel_holds_it_alone(tmp_path):
+    module = example("two_particles")
+    module.main(str(tmp_path / "all.svg"))
+    module.main(str(tmp_path / "distance.svg"))
+    whole, alone = ((tmp_path / f"{name}.svg").read_text(encoding="utf-8") for name in ("all", "distance"))
+    assert [text.count('<g id="axes_') for text in (whole, alone)] == [len(module.PANELS), 1]
+
+
 def test_every_failure_has_a_command_that_shows_it():
     section = PAGE.partition("## Failure modes")[2].partition("\n## ")[0]
     rows = [row.strip("|").split(" | ") for row in re.findall(r"^\| .*", section, re.MULTILINE)[1:]]
@@ -119,7 +144,8 @@ def test_every_failure_has_a_command_that_shows_it():
 
 
 @pytest.mark.parametrize(
-    ("number", "shown"), [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060")]
+    ("number", "shown"),
+    [("5e-4", "8.0e-04"), ("15", "7.4"), ("45.4", "45.6"), ("0.40", "0.4060"), ("<1e-9", "1.1e-09")],
 )
 def test_the_comparison_sees_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):

@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import numpy as np
 import pytest
+from worked import python
 
 import benchmarks.__main__ as benchmarks
 import lavender as lv
@@ -79,6 +80,15 @@ def test_python_of_a_page_runs(page, files, capsys):
             exec(compile("\n" * (line - 1) + text, str(page), "exec"), names)
 
 
+def test_the_test_of_the_quick_start_passes_as_a_file_of_its_own(tmp_path):
+    (text,) = (
+        text for *_, text in blocks(ROOT / "docs" / "quickstart.md", "python") if "import pytest" in text
+    )
+    path = tmp_path / "test_mine.py"
+    path.write_text(text, encoding="utf-8")
+    assert "6 passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", path, cwd=tmp_path).stdout
+
+
 @pytest.mark.parametrize("name", list(modules_with_doctests()))
 def test_doctests_of_a_module(name):
     failures, tried = doctest.testmod(importlib.import_module(name), optionflags=FLAGS)
@@ -128,10 +138,8 @@ def test_pages_link_to_pages_that_exist():
 def test_the_chapter_names_examples_tests_and_functions_that_exist():
     text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
     examples = set(re.findall(r"python (examples/\w+\.py)", text))
-    assert len(examples) == 10
+    assert len(examples) == 12
     assert examples <= {f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")}
-    figures = set(re.findall(r"figures/example-(\w+)\.svg", text))
-    assert figures and figures <= {path.stem for path in (ROOT / "examples").glob("*.py")}
     named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text)
     assert len(named) > 12
     for file, test in named:

@@ -299,6 +299,19 @@ def test_readme_command_is_one_line_from_a_fresh_clone(name):
     assert done.stdout.count("\n") == 1
 
 
+def test_the_chapter_s_commands_are_found_in_its_own_text():
+    script = ROOT / ".ci" / "readme_command.py"
+    assert python(script, "chapter", "docs/chapter.md").stdout.startswith("python3 -m venv .venv && ")
+    commands = python(script, "--all", "docs/chapter.md").stdout.splitlines()
+    assert {
+        "lavender web check",
+        "python examples/toy_stack.py",
+        "python examples/toy_stack.py slacks.png",
+    } <= set(commands)
+    assert "lavender web" not in commands and "lavender run" not in commands
+    assert len(commands) > 35 and len(set(commands)) == len(commands)
+
+
 def test_readme_python_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert blocks

@@ -1,4 +1,4 @@
-"""Record natively what WebAssembly is to repeat: scenes step by step; and the problems of the parity table.
+"""Record natively what WebAssembly is to repeat: scenes step by step.
 
     python tests/wasm/record.py FOLDER
 
@@ -15,7 +15,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from newton_steps import NewtonSteps
-from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
 from lavender.web.scenes import describe, layout
@@ -139,25 +138,6 @@ def record_newton(writer, name, parameters, changes):
         "trace": writer.put(run.trace, "<f8"),
         "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
     }
-
-
-def problems():
-    """Linear, boxed, with contacts in two and three dimensions, with spin, factored, recorded from scenes."""
-    for seed in range(40):
-        yield random_lcp(seed, m=8 + seed, rank=6 if seed % 5 == 4 else None)
-        tangents = (0, 1, 2, None)[seed % 4]
-        factored = random_contact_problem(seed, tangents=tangents, spin=seed % 3 == 0, bodies=4 + seed % 9)
-        yield factored
-        yield as_matrix(factored)
-    rng = np.random.default_rng(40)
-    for n in (1, 7, 30):
-        g = rng.normal(size=(n, n + 2))
-        yield lv.Problem.linear(g @ g.T, rng.normal(size=n), name=f"linear {n}")
-    for name in ("stack", "pyramid", "bridge"):
-        simulation = lv.Simulation(name)
-        for _ in range(5):
-            simulation.step()
-        yield simulation.constraint_problem()
 
 
 def record(folder, steps=STEPS):

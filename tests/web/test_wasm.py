@@ -2,14 +2,17 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
 import lavender as lv
+from lavender.cli import cli
 from lavender.errors import InputError, LavenderError
 from lavender.scene import SCENES
 from lavender.web import compile as wasm
@@ -138,6 +141,40 @@ def test_a_module_that_is_too_large_is_refused(tmp_path):
     path.write_text(GOOD)
     with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
         wasm.build(tmp_path / "good.wasm", ROOT, [path], largest=10)
+
+
+@pytest.mark.parametrize("name", list(wasm.PARTS))
+def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request):
+    size = len(request.getfixturevalue({"lavender": "module", "newton": "newton_module"}[name]))
+    page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
+    assert size == pytest.approx(1000 * int(told), rel=0.03)  # compilers differ by a percent or two
+    assert size < 0.95 * wasm.LARGEST
+
+
+def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
+    monkeypatch.setattr(pages, "module", lambda say, name: name.encode())
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    with pytest.raises(LavenderError, match="in tests/wasm of a checkout"):
+        pages.check()
+    script = tmp_path / "tests" / "wasm" / CHECK.name
+    script.parent.mkdir(parents=True)
+    script.write_text("""
+import { readFileSync } from "node:fs";
+import { dirname, join } from "node:path";
+const newton = readFileSync(join(dirname(process.argv[2]), "newton.wasm"), "utf8");
+process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === "newton" && process.env.PYTHON ? 0 : 1);
+""")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(LavenderError, match=r"node is not there.*install Node 18"):
+        pages.check()
+    monkeypatch.undo()
+    if shutil.which("node") is None:
+        pytest.skip("needs Node")
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    for data, code in ((str.encode, 0), (lambda name: b"other", 1)):
+        monkeypatch.setattr(pages, "module", lambda say, name, data=data: data(name))
+        assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
 
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):

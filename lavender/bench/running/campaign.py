@@ -359,6 +359,8 @@ def _end_with(parent: int) -> None:
 class _WithoutTimes(Runner):
     """Pairs that end by iterations; the limit of a process is the only clock, for what other packages bring."""
 
+    stands_in = False  # a pair that is done holds records of its own solver alone
+
     def make(self, problem: Problem, task: Task, spec: SolverSpec, impulse: Any) -> tuple[Record, Any]:
         assert isinstance(self.plan, CampaignPlan)
         if task.mode == "tol" and task.max_iter:

@@ -107,7 +107,8 @@ def run(
     Parameters
     ----------
     cases : files, folders, names of the suite, problems; all of `lavender.suite.default()` if none
-    solvers : names; every installed one if None. One that refuses a case is skipped with its reason.
+    solvers : names; every installed one if None. One that refuses a case is skipped with its reason; where another
+        is the same method with bounds (`pgs` for `gauss_seidel`), that one is run.
     plan : Plan
     store : Store or path of a `.jsonl` file, optional
         Keeps each record when it is made; a measurement that it holds already, from the same machine,
@@ -143,6 +144,8 @@ def run(
 
 class Runner:
     """Pairs of case and solver, one after the other: what is known is not made again, what is made is kept."""
+
+    stands_in = True  # a solver of free rows is run as the one that is the same method with bounds
 
     def __init__(
         self,
@@ -226,13 +229,10 @@ class Runner:
         for _, info in steps:
             self.keep(info)
         for name in self.names:
-            spec = self.specs[name]
-            reason = next((r for item, _ in steps if (r := spec.refuses(item.problem))), None)
-            if reason:
-                self.keep(Skip(self.this.run, items[0].sequence, name, reason))
-            else:
+            spec = self.taking(items[0].sequence, name, [item for item, _ in steps])
+            if spec is not None:
                 for ask in passes(self.plan, spec):
-                    self.tell(items[0].sequence, name)
+                    self.tell(items[0].sequence, spec.name)
                     self.run_pass(steps, spec, ask)
             self.done += len(steps)
         for item in items:
@@ -285,12 +285,26 @@ class Runner:
         record, impulse = self.make(problem, task, spec, start)
         return record, None if impulse is None else (problem, impulse)
 
-    def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
+    def taking(self, case: str, name: str, given: Sequence[Item | Problem]) -> SolverSpec | None:
+        """The solver to run where `name` is asked for, the same method with bounds if it must be; None, with a note."""
         spec = self.specs[name]
-        reason = spec.refuses(problem)
-        if reason:
-            self.keep(Skip(self.this.run, info.case, name, reason))
+        for problem in (item.problem if isinstance(item, Item) else item for item in given):
+            reason = spec.refuses(problem)
+            if reason:
+                break
+        else:
+            return spec
+        other = spec.standing_in(problem) if self.stands_in else None
+        if other is not None and other.name in self.names:
+            other = None  # it runs anyway
+        self.keep(Skip(self.this.run, case, name, f"{name} → {other.name}: {reason}" if other else reason))
+        return other
+
+    def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
+        spec = self.taking(info.case, name, [problem])
+        if spec is None:
             return
+        name = spec.name
 
         def one(task: Task) -> Record:
             record = self.known.get(task.key)

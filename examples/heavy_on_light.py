@@ -1,0 +1,110 @@
+"""Failure mode: a heavy body on a light one. Each sweep leaves R/(1 + R) of the error; how soon that is all one sees.
+
+A box of 1 kg lies on the ground, a box of R kg on it, one contact row each. A Gauss-Seidel sweep sees in the lower
+row what the upper one pushed in the sweep before, so that the impulse grows to its size by one part in 1 + R:
+
+    A = [[1, -1], [-1, 1 + 1/R]],   (L + D)^-1 U has the one eigenvalue R/(1 + R) beside 0
+
+so that n sweeps leave (R/(1 + R))^n of all. In a scene each face has four corners with friction, and sweeps have to
+share the load among them first: what the judge sees rises before it falls. R/(1 + R) is a rate, which is come near to
+after some sweeps, and not what n sweeps leave.
+
+    python examples/heavy_on_light.py [FIGURE.png]
+
+A file named after a panel holds it alone: sweeps.png, rate.png.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+import lavender as lv
+
+RATIO = 100.0  # R: mass of the upper box over that of the lower one
+SWEEPS = 512
+SHOWN = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512)
+GRAVITY_STEP = 9.81 / 100.0  # m/s, gravity over one step
+
+
+def two_rows():
+    """One contact row for each box: A (2, 2) [1/kg], b (2,) [m/s]."""
+    a = np.array([[1.0, -1.0], [-1.0, 1.0 + 1.0 / RATIO]])
+    return lv.Problem.lcp(a, [GRAVITY_STEP, 0.0], name="two rows")
+
+
+def scene():
+    """First problem of the gallery's scene: eight contacts with friction."""
+    return lv.Simulation(lv.Scene("heavy_on_light", ratio=RATIO, warm_start=False)).constraint_problem()
+
+
+def history(problem):
+    """Relative residual after each sweep from 0 on."""
+    return np.array(
+        [lv.solve(problem, "pgs", tol=0, max_iter=n).residual.relative for n in range(SWEEPS + 1)]
+    )
+
+
+def numbers():
+    """Both histories."""
+    return {"one row a face": history(two_rows()), "four corners and friction": history(scene())}
+
+
+def beside(axes):
+    """The legend beside the axes, where it covers nothing."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+
+
+def draw_sweeps(axes, found):
+    """What is left after each sweep."""
+    for name, left in found.items():
+        axes.semilogy(left, label=name.replace(" and", "\nand"))
+    rate = (RATIO / (1.0 + RATIO)) ** np.arange(SWEEPS + 1)
+    axes.semilogy(rate, "k:", label="$(R/(1+R))^n$")
+    axes.set(title=f"{RATIO:g} kg on 1 kg", xlabel="sweeps n", ylabel="relative residual [-]")
+    beside(axes)
+
+
+def draw_rate(axes, found):
+    """What each sweep leaves of the one before."""
+    for name, left in found.items():
+        axes.plot(np.arange(1, SWEEPS + 1), left[1:] / left[:-1], label=name.replace(" and", "\nand"))
+    axes.axhline(RATIO / (1.0 + RATIO), color="k", linestyle=":", label="$R/(1+R)$")
+    axes.set(title="what a sweep leaves of the error", xlabel="sweeps", ylabel="factor [-]", xscale="log")
+    axes.set_ylim(0.98, 1.01)
+    beside(axes)
+
+
+PANELS = {"sweeps": draw_sweeps, "rate": draw_rate}
+
+
+def figure(found, path):
+    """Every panel below the other, or alone the one that the file is named after."""
+    from matplotlib.figure import Figure
+
+    name = Path(str(path)).stem
+    shown = [name] if name in PANELS else list(PANELS)
+    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
+    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
+        PANELS[panel](axes, found)
+    canvas.savefig(path)
+
+
+def main(path="heavy_on_light.png"):
+    """Print the table, save the figure."""
+    found = numbers()
+    rate = RATIO / (1.0 + RATIO)
+    print(f"R/(1 + R) = {rate:.4f}; what is left after n sweeps")
+    print(f"{'n':>5}{'formula':>10}" + "".join(f"{name:>28}" for name in found))
+    for n in SHOWN:
+        print(f"{n:>5}{rate**n:>10.3f}" + "".join(f"{left[n]:>28.3f}" for left in found.values()))
+    most = {name: left.max() for name, left in found.items()}
+    print(f"at most {most['four corners and friction']:.2f} on the way with four corners and friction")
+    late = found["four corners and friction"]
+    print(f"its mean factor a sweep from 64 to 256: {(late[256] / late[64]) ** (1.0 / 192.0):.4f}")
+    figure(found, path)
+    print(f"figure: {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
