@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+import numpy as np
+
 __all__ = [
+    "BREAKDOWN",
     "CapabilityError",
     "InUse",
     "InputError",
@@ -13,6 +16,7 @@ __all__ = [
     "SolveFailed",
     "SolverUnavailable",
     "UnknownName",
+    "last_words",
 ]
 
 
@@ -67,6 +71,16 @@ class CapabilityError(LavenderError):
 
 class InUse(LavenderError, RuntimeError):
     """An object that serves one thread at a time is at work for another one, or for the caller of this callback."""
+
+
+# What may end a run of numbers that are valid, and makes a result with the error as its message: arithmetic that breaks
+# down, memory that is not there, an A that is too large and was not needed before.
+BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, InputError)
+
+
+def last_words(error: BaseException) -> str:
+    """Its class and what it says."""
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 class SolveFailed(LavenderError):

@@ -20,7 +20,7 @@ import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, equal, flag, number, whole_number
 from lavender.deadline import CHUNK_TIME, Deadline
-from lavender.errors import CapabilityError, InputError, InUse, UnknownName
+from lavender.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
 from lavender.foreign import Foreign
 from lavender.outcome import (
     CONVERGED,
@@ -53,8 +53,6 @@ FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled s
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
 NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
-# Errors of arithmetic on valid numbers: they become a result with the error as its message.
-BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError)
 INTERRUPTED = Status.INTERRUPTED
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
@@ -318,8 +316,10 @@ class Prepared:
                 self.state = self.solver.prepare(problem)
             else:
                 self.state = self.solver.update(self.state, problem)
+        except InputError:
+            raise  # before the start
         except BREAKDOWN as error:
-            self.state, self._broken = None, _last_words(error)
+            self.state, self._broken = None, last_words(error)
 
 
 def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
@@ -329,10 +329,6 @@ def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Call
         return callback(done, stretch * impulse, unstretched(given, found))
 
     return call
-
-
-def _last_words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
@@ -408,9 +404,13 @@ class _Loop:
                 return claim if tell is None else tell(self.state, self.impulse, claim)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        if not all_finite(self.impulse):
+        if not all_finite(self.impulse) or (self.broken and self._is_worse_than(start_point)):
             self.impulse[:] = start_point
         return claim
+
+    def _is_worse_than(self, impulse: FloatArray) -> bool:
+        last, other = (judged(self.problem, x.copy()) for x in (self.impulse, impulse))
+        return last.relative > other.relative
 
     def _call(self, max_iter: int, time_limit: float | None) -> Claim:
         """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
@@ -418,7 +418,7 @@ class _Loop:
             return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
         except BREAKDOWN as error:
             self.broken = True
-            return Claim(NUMERICAL_ERROR, 0, {}, _last_words(error))
+            return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
 
     def run(self, max_iter: int) -> Claim:
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.

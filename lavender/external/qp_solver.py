@@ -105,7 +105,7 @@ def refusal(problem: Problem) -> str | None:
             f"needs a symmetric A; here A - A^T is {problem.asymmetry:.1e} of A "
             "(pgs takes it as it is; a Problem of (A + A^T)/2 is another problem, if that error is small enough)"
         )
-    if problem.rows is None and problem.m:
+    if problem.matrix is not None and problem.m:
         diagonal = problem.csr.diagonal()
         i = int(np.argmin(diagonal))
         if diagonal[i] < 0.0:

@@ -22,6 +22,7 @@ from lavender_ext.judge import measure
 # A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
 # rounded leave negative eigenvalues of about m 2^-53.
 SHIFT = 1e-12
+MOST_ENTRIES = 2**31  # of A, from which on 32-bit indices do not reach them
 
 
 class Operators(ProblemData):
@@ -125,7 +126,8 @@ class Operators(ProblemData):
             return self._product()
         if self.rows is not None:
             most, start, blocks = assemble.bound(self.data)
-            if most >= 2**31:
+            most = min(most, self.m**2)  # blocks that share both bodies count twice
+            if most >= MOST_ENTRIES:
                 raise InputError(
                     f"A would have up to {most} entries, more than 32-bit indices reach: "
                     "use a solver that reads rows"
@@ -136,13 +138,13 @@ class Operators(ProblemData):
 
     def _product(self) -> tuple[IntArray, IntArray, FloatArray]:
         # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.
-        y = self.whitened
-        most = float(np.sum(np.bincount(y.indices, minlength=1).astype(float) ** 2))
-        if most >= 2**31:
+        most = min(self.metric.entries_of_a + self.m, self.m**2)  # rows of no velocity have their compliance
+        if most >= MOST_ENTRIES:
             raise InputError(
                 f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
                 "J and M as they are (operator 'generalized')"
             )
+        y = self.whitened
         indptr, indices, data = assemble.gram(y.data, y.indices, y.indptr, y.shape[1], self.compliance)
         return read_only(indptr), read_only(indices), read_only(data)
 

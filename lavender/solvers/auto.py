@@ -20,6 +20,7 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender._later import load
 from lavender.deadline import Deadline
+from lavender.errors import BREAKDOWN, last_words
 from lavender.problem import OPERATORS, Problem
 from lavender.registry import SMALL_ROWS, SolverSpec
 from lavender.solution import Claim, Status
@@ -112,6 +113,8 @@ class Auto:
                 solve(log, self.plan, sweeps, state.structure)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
+        except BREAKDOWN as error:
+            log.failure = last_words(error)
         return NOTHING_TOLD
 
     def tell(self, state: State, impulse: FloatArray, claim: Claim) -> Claim:

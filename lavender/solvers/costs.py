@@ -15,7 +15,7 @@ from hashlib import sha256
 from math import inf
 from typing import Any
 
-from lavender.errors import InputError
+from lavender.errors import BREAKDOWN, InputError
 from lavender.problem import Problem
 from lavender.solvers.structure import Structure
 from lavender.solvers.weights import READ, decades, law_of, of_law, rates
@@ -227,7 +227,13 @@ class Costs:
         return self.of(name)
 
     def of(self, name: str) -> Cost:
-        """As counted."""
+        """As counted; inf where the counting breaks down."""
+        try:
+            return self._of(name)
+        except BREAKDOWN:
+            return Cost(inf, 1.0, 1.0)
+
+    def _of(self, name: str) -> Cost:
         s, r, law = self.structure, self.rates, self.law
         if name in self.planned:
             return self.planned[name]
@@ -286,6 +292,6 @@ def made(problem: Problem, tol: float) -> Plan:
     counted = sorted(((m.name, costs.of(m.name)) for m in methods), key=lambda pair: pair[1].total)
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, structure=structure_of(problem), tol=tol,
-        small=costs.structure.is_small(tol), first=(chosen.name, chosen.steps(chosen.rest)),
+        small=costs.structure.is_small(tol), first=(chosen.name, chosen.steps(chosen.rest) if chosen.rest < inf else 0),
         candidates=tuple((name, cost) for name, cost in counted if cost.total < inf),
     )  # fmt: skip

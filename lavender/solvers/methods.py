@@ -11,6 +11,7 @@ import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender.deadline import CHUNK_TIME, Deadline
+from lavender.errors import BREAKDOWN, last_words
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
@@ -68,7 +69,12 @@ class Candidate:
         if n <= 0:
             return False
         before = self.log.best
-        claim = self.turn(n)
+        try:
+            claim = self.turn(n)
+        except BREAKDOWN as error:
+            self.log.failure = last_words(error)
+            self.log.note(self.shown, Claim(Status.NUMERICAL_ERROR, 0), before)
+            return False
         self.log.note(self.shown, claim, before)
         return self.has_done(claim)
 

@@ -42,6 +42,7 @@ class SolveLog:
         )  # what impulses are judged by: as given, or A formed of it
         self.end: Callable[[], None] | None = None  # called when the clock has stopped
         self.interrupted = False
+        self.failure = ""  # what broke down, in words
         self.timed_out = False  # it ended a little before the deadline, as the rest of the time was too short
         self.best, self.impulse = np.inf, problem._start  # least relative residual, (m,) N s
         self.given: FloatArray | None = None  # (m,) N s, a start that is worse than doing nothing
@@ -152,7 +153,9 @@ class SolveLog:
             return Status.FLOOR
         if self.late:
             return Status.TIME_LIMIT
-        return Status.MAX_ITERATIONS if self.left <= 0 else Status.STALLED
+        if self.left <= 0:
+            return Status.MAX_ITERATIONS
+        return Status.NUMERICAL_ERROR if self.failure else Status.STALLED
 
     def claim(self) -> Claim:
         """The claim of the whole solve."""
@@ -161,11 +164,12 @@ class SolveLog:
         )
         if self.best <= self.tol:
             nothing = "the start is a solution"
+        message = self.message or ("" if self.failure else nothing)
         return Claim(
             Status.INTERRUPTED if self.interrupted else self.status,
             self.iterations,
             self.work,
-            self.message or nothing,
+            "; ".join(filter(None, (message, self.failure))),
             certificate=self.certificate,
             turns=tuple(self.turns),
         )

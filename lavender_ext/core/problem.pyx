@@ -240,7 +240,7 @@ cdef void point_at(blocks_t* p, generalized_t* g, const made_t* made) noexcept n
 cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
     """`Data.entries_of_a`; on (n) is scratch: rows of each tree, at its first velocity."""
     cdef int32_t b, q, rows
-    cdef double out = 0.0
+    cdef double out = 0.0, most = <double>g.m * g.m
     for b in range(g.n):
         on[b] = 0.0
     for b in range(g.n_panels):
@@ -250,7 +250,7 @@ cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
                 on[g.cols[q]] += rows
     for b in range(g.n):
         out += on[b] * on[b]
-    return out
+    return out if out < most else most
 
 
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
@@ -515,7 +515,7 @@ cdef class Data:
 
     @property
     def entries_of_a(self):
-        """Entries that A would have, of J and M: rows that share a tree meet; rows on several trees may count twice."""
+        """Entries that A has at most, of J and M: rows that share a tree meet; those that share two count twice."""
         cdef double[::1] on = np.empty(self.general.n + 1)
         return entries_of(&self.general, &on[0])
 

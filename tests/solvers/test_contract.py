@@ -16,7 +16,8 @@ from random_trees import random_general
 import lavender as lv
 from lavender import registry
 from lavender.certificates import check_certificate
-from lavender.problem import LAWS
+from lavender.problem import LAWS, operators
+from lavender.solvers import methods
 
 NAMES = sorted(registry.specs())
 HERE = [
@@ -487,3 +488,100 @@ def test_units_scale_the_result(name):
         x, y = (lv.solve(p, name, tol=1e-9, max_iter=budget(spec)) for p in (problem, scaled))
         assert (x.status, x.iterations) == (y.status, y.iterations)
         np.testing.assert_allclose(y.impulse / scale, x.impulse, atol=1e-7 * np.abs(x.impulse).max())
+
+
+BROKEN = [MemoryError("8 GB"), lv.InputError("A would have 1e10 entries"), FloatingPointError("1e400")]
+
+
+@pytest.mark.parametrize("error", BROKEN, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("name", [name for name in OURS if name != "auto"])
+def test_what_breaks_down_after_the_start_is_a_result(name, error, monkeypatch):
+    """With the best impulse so far, and never one that is worse than the start."""
+    spec = registry.get(name)
+    *_, problem = examples(spec)
+    start = 0.9 * lv.solve(problem).impulse
+    factory = spec.load()
+    runs = factory.run
+    for before in (0, 1) if spec.resumable else (0,):  # calls that end well
+        left = [before]
+
+        def run(self, state, impulse, n, tol, time_limit=None, left=left):
+            if left[0]:
+                left[0] -= 1
+                return runs(self, state, impulse, 1, tol, time_limit)
+            if not spec.resumable:
+                impulse[:] = 1e3
+            raise error
+
+        monkeypatch.setattr(factory, "run", run)
+        found = lv.solve(problem, name, impulse=start, tol=1e-12, max_iter=500)
+        if not (before and found.success):  # the first of its iterations may do
+            assert found.status is lv.Status.NUMERICAL_ERROR
+            assert found.message.endswith(str(error))
+        assert found.residual.relative <= lv.residual(problem, start).relative
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize("error", BROKEN, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkeypatch):
+    def breaks(self, n):
+        raise error
+
+    problem = random_contact_problem(3, contacts=60, bodies=20, friction="coulomb")
+    assert problem.m > registry.SMALL_ROWS
+    kinds = {methods.KINDS[name] for name in methods.KINDS}
+    for broken in [{kind} for kind in kinds] + [kinds | {methods.Resumed}]:
+        for kind in broken:
+            monkeypatch.setattr(kind, "turn", breaks)
+        found = lv.solve(problem, tol=1e-13, time_limit=limit)  # the compiled call leaves that to the others
+        ran = {turn.solver for turn in found.turns if turn.work}
+        if len(broken) == 1:
+            assert found.residual.relative <= 1e-6
+            assert ran
+        else:
+            assert found.status is lv.Status.NUMERICAL_ERROR
+            assert str(error) in found.message
+        monkeypatch.undo()
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_an_a_that_is_too_large_is_told_before_the_start_or_not_needed(name, monkeypatch):
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 4000)  # J and M have 2,700
+    spec = registry.get(name)
+    rng = np.random.default_rng(4)
+    jac, mass = rng.normal(size=(90, 15)), np.diag(rng.uniform(1.0, 2.0, 15))
+    chain = 0.2 * (np.eye(15, k=1) + np.eye(15, k=-1))
+    for friction in ("coulomb", "cone"):
+        problem = lv.Problem.from_jacobian(
+            jac, mass + chain, rng.normal(size=15), cones=lv.Cones.contacts(0.5, count=30), friction=friction
+        )
+        if spec.refuses(problem) is not None:
+            continue
+        for more in ({}, {"time_limit": 10.0}, {"tol": 1e-30}):
+            if name in ("admm", "jacobi", "direct", "lemke"):  # which read A
+                with pytest.raises(lv.InputError, match="use a solver that takes J and M"):
+                    lv.prepare(problem, name)
+            else:
+                assert lv.solve(problem, name, **more).residual.relative < 1.0
+        assert lv.explain(problem).candidates
+
+
+def test_entries_of_a_are_counted_once(monkeypatch):
+    """Rows that share all velocities of a tree meet once, not once for each of them."""
+    rng = np.random.default_rng(5)
+    jac = np.zeros((40, 30))
+    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
+    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40 + 1)
+    free = lv.Cones.free(40)
+    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
+    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
+    assert lv.redundancy(problem).rank == 1
+    twins = lv.Problem.from_jacobian(
+        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
+    )
+    assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40)
+    with pytest.raises(lv.InputError, match="J and M as they are"):
+        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()
