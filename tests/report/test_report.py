@@ -462,7 +462,7 @@ def test_built_in_problems_are_not_called_yours():
 
 
 def test_a_report_of_nothing_says_so(tmp_path):
-    records = bench.run([lv.Problem.lcp(np.eye(2), np.ones(2))], ["gauss_seidel"], bench.Plan())
+    records = bench.run([lv.Problem.lcp(np.eye(2), np.ones(2))], ["sor"], bench.Plan())
     text = report.write(records, tmp_path).read_text()
     assert "No case ran" in text
     assert "takes laws linear" in text
