@@ -11,11 +11,12 @@ import numpy as np
 from lavender._arrays import FloatArray
 from lavender.certificates import check_certificate
 from lavender.cones import ROW
+from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, in_one_call
-from lavender.residuals import FLOOR_MOST, residual
+from lavender.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import Judged, all_finite
 
 # Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
 CONVERGED = Status.CONVERGED
@@ -46,13 +47,15 @@ def finish(
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
         status = DIVERGED
-    elif status is CONVERGED and tol < relative == judged.floor:
+    elif status is CONVERGED and tol < relative == judged.floor and _meets(problem, judged, tol):
         status = DIVERGED
         message = f"{message}; beside such impulses float64 loses b".removeprefix("; ")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
-    elif problem.operator not in spec.operators and (
-        (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
+    elif (
+        problem.operator not in spec.operators
+        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor))
+        and _holds_as_formed(problem, impulse, tol)
     ):
         status = STALLED
         message = (
@@ -102,6 +105,22 @@ def finish(
             "turns": claim.turns,
         }
     )
+
+
+def _meets(problem: Problem, judged: Residual, tol: float) -> bool:
+    """Is w, as float64 has it, within tol, whatever rounding hides?"""
+    return relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+
+
+def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
+    """Within tol or at the floor of A as it was formed of the data: the difference is rounding in its forming."""
+    try:
+        formed = problem.csr_data
+    except InputError:  # too large to be formed: no solver has
+        return False
+    formed.set_start(*reference(problem))
+    found = Judged(formed, impulse)
+    return found.relative <= tol or at_floor(found.relative, found.floor)
 
 
 def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
