@@ -34,7 +34,9 @@ REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 tim
 
 AGREES = "agrees"
 AGREES_UNCOMPARED = "solved, nothing to compare with"
-PROVED = "no solution, as proved"
+PROVED = "no solution, proved"
+NEAR_NONE = "no solution within rounding"  # of the data: theirs has huge impulses, if any
+INEXACT = "no exact solution"  # a certificate holds, and others meet the tolerance
 NOT_SOLVED = "not solved"
 NOTHING = "nothing to do"
 CONTRADICTED = "claim contradicted"
@@ -101,9 +103,15 @@ class CrossCheck:
         return tuple(row for row in self.rows if row.verdict == AGREES)
 
     @property
+    def refused(self) -> tuple[CrossCheckRow, ...]:
+        """Rows of solvers that do not take the problem; their notes say why."""
+        return tuple(row for row in self.rows if row.verdict == REFUSED)
+
+    @property
     def ok(self) -> bool:
-        """No claim is contradicted."""
-        return not self.contradicted
+        """Every solver that takes the problem solves it, and agrees; False where none takes it."""
+        asked = {row.verdict for row in self.rows} - {REFUSED}
+        return bool(asked) and asked <= {AGREES, AGREES_UNCOMPARED, NOTHING}
 
     def __str__(self) -> str:
         head = (
@@ -202,6 +210,8 @@ def cross_check(
             rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
             continue
         rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
+    if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
+        rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
     return CrossCheck(problem, tol, chosen, note, tuple(rows))
 
 
@@ -268,7 +278,8 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
             name, CONTRADICTED, note=f"{solution.contradicted}; {note}".rstrip("; "), **shared
         )
     if solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
-        return CrossCheckRow(name, PROVED, note=note, **shared)
+        verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
+        return CrossCheckRow(name, verdict, note=note, **shared)
     if r.nothing_to_do and r.verdict != WRONG:
         units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
         return CrossCheckRow(name, NOTHING, note=f"{units}; {note}".rstrip("; "), **shared)

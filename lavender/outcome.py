@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
+from lavender.certificates import prove, rounded_down
 from lavender.cones import ROW
+from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, in_one_call
-from lavender.residuals import FLOOR_MOST, residual
+from lavender.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import Judged, all_finite
 
 # Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
 CONVERGED = Status.CONVERGED
@@ -46,41 +47,46 @@ def finish(
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
         status = DIVERGED
-    elif status is CONVERGED and tol < relative == judged.floor:
+    elif status is CONVERGED and tol < relative == judged.floor and _meets(problem, judged, tol):
         status = DIVERGED
-        message = f"{message}; beside such impulses float64 loses b".removeprefix("; ")
+        message = _joined(message, "beside such impulses float64 loses b")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
         status = CONVERGED
-    elif problem.operator not in spec.operators and (
-        (status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor)
+    elif (
+        problem.operator not in spec.operators
+        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor))
+        and _holds_as_formed(problem, impulse, tol)
     ):
         status = STALLED
-        message = (
-            f"{message}; its test was met only on A as it was formed, not on the given data".removeprefix(
-                "; "
-            )
-        )
+        message = _joined(message, "its test was met only on A as it was formed, not on the given data")
     if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
         status = FLOOR
-    certificate = claim.certificate
+    certificate, bound, contradicted = claim.certificate, None, ""
     if status is INFEASIBLE and relative <= tol:
         # What meets tol is a solution to tol, whatever can be said of an exact one.
-        status, certificate = CONVERGED, None
-        message = f"{message}; the impulse meets tol nevertheless".removeprefix("; ")
-    contradicted = ""
+        status = CONVERGED
+        message = _joined(message, "the impulse meets tol nevertheless")
+    elif status is INFEASIBLE and certificate is None:
+        contradicted = "says INFEASIBLE, no certificate was given"
+    elif status in (INFEASIBLE, STALLED) and certificate is not None:
+        proof = prove(problem, certificate, tol)
+        certificate, bound = proof.y, proof.impulse_bound or None
+        if status is INFEASIBLE and not proof.reason:
+            message = _joined(message, proof.words)
+        elif bound == math.inf:
+            status, message = STALLED, _joined(message, proof.reason)
+        elif status is INFEASIBLE:
+            contradicted = f"says INFEASIBLE, {proof.reason}"
+        elif bound is not None and bound > np.abs(impulse).sum():
+            message = _joined(message, f"every solution has an impulse of at least {rounded_down(bound)} N s")
     if status is CONVERGED and not relative <= tol:
         contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
     elif status is FLOOR and not judged.at_floor:
         least = min(2.0 * judged.floor, FLOOR_MOST)
         contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
-    elif status is INFEASIBLE:
-        reason = (
-            "no certificate was given" if certificate is None else check_certificate(problem, certificate)
-        )
-        contradicted = f"says INFEASIBLE, {reason}" if reason else ""
     if status is MAX_ITERATIONS:
         way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
-        message = "; ".join(filter(None, (message, way)))
+        message = _joined(message, way)
     impulse.setflags(write=False)
     return Solution.of(
         {
@@ -96,12 +102,34 @@ def finish(
             "message": message,
             "history": history,
             "dual": claim.dual,
-            "certificate": certificate,
+            "certificate": certificate if status is INFEASIBLE else None,
+            "impulse_bound": bound,
             "contradicted": contradicted,
             "sweeps_per_decade": sweeps_per_decade,
             "turns": claim.turns,
         }
     )
+
+
+def _joined(message: str, more: str) -> str:
+    """Both, where the message does not say so already: a record's was told by the solution that it was made of."""
+    return message if more in message else f"{message}; {more}".removeprefix("; ")
+
+
+def _meets(problem: Problem, judged: Residual, tol: float) -> bool:
+    """Whether w, as float64 has it, is within tol, whatever rounding hides."""
+    return relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+
+
+def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
+    """Within tol or at the floor of A as it was formed: what the given data add is rounding in its forming."""
+    try:
+        formed = problem.csr_data
+    except InputError:  # too large to be formed: no solver has
+        return False
+    formed.set_start(*reference(problem))
+    found = Judged(formed, impulse)
+    return found.relative <= tol or at_floor(found.relative, found.floor)
 
 
 def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
@@ -115,8 +143,8 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
     )
 
 
-def decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, FloatArray] | None:
-    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none."""
+def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
+    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
     cones = problem.cones
     for i in problem.metric.empty:
         block = problem.block_of(int(i))
@@ -131,7 +159,7 @@ def decide_empty_rows(problem: Problem, impulse: FloatArray) -> tuple[str, Float
             continue
         y = np.zeros(problem.m)
         y[i] = math.copysign(1.0, b)
-        if check_certificate(problem, y) is not None:
-            continue  # its products vanish or overflow, but it is not zero
+        if prove(problem, y, tol).reason:
+            continue  # its products vanish or overflow, but it is not zero; or b is dust
         return f"{problem.row_name(int(i))}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
     return None

@@ -58,7 +58,7 @@ class Claim:
     message: str = ""
     form: str = ""  # which formulation ran, where there is a choice
     dual: Any = None  # the backend's own multipliers, as it returned them
-    certificate: FloatArray | None = None  # (m,), with INFEASIBLE
+    certificate: FloatArray | None = None  # (m,), with INFEASIBLE; with STALLED a direction that is none
     turns: tuple[Turn, ...] = ()  # of a solver that hands over to others
 
 
@@ -133,6 +133,9 @@ class Solution:
         A backend's own multipliers.
     certificate : (m,), or None
         With INFEASIBLE: the proof that there is no solution.
+    impulse_bound : float or None, N s
+        With a certificate: the least sum of |impulse| of every solution of the problem as it was given; inf where it
+        has none. Also of STALLED, where a solver met a direction that shows such a bound.
     contradicted : str
         Why the judge disagrees with `status`; empty if it agrees.
 
@@ -160,6 +163,7 @@ class Solution:
     history: History | None
     dual: Any
     certificate: FloatArray | None  # (m,), with INFEASIBLE
+    impulse_bound: float | None  # N s, with a certificate: the least sum |impulse| of every solution
     contradicted: str  # why the judge disagrees with `status`; empty where it does not
     # of the last checks, in which the residual falls tenfold; NaN where it did not fall, or no sweeps were checked
     sweeps_per_decade: float

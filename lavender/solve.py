@@ -276,7 +276,7 @@ class Prepared:
     def _run(self, loop: _Loop, max_iter: int) -> Solution:
         spec, problem = self.spec, self.problem
         setup_time, self.setup_time = self.setup_time, 0.0
-        proof = decide_empty_rows(problem, loop.impulse)
+        proof = decide_empty_rows(problem, loop.impulse, loop.tol)
         if proof is not None:
             claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         elif self._broken:
@@ -556,6 +556,7 @@ def rest_of(
         "history": None,
         "dual": None,
         "certificate": None,
+        "impulse_bound": None,
         "contradicted": "",
         "sweeps_per_decade": math.nan,
         "turns": claim.turns,

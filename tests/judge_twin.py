@@ -18,6 +18,7 @@ import numpy as np
 L = np.longdouble
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = 0, 1, 2, 3, 4, 5, 7
 NORMAL = L(2.0) ** -1022
+U = L(2.0) ** -53
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
 LARGEST = L(1.7976931348623157e308)  # of an impulse in float64
@@ -97,6 +98,7 @@ class Problem:
         self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
         self.cones.setdefault("rolling", np.zeros(len(self.cones["kind"])))
         self.law = spec["friction"]
+        self.half = None  # of J and M, or of bodies: J M^-1/2 (m, any)
         self.m = len(self.b)
         self.stretch = self._stretch()
         self.roundings = self.m + 20
@@ -183,7 +185,12 @@ class Problem:
             minv[i, [0, 1, 2], [0, 1, 2]] = r["inv_mass"][i]
             minv[i, 3:, 3:] = np.array(r["inv_inertia"][i], L)
         minv_size = np.abs(minv)
-        soft = np.array(spec.get("compliance", np.zeros(m)), L)
+        soft = self.soft = np.array(spec.get("compliance", np.zeros(m)), L)
+        root = np.zeros((n, 6, 6), L)
+        for i in range(n):
+            value, vector = np.linalg.eigh(minv[i].astype(float))
+            root[i] = vector * np.sqrt(np.maximum(value, 0.0))
+        self.half = self.stretch[:, None] * np.einsum("mni,nij->mnj", jac, root).reshape(m, 6 * n)
         self.jac = jac.reshape(m, 6 * n)
         half = np.einsum("mni,nij->mnj", jac, minv)
         half_size = np.einsum("mni,nij->mnj", size, minv_size)
@@ -213,6 +220,7 @@ class Problem:
                 lower[i, j] = (mass[i, j] - lower[i, :j] @ lower[j, :j]) / lower[j, j]
             lower[i, i] = np.sqrt(mass[i, i] - lower[i, :i] @ lower[i, :i])
             y[:, i] = (jac[:, i] - y[:, :i] @ lower[i, :i]) / lower[i, i]
+        self.half, self.soft = y, soft
         self.A = y @ y.T + np.diag(soft)
         self.size = np.abs(y) @ np.abs(y.T) + np.diag(soft)
         d = np.diag(self.A).copy()
@@ -436,10 +444,20 @@ class Problem:
 
     # -- no solution -------------------------------------------------------------------------------
 
+    def _rounds(self, y, z, share):
+        """(m,) where rounding of the data by `share` explains A^T y: of A by its rows, of J as a whole; never of R."""
+        length = np.sqrt(self.d)
+        size = length @ np.abs(y)
+        if self.half is None:
+            return np.abs(z) <= share * length * size
+        r = self.half.T @ y
+        return (self.soft * y == 0) & (np.sqrt(r @ r) <= share * size)
+
     def refutes(self, y):
         """Why y (m,) does not prove that there is no solution, or None where it does.
 
-        Wanted: y in the recession cone of the bounds, and b.y > max (A^T y).lambda over the bounds.
+        Wanted: y in the recession cone of the bounds, and b.y > max (A^T y).lambda over the bounds, for data
+        within rounding of these.
         """
         y = np.array(y, L)
         if y.shape != (self.m,) or not np.isfinite(y).all():
@@ -449,8 +467,8 @@ class Problem:
         gain, most = self.b @ y, np.abs(self.b) @ np.abs(y)
         if not gain > 0:
             return "b.y is not positive"
-        z, scale = self.A.T @ y, self.size.T @ np.abs(y)
-        z = np.where(np.abs(z) <= L(1e-9) * (gain / most) * scale, ZERO, z)
+        z = self.A.T @ y
+        z = np.where(self._rounds(y, z, min(L(4.0) * (self.m + 2) * U, L(1e-9) * gain / most)), ZERO, z)
         pull = ZERO
         for k in range(len(c["kind"])):
             part = slice(c["ptr"][k], c["ptr"][k + 1])

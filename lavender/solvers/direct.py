@@ -356,7 +356,7 @@ class _Run:
             return None
         y = y / size
         y[np.abs(y) < 1e-13] = 0.0
-        if check_certificate(self.problem, y) is not None:
+        if check_certificate(self.problem, y, self.tol) is not None:
             return None
         self.notes.append("no impulse meets every row: certificate found")
         return self.claim(Status.INFEASIBLE, certificate=y)

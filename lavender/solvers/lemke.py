@@ -90,8 +90,8 @@ class Lemke:
             code = paths.run(min(chunk, max_iter - paths.pivots))
             if code == RAY:
                 message = "ended on a secondary ray"
-                certificate = _certificate(state.problem, paths.ray)
-            if certificate is not None:
+                certificate = _direction(paths.ray)
+            if certificate is not None and check_certificate(state.problem, certificate, tol) is None:
                 status, message = Status.INFEASIBLE, f"{message}: no impulse meets every row"
             elif code == DONE and rows.relative <= tol:
                 status, message = Status.CONVERGED, ""
@@ -107,12 +107,10 @@ class Lemke:
             return Claim(status, paths.pivots, work, message, form="dense", certificate=certificate)
 
 
-def _certificate(problem: Problem, y: FloatArray) -> FloatArray | None:
-    """The direction y (m,) of a ray, its largest entry 1, where it proves that there is no solution."""
+def _direction(y: FloatArray) -> FloatArray | None:
+    """The direction y (m,) of a ray, its largest entry 1."""
     size = np.abs(y).max(initial=0.0)
-    if not 0.0 < size < np.inf or check_certificate(problem, y / size) is not None:
-        return None
-    return y / size
+    return y / size if 0.0 < size < np.inf else None
 
 
 def _refusal(problem: Problem) -> str | None:

@@ -233,7 +233,7 @@ def _turns(
     `again`: on from where an earlier call has stopped; `more`: a later one may go on from where this one stops.
     """
     deadline = Deadline(time_limit)
-    solve, certificate = system.solve, None
+    solve, certificate, proven = system.solve, None, False
     late = interrupted = False
     last = max_iter + (solve.factorisations if again else 0)
     if not again:
@@ -255,10 +255,9 @@ def _turns(
                 system.took(watch.seconds / (solve.factorisations - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
-                if check_certificate(problem, certificate) is None:
+                proven = check_certificate(problem, certificate, tol) is None
+                if proven:
                     solve.prove()
-                else:
-                    certificate = None
             elif end != OUTCOMES["more"] or (more and solve.factorisations >= last):
                 break
     except KeyboardInterrupt:
@@ -268,15 +267,15 @@ def _turns(
     solve.take(impulse)
     if interrupted:
         return Status.INTERRUPTED, None
-    if certificate is not None:
+    if proven:
         return Status.INFEASIBLE, certificate
     if end == OUTCOMES["more"]:
         return Status.MAX_ITERATIONS, None
     if end == OUTCOMES["spent"]:
         if more and not late:
-            return Status.STALLED, None  # none may follow
+            return Status.STALLED, certificate  # none may follow
         return (Status.TIME_LIMIT if late and solve.factorisations < last else Status.MAX_ITERATIONS), None
-    return _ENDS[end], None
+    return _ENDS[end], certificate
 
 
 def _refusal(problem: Problem) -> str | None:

@@ -216,7 +216,7 @@ class ThroughRows:
             status = Status.FLOOR
         elif status is Status.INFEASIBLE and claim.certificate is not None:
             proof = _whole(form.back @ claim.certificate)
-            if check_certificate(form.problem, proof) is not None:
+            if check_certificate(form.problem, proof, tol) is not None:
                 status, proof = Status.STALLED, None
                 words += ": of the friction as rows, which proves nothing of the problem itself"
         elif status in (Status.CONVERGED, Status.FLOOR):

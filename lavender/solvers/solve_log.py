@@ -50,6 +50,7 @@ class SolveLog:
         self.work: dict[str, int] = {}
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
+        self.direction: FloatArray | None = None  # (m,) one that is none, but bounds the impulses
         self.pace = 0.0  # measured time / counted time, under a time limit; 0: not known
 
     def offer(self, impulse: FloatArray) -> float:
@@ -80,8 +81,13 @@ class SolveLog:
         for kind, count in claim.work.items():
             self.work[kind] = self.work.get(kind, 0) + count
         self.turns.append(Turn(name, dict(claim.work), before, self.best))
-        if claim.certificate is not None and check_certificate(self.problem, claim.certificate) is None:
+        if (
+            claim.certificate is not None
+            and check_certificate(self.problem, claim.certificate, self.tol) is None
+        ):
             self.certificate = claim.certificate
+        elif claim.certificate is not None:
+            self.direction = claim.certificate
         if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
 
@@ -170,7 +176,7 @@ class SolveLog:
             self.iterations,
             self.work,
             "; ".join(filter(None, (message, self.failure))),
-            certificate=self.certificate,
+            certificate=self.direction if self.certificate is None else self.certificate,
             turns=tuple(self.turns),
         )
 

@@ -1,14 +1,23 @@
 """What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import FORMS, arrays_of, nearly_singular, random_contact_problem, random_lcp
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    arrays_of,
+    as_matrix,
+    nearly_singular,
+    random_contact_problem,
+    random_lcp,
+)
 
 import lavender as lv
-from lavender import registry
+from lavender import registry, suite
 
 #: Its solution, 1e310, is no number, and so the error of every impulse is infinite.
 FLOORLESS = lv.Problem.linear(1e-310 * np.eye(2), [1.0, 1.0])
@@ -128,7 +137,9 @@ def test_a_solver_that_does_nothing_is_stopped(plug_in):
 # -- the problem is out of reach ----------------------------------------------------------------------
 
 
-GIVEN = FORMS | {"dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), guess=np.zeros(p.m))}
+GIVEN = FORMS | {
+    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
+}
 
 
 def given_by(form):
@@ -194,6 +205,81 @@ def test_a_verdict_on_another_problem_is_not_taken(plug_in):
 
 
 # -- plug-ins that lie --------------------------------------------------------------------------------
+
+#: What a solver may return in place of the answer, of (problem, answer): each with a claim of success.
+LIARS = {
+    "constant": lambda p, x: np.full(p.m, 1000.0),
+    "runs away": lambda p, x: np.full(p.m, 1e18),
+    "clamp forgotten": lambda p, x: np.linalg.lstsq(p.dense(), p.b, rcond=None)[0],
+    "sign flipped": lambda p, x: -x,
+    "one row wrong": lambda p, x: x * np.where(np.arange(p.m) == np.abs(x).argmax(), 1.01, 1.0),
+    "stops early": lambda p, x: (1.0 - 1e-4) * x,
+}
+
+
+def laws():
+    """One problem of rows for every law."""
+    free = random_contact_problem(31, contacts=0, joints=9)
+    ends = np.full(free.m, np.inf)
+    yield replace(free, cones=replace(free.cones, lower=-ends, upper=ends))
+    yield random_contact_problem(32, tangents=0, spin=False)
+    yield from (make(33, law) for make in CONTACTS.values() for law in ("coulomb", "cone"))
+
+
+@pytest.mark.parametrize("form", GIVEN)
+@pytest.mark.parametrize("status", [lv.Status.CONVERGED, lv.Status.FLOOR])
+def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
+    """A matrix is what docs/plugin.md shows; that A was formed of bodies, or of J and M, excuses rounding alone."""
+    seen = set()
+    for rows in laws():
+        problem = GIVEN[form](replace(rows, compliance=rows.compliance + 0.3))
+        answer = lv.solve(problem, tol=1e-12)
+        assert answer.residual.relative <= 1e-11
+        seen.add(problem.law)
+        for name, lie in LIARS.items():
+            if problem.law == "linear" and name == "clamp forgotten":
+                continue  # nothing is to be clamped: this is the answer
+            told = lie(problem, answer.impulse)
+
+            def run(_, impulse, told=told):
+                impulse[:] = told
+                return says(status)
+
+            liar = plug_in(run, operators={"matrix"}, rolling=True, boxes={"coulomb", "cone"})
+            solution = lv.solve(problem, liar)
+            assert solution.contradicted, (problem, name, str(solution))
+    assert seen == {"linear", "lcp", "coulomb", "cone"}
+
+
+@pytest.mark.parametrize("form", GIVEN)
+def test_nobody_honest_is_accused(form, plug_in):
+    """Who solves A as it was formed is excused by rounding in its forming, at any ratio of masses."""
+    for ratio in ("1", "1e4", "1e8"):
+        rows = suite.case(f"box_stack(n=3, mass_ratio={ratio})").problem
+        problem = GIVEN[form](rows)
+
+        def run(given, impulse):
+            found = lv.solve(as_matrix(given), tol=1e-10)
+            impulse[:] = found.impulse
+            return says(found.status)
+
+        for name in (plug_in(run, operators={"matrix"}), *lv.available(problem, external=False)):
+            solution = lv.solve(problem, name, tol=1e-10)
+            assert not solution.contradicted, (ratio, str(solution))
+
+
+def test_the_command_of_a_check_fails_on_a_liar(plug_in, capsys):
+    from lavender.cli import main
+
+    def run(_, impulse):
+        impulse[:] = 1000.0
+        return says(lv.Status.CONVERGED)
+
+    liar = plug_in(run, operators={"matrix"})
+    with pytest.raises(SystemExit) as end:
+        main(["check", "granular(n=3)", "--solvers", liar])
+    assert end.value.code == 1
+    assert "1 claims are contradicted" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("form", GIVEN)

@@ -342,7 +342,7 @@ def test_a_sum_that_rounds_to_zero_proves_nothing():
         if not proves:
             assert lv.residual(problem, met).relative < 2e-9
     for jac, proves in (([[1.0], [-1.0]], True), ([[1.0], [2.0**-30 - 1.0]], False)):
-        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-8]
+        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-10]
         opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
         assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
 
