@@ -1,18 +1,18 @@
 """Problems in generalised coordinates, one or many, one after the other without the interpreter: prepare, solve, judge.
 
 The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. What
-does not end below tol on the judge's own measure, has empty rows or is counted to cost more than is asked for, is left
-to the caller.
+does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
+asked for, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
-from libc.math cimport log10
+from libc.math cimport INFINITY, fabs, log10, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport COULOMB, blocks_t, has_friction
+from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
@@ -101,13 +101,38 @@ cdef inline bint is_cheap(const job_t* j, const limits_t* l, double tol, double 
     return cost <= l.most and (j.p.n_rows <= l.rows or cost <= others_cost(j, l, tol, sweep, w))
 
 
+cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
+    """Rows of zeros at the bound that b asks for, as `decide_empty_rows` of lavender/outcome.py.
+
+    0 where that is infinite and b alone is above tol, or where A_ii is 0 only because products of small numbers vanish.
+    """
+    cdef const blocks_t* p = &j.p
+    cdef int32_t i, k, q
+    cdef double bound
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not j.made.empty[k]:
+                continue
+            for q in range(j.g.jptr[k], j.g.jptr[k + 1]):
+                if j.g.jval[q] != 0.0:
+                    return False
+            if p.b[k] == 0.0 or (p.kind[i] != ROW and k > p.ptr[i]):
+                continue                                # asks nothing: tangents and spin have bounds of mu lambda_n
+            bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
+            if fabs(bound) < INFINITY:
+                j.lam[k] = bound
+            elif fabs(p.b[k]) * sqrt(p.nu[k] / p.d[k]) > tol * j.begin[1]:
+                return False
+    return True
+
+
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n)
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
         return
-    if j.made.n_empty or not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
+    if not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
         return
     if j.begin[0] < 0.0:
         begin(j, room.real)
@@ -119,6 +144,8 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     furnish(&f, &need, room.real)
     if j.cold:
         do_nothing(&j.p, j.lam, j.both)
+    if j.made.n_empty and not settle_empty_rows(j, tol):
+        return
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
@@ -187,8 +214,8 @@ cdef class Limits:
 def solve_first(Data p, start, double tol, Limits limits):
     """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
 
-    What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, has empty rows or costs
-    more than the limits (`limits_t`) let in. d, Y and the error of doing nothing stay with the data.
+    What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, an empty row cannot be
+    met or it costs more than the limits (`limits_t`) let in. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL)

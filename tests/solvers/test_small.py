@@ -87,15 +87,30 @@ def draw(kind, seed):
     if kind.startswith("matrix"):
         return as_matrix(draw("rows " + kind.split()[1], seed))
     law = kind.split()[1]
+    if kind.startswith("hollow"):
+        return hollow(random_general(seed, law, n=8, compliance=seed % 3 > 0), rng)
     tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
     return random_general(
         seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents
     )
 
 
+def hollow(problem, rng):
+    """Some of its rows of A all zero: rows of J, and the compliance of these."""
+    general, soft = problem.generalized, problem.compliance.copy()
+    jac = general.jac.toarray()
+    rows = rng.random(problem.m) < 0.3
+    jac[rows] = soft[rows] = 0.0
+    target = np.where(rows, rng.choice([-1.0, -1e-3, 0.0, 0.2], problem.m), problem.b)
+    return lv.Problem.from_jacobian(
+        jac, general.mass, general.v_free, target=target + jac @ general.v_free, cones=problem.cones,
+        compliance=soft, friction=problem.friction,
+    )  # fmt: skip
+
+
 KINDS = (
     "lcp", "linear", "singular", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone",
-    "general coulomb", "general cone",
+    "general coulomb", "general cone", "hollow coulomb", "hollow cone",
 )  # fmt: skip
 
 
@@ -113,6 +128,22 @@ def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
         check(problem, solver, tol=tol, impulse=near)
         check(problem, solver, tol=tol, impulse=np.zeros(problem.m))
         check(replace(problem, guess=near, copy=False), solver, tol=tol)
+
+
+def test_rows_of_zeros_leave_a_small_problem_to_the_one_call():
+    """Bounded rows of a walking robot's plan: the first of each bound hangs on nothing that is to be found."""
+    solved = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        jac = np.vstack([np.zeros(6), rng.normal(size=(9, 6))])
+        problem = lv.Problem.from_jacobian(
+            jac, np.eye(6), rng.normal(size=6), target=np.r_[-0.1, -np.ones(9)],
+            cones=lv.Cones.bounded(np.zeros(10), np.full(10, np.inf)),
+        )  # fmt: skip
+        found = AUTO.solve(problem, None, 1e-6)
+        solved += found is not None
+        assert lv.solve(problem).success
+    assert solved == 20
 
 
 @pytest.mark.parametrize("name", suite.families())
