@@ -54,7 +54,7 @@ def draw_judged(axes, found):
     """What the judge of all rows says."""
     for i, (name, by) in enumerate(found.items()):
         axes.semilogy(np.arange(1, STEPS + 1), by["relative"], f"C{i}", label=name)
-    axes.set(title="all rows, by the judge", xlabel="step", ylabel="relative residual [-]")
+    axes.set(title="all rows, by the judge", xlabel="step", ylabel="relative residual [-]", ylim=(1e-7, 3))
     beside(axes)
 
 
@@ -63,7 +63,9 @@ def draw_normals(axes, found):
     for i, (name, by) in enumerate(found.items()):
         shown = np.where(by["normals"] > 0.0, by["normals"], np.nan)
         axes.semilogy(np.arange(1, STEPS + 1), shown, f"C{i}", label=name)
-    axes.set(title="the normals alone, as published", xlabel="step", ylabel="max $|e_n|$ [N s]")
+    axes.set(
+        title="the normals alone, as published", xlabel="step", ylabel="max $|e_n|$ [N s]", ylim=(1e-7, 1)
+    )
     beside(axes)
 
 

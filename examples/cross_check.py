@@ -44,7 +44,12 @@ def numbers():
 
 def apart(axes, table):
     """Distance of each solver, and how far its residual lets it be."""
-    names = [f"{row.solver} → {row.ran}" if row.ran else row.solver for row in table]
+    said = {table.reference: " (the reference)"}
+    names = [
+        (f"{row.solver} → {row.ran}" if row.ran else row.solver)
+        + said.get(row.solver, "" if row.verdict == "agrees" else f" ({row.verdict})")
+        for row in table
+    ]
     place = range(len(names))
     axes.semilogx([max(row.distance, 1e-17) for row in table], place, "o", label="distance")
     axes.semilogx([row.allowed for row in table], place, "k|", markersize=10, label="allowed")

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import EXIT_UNMET
-
 __all__ = ["view", "web"]
 
 PORT = click.option(
@@ -86,7 +84,7 @@ def check() -> None:
     from lavender.web import pages
 
     if not pages.check(_say):
-        raise click.exceptions.Exit(EXIT_UNMET)
+        raise click.exceptions.Exit(1)
 
 
 @click.command()
