@@ -6,13 +6,14 @@ differs is what was declared.
 
     python examples/what_a_row_costs.py [FIGURE.png]
 
-The time of one declaration: lavender run stack --set n=20 --iterations 64 --set friction=0
+A file named after a panel holds it alone: step.png, row.png. One of these stacks by itself:
+
+    lavender run stack --set n=20 --iterations 64 --set friction=0
 """
 
 import sys
+from pathlib import Path
 from time import perf_counter
-
-import numpy as np
 
 import lavender as lv
 
@@ -45,32 +46,51 @@ def numbers():
     return found
 
 
+def least(found):
+    """The least time of a step [s] by what is declared: what else ran on the machine only adds to it."""
+    return {name: min(one["times"]) for name, one in found.items()}
+
+
+def draw_step(axes, found):
+    """Time of a step."""
+    times = least(found)
+    axes.barh(list(times), [1e3 * t for t in times.values()], color="C4")
+    for name, one in found.items():
+        axes.text(0.0, name, f"  {one['rows']} rows", va="center", color="white")
+    axes.set(title=f"a step of {BOXES} boxes, {SWEEPS} sweeps", xlabel="time [ms]")
+    axes.invert_yaxis()
+
+
+def draw_row(axes, found):
+    """The same for each row and sweep."""
+    sweeps = SWEEPS * lv.Scene("stack").parameters.substeps
+    times = {name: 1e9 * t / (found[name]["rows"] * sweeps) for name, t in least(found).items()}
+    axes.barh(list(times), list(times.values()), color="C2")
+    axes.set(title="the same for each row and sweep", xlabel="time [ns]")
+    axes.invert_yaxis()
+
+
+PANELS = {"step": draw_step, "row": draw_row}
+
+
 def figure(found, path):
-    """Time a step and time a row."""
+    """Every panel below the other, or alone the one that the file is named after."""
     from matplotlib.figure import Figure
 
-    canvas = Figure(figsize=(8, 4), layout="constrained")
-    left, right = canvas.subplots(1, 2, sharey=True)
-    names = list(found)[::-1]
-    least = np.array([1e3 * min(found[name]["times"]) for name in names])  # ms
-    rows = np.array([found[name]["rows"] for name in names])
-    left.barh(names, least, color="C4")
-    left.set(title=f"a step of {BOXES} boxes, {SWEEPS} sweeps", xlabel="time [ms]")
-    for i, n in enumerate(rows):
-        left.text(0.02 * least.max(), i, f"{n} rows", va="center", color="white")
-    right.barh(names, 1e6 * least / (rows * SWEEPS * lv.Scene("stack").parameters.substeps), color="C2")
-    right.set(title="the same for each row and sweep", xlabel="time [ns]")
+    shown = [draw] if (draw := PANELS.get(Path(str(path)).stem)) else list(PANELS.values())
+    canvas = Figure(figsize=(8, 3 * len(shown)), layout="constrained")
+    for axes, draw in zip(canvas.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
+        draw(axes, found)
     canvas.savefig(path)
 
 
 def main(path="what_a_row_costs.png"):
     """Print the table, save the figure."""
     found = numbers()
-    plain = min(found["friction"]["times"])
+    times = least(found)
     print(f"{'declared':<26}{'rows':>6}{'ms a step':>12}{'of friction alone':>20}")
-    for name, one in found.items():
-        least = min(one["times"])
-        print(f"{name:<26}{one['rows']:>6}{1e3 * least:>12.3f}{least / plain:>20.2f}")
+    for name, t in times.items():
+        print(f"{name:<26}{found[name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}")
     figure(found, path)
     print(f"figure: {path}")
 
