@@ -244,7 +244,9 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
                 while some := list(itertools.islice(calls, ROUND)):
                     yield from parallel(some)
                 return
-            with _deaf():
+            with (
+                _deaf() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext()
+            ):  # not on Windows
                 found = parallel(calls)
             yield from found
         except lost:
@@ -254,9 +256,6 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
     """Processes that begin here hear no Ctrl-C, which a terminal sends to all; this one does, and ends them."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
     from joblib.externals.loky.backend import resource_tracker as lokys
 
     for tracker in (
