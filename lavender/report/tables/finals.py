@@ -104,7 +104,7 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
     return [f for f in found if (f.line.solver, *sorted(f.runs)) in whole]
 
 
-STARTS = {"cold": "cold", "carried": "warm from the step before", "warm": "from its guess"}
+STARTS = {"cold": "cold", "carried": "warm from the step before"}
 WAYS = {"call": "one call", "steps": "a step in its loop", "batch": "a problem of a batch"}
 
 
