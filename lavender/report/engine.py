@@ -59,7 +59,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 numbers = [float(entry[name]) for name in _NUMBERS]
                 early = entry["verdict"] != AT_FLOOR if entry.get("precision") == "float32" else None
                 found.append((*numbers, early, str(entry["solver"])))
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue
         if not found:
             continue
