@@ -49,10 +49,11 @@ def run(steps=STEPS):
         problem = lv.io.from_drake(made, context)
         if problem.m:
             solution = lv.solve(problem, tol=1e-9)
-            apart = np.abs(problem.velocity(solution.impulse) - problem.velocity(problem.guess)).max()
-            theirs = lv.residual(problem, problem.guess).relative
+            sap = lv.io.drake.impulse(made, context)
+            apart = np.abs(problem.velocity(solution.impulse) - problem.velocity(sap)).max()
+            theirs = lv.residual(problem, sap).relative
             found.append((theirs, solution.residual.relative, apart))
-    force = problem.guess.reshape(-1, 3)[:, 0].sum() / DT
+    force = sap.reshape(-1, 3)[:, 0].sum() / DT
     return np.array(found), float(force)
 
 

@@ -62,7 +62,7 @@ def solve_many(
     UnknownName, CapabilityError, SolverUnavailable
         As `solve`, for the first problem that is refused.
     KeyboardInterrupt
-        Ctrl-C.
+        Ctrl-C; a thread ends the problem that it has in hand.
     """
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")

@@ -21,7 +21,7 @@ from lavender._derived import cached_property
 from lavender.bench.record import CaseInfo, file_name, printable
 from lavender.cones import ROW
 from lavender.errors import InputError
-from lavender.io.stored import ENGINE, SUFFIXES
+from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.problem import Problem
 from lavender.residuals import ENOUGH, Residual, nothing_to_do, residual
 from lavender.suite import Case
@@ -197,10 +197,10 @@ def _check_one_recording(folder: Path, paths: list[Path]) -> None:
 def _told(folder: Path) -> list[dict[str, Any]]:
     """What an engine said of the steps in a folder, each with its "file"; nothing if a line of it cannot be read."""
     try:
-        text = (folder / ENGINE).read_text(encoding="utf-8", errors="replace")
+        text = whole_file(folder / ENGINE, "the engine's answers").decode(errors="replace")
         lines = [dict(json.loads(line)) for line in text.splitlines()]
         return lines if all("file" in line for line in lines) else []
-    except (OSError, ValueError, TypeError):
+    except (ValueError, TypeError, RecursionError):
         return []
 
 

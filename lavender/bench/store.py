@@ -121,7 +121,7 @@ class Records:
 
     def rows(self) -> list[dict[str, Any]]:
         """Plain rows, one for each record, with its case and machine: the columns of `records.csv`."""
-        out, left_out = [], self.left_out
+        out = []
         for r in self.records:
             run, info = self.runs.get(r.run), self.cases.get(r.case)
             row = {f.name: getattr(r, f.name) for f in fields(r) if f.name != "sha"}
@@ -131,7 +131,6 @@ class Records:
                 "law": info.law if info else "",
                 "rows": info.rows if info else 0,
                 "structure": ", ".join(info.structure) if info else "",
-                "left_out": len(left_out.get(info.sequence if info else "", ())),
                 "lavender": run.lavender if run else "",
                 "python": run.python if run else "",
                 "platform": run.platform if run else "",

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import one_thread
+from lavender.cli.options import EXIT_UNMET, one_thread
 from lavender.errors import InputError, LavenderError
 from lavender.io.stored import write_text
 
@@ -43,7 +43,10 @@ def bench() -> None:
     "--out", type=click.Path(path_type=Path), help="Write the numbers of every problem as JSON lines."
 )
 def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
-    """Measure lavender's `newton` beside MuJoCo's Newton solver on steps of your own models (MJCF files)."""
+    """Measure lavender's `newton` beside MuJoCo's Newton solver on steps of your own models (MJCF files).
+
+    Exit code 1: a model is left out, of every number.
+    """
     one_thread()
     try:
         import mujoco as mj
@@ -55,12 +58,14 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
 
     found: list[Step] = []
     consecutive: list[WarmStep] = []
+    lost: list[str] = []
     for path in models:
         try:
             new = measure(mj, path, steps, every)
             after = measure_warm(mj, path, warm)
         except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
-            click.echo(f"{path.name}: left out: {str(error).splitlines()[0][:140]}", err=True)
+            lost.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
+            click.echo(lost[-1], err=True)
             continue
         found += new
         consecutive += after
@@ -76,3 +81,6 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         click.echo(table(found))
     if consecutive:
         click.echo(f"\n{warm_table(consecutive)}")
+    if lost:
+        click.echo("\n".join(lost))
+        raise click.exceptions.Exit(EXIT_UNMET)

@@ -127,8 +127,10 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         done = measure(context, files, path, sweeps)
     engines = [] if asked["campaign"] else contestants(files, done.records.latest())
     found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
+    index = write(
+        found, out, figures=not asked["no_figures"]
+    )  # before a pipe that nobody reads ends the command
     print_report(found, console(), whole=asked["tables"])
-    index = write(found, out, figures=not asked["no_figures"])
     if asked["paper"]:
         from lavender.report.paper import write_paper
 

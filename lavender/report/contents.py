@@ -356,7 +356,7 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
     for w in passes:
         rows.append(
             [
-                w.sequence, w.solver, w.asked, f"{w.steps}{without(w.left_out)}",
+                Cell(w.sequence, after=without(w.left_out)), w.solver, w.asked, str(w.steps),
                 f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
                 *(residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
                 *(seconds(w.time[s]) + share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),

@@ -62,7 +62,7 @@ def contestants(words: Sequence[str], records: Records) -> list[Contestant]:
                 numbers = [float(entry[name]) for name in _NUMBERS]
                 row = float(entry.get("velocity", math.nan)), str(entry.get("worst", ""))
                 found.append((*numbers, row, str(entry["verdict"]), str(entry["solver"])))
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, RecursionError):
                 continue
         if not found:
             continue

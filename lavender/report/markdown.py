@@ -20,9 +20,8 @@ def summary(report: Report) -> str:
         lines += [plain(f"{machine}; run {run.run}, {run.started}"), ""]
     if found.sentences:
         lines += [plain(found.text), "", "```python", *found.code, "```", ""]
-    lines += [
-        plain(f"Left out, and in no number here: {what}: {reason}") for what, reason in left_out(records)
-    ]
+    for what, reason in left_out(records):
+        lines += [plain(f"Left out, and in no number here: {what}: {reason}"), ""]
     for section in sections(report):
         lines += [f"**{plain(section.title)}** ({plain(section.note)})", ""]
         lines += [*(markdown(section.table) if section.table.rows else [section.empty]), ""]

@@ -107,6 +107,11 @@ def test_an_answer_is_no_start(tmp_path, early):
     asks = [bench.Ask("pgs", "tol", 1e-6), bench.Ask("pgs", "tol", 1e-6, way="batch")]
     made = bench.finals([path], asks, records, QUICK).records
     assert all(r.iterations > 5 for r in made if r.mode == "tol" and r.tol <= 1e-6)
+    steps = bench.sequence([p.updated(guess=answer), p.updated(guess=answer)], "steps")
+    records = bench.run(steps, ["pgs"], QUICK)
+    made = bench.finals(steps, [bench.Ask("pgs", "tol", 1e-6, way="steps")], records, QUICK).records
+    assert all(r.iterations > 5 for r in made if r.start == "cold" and r.mode == "tol" and r.tol <= 1e-6)
+    assert all(r.iterations > 5 for r in made if r.start == "carried" and r.step == 0 and r.tol == 1e-8)
     assert lv.cross_check(lv.load(path), ["pgs"])["pgs"].solution.iterations > 5
 
 

@@ -329,3 +329,31 @@ def test_a_lock_of_another_host_is_believed_and_one_process_locks_against_itself
     lock.path.write_bytes(b"torn")
     bench.Store(path).close()
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"file": "../../x.npz", "left_out": "\\u202e<i>why"}',
+        '{"file": "a\\u0000b", "left_out": ["why"]}',
+        '{"file": ["x"], "left_out": null}',
+        '{"file": "", "left_out": "why"}',
+        pytest.param(None, marks=POSIX, id="a pipe"),
+    ],
+)
+def test_what_an_engine_said_of_a_folder_harms_nothing(lavender, tmp_path, text):
+    """Its file may be of anybody: at most it names steps that are not there."""
+    folder = tmp_path / "steps"
+    folder.mkdir()
+    io.save(stack(4), folder / "step_1.npz")
+    if text is None:
+        os.mkfifo(folder / "engine.jsonl")
+    else:
+        (folder / "engine.jsonl").write_text(text)
+    items = bench.resolve(folder)
+    assert items[0].problem.m == 4 and len(items) <= 2
+    assert all(item.name.isprintable() for item in items)
+    code = lavender("report", folder, *QUICK, "--no-figures")[0]
+    assert code == (cli.EXIT_UNMET if len(items) == 2 else 0)
+    assert "<i>" not in (tmp_path / "lavender-report" / "index.html").read_text()

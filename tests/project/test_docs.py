@@ -138,7 +138,7 @@ def test_pages_link_to_pages_that_exist():
 def test_the_chapter_names_examples_tests_and_functions_that_exist():
     text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
     examples = set(re.findall(r"python (examples/\w+\.py)", text))
-    assert len(examples) == 12
+    assert len(examples) == 13
     assert examples <= {f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")}
     named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text)
     assert len(named) > 12

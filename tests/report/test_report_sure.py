@@ -7,7 +7,7 @@ import pytest
 
 from lavender import bench, report
 from lavender.report import tables
-from lavender.report.tables.finals import in_time, lines, to_level
+from lavender.report.tables.finals import in_time, line_table, lines, to_level
 from lavender.report.verdict import verdict
 from tests.report.test_report import record, records_of
 
@@ -168,6 +168,37 @@ def test_backends_are_told_by_their_own_interface_too():
     assert (osqp.solver, osqp.solved) == ("osqp", 1)
     assert osqp.own == pytest.approx(r.own_min)
     assert osqp.whole == pytest.approx(r.time_min)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_batch_of_some_of_the_cases_is_not_told_beside_a_call_on_all(n):
+    made = in_turns({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
+    for r in [r for r in made if r.turns and r.case in CASES[:n]]:
+        made.add(bench.Record(**{**vars(r), "way": "batch"}))
+    assert ("batch" in line_table(made)["auto"]) == (n == 3)
+    assert any("solve_many" in line for line in verdict(made).code) == (n == 3)
+
+
+def test_a_line_says_where_it_starts_and_leaves_the_guess_out():
+    """Of cases that bring a guess, where a cold start was timed; a loop that carries impulses needs no such line."""
+    cold, carried = in_turns({"auto": 1.0}, 0), in_turns({"auto": 1.0}, 0)
+    for case, info in list(cold.cases.items()):
+        cold.add(bench.CaseInfo(**{**vars(info), "guess": "answer"}))
+        step = {"guess": "start", "sequence": "walk", "step": CASES.index(case)}
+        carried.add(bench.CaseInfo(**{**vars(info), **step}))
+    more = {"start": "carried", "way": "steps"}
+    carried.records = [
+        bench.Record(**{**vars(r), **more, "step": CASES.index(r.case)}) for r in carried.records
+    ]
+    said = verdict(cold)
+    assert said.code[0] == "problem = dataclasses.replace(problem, guess=None)"
+    assert said.code[1].startswith('lv.solve(problem, "auto", tol=1e-6)') and said.code[1].endswith(", cold")
+    assert " cold, to 1e-6 on " in said.sentences[0]
+    said = verdict(carried)
+    assert said.code[0].endswith("warm from the step before") and not any(
+        "dataclasses" in x for x in said.code
+    )
+    assert " warm from the step before, to 1e-6 on " in said.sentences[0]
 
 
 def test_the_headline_is_of_all_sequences():

@@ -244,7 +244,7 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
                 while some := list(itertools.islice(calls, ROUND)):
                     yield from parallel(some)
                 return
-            with _deaf():
+            with _deaf() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():
                 found = parallel(calls)
             yield from found
         except lost:
@@ -254,16 +254,11 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
 @contextlib.contextmanager
 def _deaf() -> Iterator[None]:
     """Processes that begin here hear no Ctrl-C, which a terminal sends to all; this one does, and ends them."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
     from joblib.externals.loky.backend import resource_tracker as lokys
 
-    for tracker in (
-        resource_tracker,
-        lokys,
-    ):  # each begins once, and leaves the process that begins it hearing
-        tracker.ensure_running()
+    # Each begins once, and would leave this process hearing.
+    resource_tracker.ensure_running()
+    lokys.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

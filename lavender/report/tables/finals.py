@@ -92,14 +92,19 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
             key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
             groups.setdefault(key, {})[r.case] = r
     most = max((len(runs) for runs in groups.values()), default=0)
-    return [
+    found = [
         Final(runs, any(records.cases[c].guess for c in runs))
         for runs in groups.values()
         if len(runs) == most
     ]
+    if way != "batch":
+        return found
+    # A batch of some of the cases says nothing beside a call on all of them.
+    whole = {(f.line.solver, *sorted(f.runs)) for one in ("call", "steps") for f in lines(records, one)}
+    return [f for f in found if (f.line.solver, *sorted(f.runs)) in whole]
 
 
-STARTS = {"cold": "cold", "carried": "warm from the step before", "warm": "from its guess"}
+STARTS = {"cold": "cold", "carried": "warm from the step before"}
 WAYS = {"call": "one call", "steps": "a step in its loop", "batch": "a problem of a batch"}
 
 
