@@ -1,5 +1,6 @@
 """MuJoCo's constraint problem read from memory: its own solution is the judge's solution too."""
 
+import copy
 import json
 
 import numpy as np
@@ -294,6 +295,24 @@ def test_something_else_is_an_input_error():
 
 
 # -- a folder of steps ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_a_model_that_was_edited_between_two_states_is_noticed(jacobian):
+    """What is kept with a model is compared before it serves: the same bits as from a model seen for the first time."""
+    model, data = state(jacobian=jacobian)
+    for change in ("body_mass", "dof_armature", "geom_friction", "dof_frictionloss"):
+        before = lv.io.from_mujoco(model, data)
+        array = getattr(model, change)
+        array[:] = 1.5 * array + 0.01
+        mj.mj_setConst(model, data)
+        mj.mj_forward(model, data)
+        fresh = copy.copy(model)
+        other = mj.MjData(fresh)
+        other.qpos[:], other.qvel[:], other.qacc_warmstart[:] = data.qpos, data.qvel, data.qacc_warmstart
+        mj.mj_forward(fresh, other)
+        found = lv.io.from_mujoco(model, data)
+        assert found == lv.io.from_mujoco(fresh, other) != before
 
 
 def test_a_recording_is_a_folder_of_problems_with_the_engines_own_answer(tmp_path):
