@@ -73,7 +73,7 @@ ALIKE = (
 # Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
-OF_M = ("euler", "rk4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
+OF_M = ("Euler", "RK4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
 OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
 _SEEN: WeakKeyDictionary[Any, Any] = (
     WeakKeyDictionary()
@@ -249,7 +249,7 @@ def _mass(mj: Any, model: Any, data: Any, smooth: Any) -> Any:
         why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
         raise CapabilityError(
             f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
-            f"{CHANGED if word in OF_M else why}"
+            f"{CHANGED if word in map(str.lower, OF_M) else why}"
         )
     return mass
 

@@ -219,7 +219,9 @@ def test_an_integrator_that_puts_damping_into_m_is_refused():
         data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
         mj.mj_forward(model, data)
         if refused:
-            with pytest.raises(lv.CapabilityError, match=r"integrator='discrete'.*'euler', .* have M itself"):
+            with pytest.raises(
+                lv.CapabilityError, match=r"integrator='discrete'.*'Euler', 'RK4', .* have M itself"
+            ):
                 lv.io.from_mujoco(model, data)
         else:
             assert lv.io.from_mujoco(model, data).m > 0
@@ -485,6 +487,57 @@ def test_every_edge_of_a_flex_is_a_block_of_its_own():
     assert problem.whitened.nnz <= 9 * problem.m  # three vertices at most
     solution = lv.solve(problem, "newton", tol=1e-9)
     assert solution.success or solution.residual.at_floor
+
+
+CLOTH = """<mujoco><option cone="{cone}" tolerance="1e-12" iterations="300"/><worldbody>
+  <geom type="plane" size="2 2 .1" condim="{condim}"/><geom type="sphere" size=".08" pos=".05 .03 .05"/>
+  <body pos="0 0 .4"><freejoint/><geom type="sphere" size=".05" mass=".2"/></body>
+  <flexcomp name="cloth" type="grid" {more} spacing=".05 .05 .05" pos="0 0 .2" radius=".01" mass="1">
+  <edge equality="{edge}"/><contact selfcollide="auto" condim="{condim}"/></flexcomp></worldbody></mujoco>"""
+FLEXES = {
+    "rope": ('dim="1" count="8 1 1"', "true"),
+    "cloth": ('dim="2" count="5 5 1"', "true"),
+    "solid": ('dim="3" count="3 3 3"', "true"),
+    "interpolated": ('dim="3" count="3 3 3" dof="trilinear"', "false"),
+}
+
+
+@pytest.mark.parametrize("kind", FLEXES)
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("pyramidal", 3), ("elliptic", 1), ("elliptic", 3), ("elliptic", 4)]
+)
+def test_what_bends_is_moved_as_mujoco_moves_it(cone, condim, kind):
+    more, edge = FLEXES[kind]
+    try:
+        model = mj.MjModel.from_xml_string(CLOTH.format(cone=cone, condim=condim, more=more, edge=edge))
+    except ValueError as error:
+        pytest.skip(f"this MuJoCo does not know it: {error}")
+    data, met = mj.MjData(model), 0
+    for _ in range(12):
+        mj.mj_step(model, data, 10)
+        mj.mj_forward(model, data)
+        problem = lv.io.from_mujoco(model, data)
+        met = max(met, int(np.count_nonzero(np.array(data.contact.geom) < 0)))
+        solution = lv.solve(problem, tol=1e-9)
+        found = adapter.acceleration(model, data, solution.impulse)
+        # 1e-9 of what contact changes, over the softness that MuJoCo's elliptic cones stop at
+        assert np.abs(found - data.qacc).max() < 1e-5 * (1.0 + np.abs(data.qacc).max())
+    assert met > 0  # a vertex has touched something
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_after_a_step_of_rk4_the_accelerations_are_the_mean_of_four_passes(cone):
+    """Of none is efc_force; after a forward pass they are those of its forces, as under any integrator."""
+    model, data = state(cone)
+    model.opt.integrator = mj.mjtIntegrator.mjINT_RK4
+    v = data.qvel.copy()
+    mj.mj_step(model, data)
+    np.testing.assert_allclose(data.qacc, (data.qvel - v) / model.opt.timestep, atol=1e-9)
+    own = adapter.acceleration(model, data, adapter.impulse(model, data))
+    assert np.abs(own - data.qacc).max() > 1e-2
+    mj.mj_forward(model, data)
+    solution = lv.solve(lv.io.from_mujoco(model, data), tol=1e-10)
+    np.testing.assert_allclose(adapter.acceleration(model, data, solution.impulse), data.qacc, atol=1e-5)
 
 
 # -- data that were changed -----------------------------------------------------------------------------
