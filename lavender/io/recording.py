@@ -140,17 +140,16 @@ def record(
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in kept))
     far = [line for line in kept if line["verdict"] in (EARLY, WRONG)]
     worst = max(far, key=lambda line: float(line["velocity"]), default=None)
+    short = worst and f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
     return Recording(
-        folder,
-        tuple(line["file"] for line in kept),
-        without,
-        tuple(left_out),
-        sum(line["verdict"] != AT_FLOOR for line in kept),
-        len(far),
-        threshold,
-        ""
-        if worst is None
-        else f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})",
+        folder=folder,
+        files=tuple(line["file"] for line in kept),
+        without=without,
+        left_out=tuple(left_out),
+        above_floor=sum(line["verdict"] != AT_FLOOR for line in kept),
+        stopped=len(far),
+        threshold=threshold,
+        worst=short or "",
     )
 
 
