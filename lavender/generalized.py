@@ -99,7 +99,8 @@ class Generalized:
                 x.setflags(write=False)
             else:  # which finds the words
                 as_array(name, x, (None,), copy=False)
-        made._fill(jac, mass, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names, like)
+        free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
+        made._fill(jac, mass, free, names, like)
         return made
 
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
