@@ -47,13 +47,13 @@ def run(steps=STEPS):
     for i in range(steps):
         simulator.AdvanceTo(i * DT)
         problem = lv.io.from_drake(made, context)
+        own = lv.io.drake.impulse(made, context)
         if problem.m:
             solution = lv.solve(problem, tol=1e-9)
-            sap = lv.io.drake.impulse(made, context)
-            apart = np.abs(problem.velocity(solution.impulse) - problem.velocity(sap)).max()
-            theirs = lv.residual(problem, sap).relative
+            apart = np.abs(problem.velocity(solution.impulse) - problem.velocity(own)).max()
+            theirs = lv.residual(problem, own).relative
             found.append((theirs, solution.residual.relative, apart))
-    force = sap.reshape(-1, 3)[:, 0].sum() / DT
+    force = own.reshape(-1, 3)[:, 0].sum() / DT
     return np.array(found), float(force)
 
 

@@ -79,12 +79,18 @@ class Generalized:
 
     @classmethod
     def compressed(
-        cls, jac: Compressed, mass: Compressed, v_free: Any, names: Sequence[str] | None = None
+        cls,
+        jac: Compressed,
+        mass: Compressed,
+        v_free: Any,
+        names: Sequence[str] | None = None,
+        like: kernels.Operator | None = None,
     ) -> Generalized:
         """From (indptr, indices, data) of J and of M's lower triangle with its diagonal, columns ascending.
 
         The quick way for adapters, whose engines hold these arrays: int32 and float64, adopted as they are. Only
-        finiteness and definiteness are checked.
+        finiteness and definiteness are checked. `like` is the operator of a problem before, whose pattern of M's factor
+        serves again where M's entries stand in the same places.
         """
         made = object.__new__(cls)
         n = len(mass[0]) - 1
@@ -93,7 +99,8 @@ class Generalized:
                 x.setflags(write=False)
             else:  # which finds the words
                 as_array(name, x, (None,), copy=False)
-        made._fill(jac, mass, as_array("v_free", v_free, (n,), unit="m/s, rad/s"), names)
+        free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
+        made._fill(jac, mass, free, names, like)
         return made
 
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
@@ -114,13 +121,18 @@ class Generalized:
         return made
 
     def _fill(
-        self, jac: Compressed, mass: Compressed, v_free: FloatArray, names: Sequence[str] | None
+        self,
+        jac: Compressed,
+        mass: Compressed,
+        v_free: FloatArray,
+        names: Sequence[str] | None,
+        like: kernels.Operator | None = None,
     ) -> None:
         put = self.__dict__
         n = len(v_free)
         names = None if names is None else words_for("velocities", names, n)
         put["v_free"], put["names"], put["order"] = v_free, names, None
-        operator = kernels.Operator(*jac, *mass)
+        operator = kernels.Operator(*jac, *mass, like)
         if operator.fill > 0 and operator.failed < 0 and _worth_ordering(operator.work, len(mass[1])):
             order = _order(mass, n)
             other = kernels.Operator(*_permuted_columns(jac, order), *_permuted_lower(mass, order))

@@ -18,7 +18,7 @@ from typing import Any
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.io import fclib, mujoco, npz
+from lavender.io import drake, fclib, mujoco, npz
 from lavender.io.drake import from_drake
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
@@ -29,6 +29,7 @@ from lavender.problem import Problem
 __all__ = [
     "Recording",
     "Stored",
+    "drake",
     "from_drake",
     "from_mujoco",
     "from_pinocchio",

@@ -10,9 +10,9 @@ actuation and applied forces. In one step of dt
     joint limits   lambda >= 0, target = -gap / dt, `correction` of it where gap < 0
 
 SAP's own contacts are softer than that: stiffness, dissipation and a regularisation of friction, which it derives from
-materials and from diag(J A^-1 J^T) and does not publish. What it answers is nevertheless here: its impulses
-(`impulse`) give, under this A and J, its next velocity, or the problem is refused. On a box, a cart and an
-arm that come to rest in steps of 2 ms the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median
+materials and from diag(J A^-1 J^T) and does not publish. What it answers is nevertheless here: `impulse` has its
+impulses, which give, under this A and J, its next velocity, or the problem is refused. On a box, a cart and an arm
+that come to rest in steps of 2 ms the velocities of the rigid problem differ from SAP's by 1.2e-4 m/s in the median
 (0.6 % of what contact changes; 1.3e-9 with the "lagged" approximation), at the moment of an impact by up to 0.1 m/s.
 """
 
@@ -33,7 +33,7 @@ from lavender.problem import Problem
 __all__ = ["from_drake", "impulse"]
 
 REACH = 4.0  # steps at the present speed within which a joint limit may push
-UNSEEN = 1e-6  # -, of |A| |v+ - v*| + |J|^T |lambda|: above what SAP's own tolerance leaves of its momentum
+UNSEEN = 1e-6  # -, of |A| |v+ - v*| + |J|^T |lambda| in SAP's own norm: above what its tolerance leaves of its momentum
 
 
 def from_drake(
@@ -65,7 +65,7 @@ def from_drake(
     Returns
     -------
     Problem
-        SAP's own impulses are an answer, no start: `impulse(plant, context)` has them.
+        Without a start: SAP's own impulses are an answer, `impulse(plant, context)`.
 
     Raises
     ------
@@ -74,16 +74,15 @@ def from_drake(
     CapabilityError
         What the plant holds beside joints, contacts at points and joint limits; momentum that does not add up.
     """
-    return _checked(plant, context, dt, friction, compliance, correction, name)[0]
+    return _solved(plant, context, dt, friction, compliance, correction, name)[0]
 
 
 def impulse(plant: Any, context: Any) -> FloatArray:
-    """SAP's own answer as impulses of the problem's rows (m,) [N s]; refuses what `from_drake` refuses."""
-    return _checked(plant, context, None, "coulomb", None, 0.0, "drake")[1]
+    """SAP's own answer as impulses (m,) [N s] of the problem's rows: what `lavender.residual` judges."""
+    return _solved(plant, context, None, "coulomb", None, 0.0, "")[1]
 
 
-def _checked(plant: Any, context: Any, *asked: Any) -> tuple[Problem, FloatArray]:
-    """The problem, and SAP's impulses."""
+def _solved(plant: Any, context: Any, *how: Any) -> tuple[Problem, FloatArray]:
     try:
         from pydrake.multibody.plant import MultibodyPlant_
         from pydrake.systems.framework import Context_
@@ -97,7 +96,7 @@ def _checked(plant: Any, context: Any, *asked: Any) -> tuple[Problem, FloatArray
         "Drake",
         "Give a finalised plant with its scene graph connected, and its own context of finite numbers",
     ):
-        return _problem(plant, context, *asked)
+        return _problem(plant, context, *how)
 
 
 def _problem(
@@ -130,7 +129,7 @@ def _problem(
         cones = cones + Cones.bounded(np.zeros(len(limits)), np.full(len(limits), np.inf))
     own = np.concatenate([np.zeros(0), *(dt * c.force for c in contacts), np.zeros(len(limits))])
     _complete(plant, context, dynamics, v_free, jac, own, limits, 3 * len(contacts), dt)
-    problem = Problem.from_jacobian(
+    made = Problem.from_jacobian(
         jac,
         dynamics,
         v_free,
@@ -142,7 +141,7 @@ def _problem(
         dof_names=list(plant.GetVelocityNames(always_add_suffix=True)),
         name=name,
     )
-    return problem, own
+    return made, own
 
 
 def _refuse_locked(plant: Any, context: Any) -> None:
@@ -313,8 +312,9 @@ def _complete(
         if limit.sign * left[limit.at] > UNSEEN * size[limit.at]:
             own[first + k] = limit.sign * left[limit.at]
             left[limit.at] = 0.0
-    if np.any(np.abs(left) > UNSEEN * size):
-        worst = int(np.argmax(np.abs(left) / np.where(size > 0.0, size, 1.0)))
+    weight = 1.0 / np.sqrt(np.diag(dynamics))  # what SAP weighs momenta by when it ends
+    if not np.linalg.norm(weight * left) <= UNSEEN * np.linalg.norm(weight * size):
+        worst = int(np.argmax(weight * np.abs(left)))
         raise CapabilityError(
             f"A (v+ - v*) of Drake's own next step is not J^T times its impulses: {left[worst]:.3g} of "
             f"{size[worst]:.3g} is left at {plant.GetVelocityNames(always_add_suffix=True)[worst]}; something acts "

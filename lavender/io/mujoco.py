@@ -45,7 +45,9 @@ further off, and the judge says by how much.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -71,9 +73,14 @@ ALIKE = (
 # Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
-OF_M = ("euler", "rk4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
-MADE_BY_J = ("J qvel and efc_vel", "J qacc_smooth - efc_aref and efc_b", "J^T efc_force and qfrc_constraint")
+OF_M = ("Euler", "RK4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
 OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
+_SEEN: WeakKeyDictionary[Any, Any] = (
+    WeakKeyDictionary()
+)  # a model's operator, whose pattern is compared before use
+NO_CONTACT = SimpleNamespace(
+    dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
+)
 _CODES = (
     "mjCNSTR_EQUALITY",
     "mjCNSTR_FRICTION_DOF",
@@ -86,7 +93,6 @@ _CODES = (
 )
 
 
-@np.errstate(over="ignore", invalid="ignore")  # what is not finite is refused
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     """The constraint problem that MuJoCo solved last, in impulses and velocities; see the module.
 
@@ -119,26 +125,31 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     mj = _mujoco(model, data)
     opt = model.opt
     m, n, dt = int(data.nefc), int(model.nv), _timestep(opt)
-    smooth, force = data.qacc_smooth, data.efc_force
-    mass = _mass(mj, model, data)
-    held = _Held.of(data)
-    cones, scale, key = _blocks(mj, model, data, held, dt)
+    smooth = data.qacc_smooth
+    mass = _mass(mj, model, data, smooth)
+    cones, scale, key, held = _blocks(mj, model, data, dt)
     jac = _rows(mj, model, data, m, n, scale)
-    _check_smooth(mj, model, data, mass, smooth)
-    free = dt * smooth
-    before = _before(model, data)
-    general = Generalized.compressed(jac, mass, before + free)
-    own, target, softness, gap = export.numbers(force, data.efc_aref, data.efc_R, data.efc_D, scale, dt)
-    rhs = general.operator.bias(free if general.order is None else free[general.order], target)
-    _check_jacobian(data, jac, scale, rhs, own, before, free, dt)
-    return Problem(
-        rhs,
-        cones,
+    rhs, softness, v_free, sound, gap, gaps = export.numbers(
+        *jac, scale, dt, _before(model, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
+        data.efc_vel, data.efc_b, data.qfrc_constraint, data.qacc,
+    )  # fmt: skip
+    _check_jacobian(*gaps)
+    if not gap <= SAME:
+        softness, sound = _compliance(data) * scale * scale, False
+    names = Names(cones.n_blocks, lambda: _words(mj, model, held, m))
+    before = _SEEN.get(model)
+    general = Generalized.compressed(jac, mass, v_free, like=before)
+    if before is None or before.n != n:
+        _SEEN[model] = general.operator
+    made = Problem._of_engine if sound else Problem
+    return made(
+        b=rhs,
+        cones=cones,
         generalized=general,
-        compliance=softness if gap <= SAME else _compliance(data) * scale * scale,
+        compliance=softness,
         friction="cone",
         key=key,
-        names=Names(cones.n_blocks, lambda: _words(mj, model, held)),
+        names=names,
         name=f"{name} (noslip)" if opt.noslip_iterations > 0 else name,
         copy=False,
     )
@@ -161,7 +172,8 @@ def scaling(model: Any, data: Any) -> FloatArray:
     1, and friction[j] / friction[0] on the tangents of an elliptic cone. Impulses are MuJoCo's over it.
     """
     mj = _mujoco(model, data)
-    return _blocks(mj, model, data, _Held.of(data), _timestep(model.opt))[1]
+    scale: FloatArray = _blocks(mj, model, data, _timestep(model.opt))[1]
+    return scale
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
@@ -219,14 +231,30 @@ def _timestep(opt: Any) -> float:
     return dt
 
 
-def _mass(mj: Any, model: Any, data: Any) -> Any:
-    """(indptr, indices, data) of M's lower triangle."""
-    if hasattr(data, "M") and hasattr(model, "M_rownnz"):
-        columns, values = np.array(model.M_colind, np.int32), np.array(data.M, float)
-        indptr = export.lower_pointers(model.M_rowadr, model.M_rownnz, columns, len(values))
-        if indptr is None:
-            raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
-        return indptr, columns, values
+def _mass(mj: Any, model: Any, data: Any, smooth: Any) -> Any:
+    """(indptr, indices, data) of M's lower triangle.
+
+    M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
+    """
+    try:
+        parts = model.M_rowadr, model.M_rownnz, model.M_colind, data.M
+    except AttributeError:  # an earlier MuJoCo
+        parts = _whole_mass(mj, model, data)
+    found = export.lower(*parts, smooth, data.qfrc_smooth)
+    if found is None:
+        raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
+    mass, gap = found
+    if not gap <= ROUNDING:
+        word = mj.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_").lower()
+        why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
+        raise CapabilityError(
+            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
+            f"{CHANGED if word in map(str.lower, OF_M) else why}"
+        )
+    return mass
+
+
+def _whole_mass(mj: Any, model: Any, data: Any) -> Any:
     n = int(model.nv)
     parent = np.asarray(model.dof_parentid)
     if (
@@ -236,21 +264,22 @@ def _mass(mj: Any, model: Any, data: Any) -> Any:
         raise InputError(f"dof_parentid and dof_Madr are no tree of velocities. {OTHER_MODEL}")
     whole = np.zeros((n, n))
     mj.mj_fullM(model, whole, data.qM)
-    return lower_of_dense(whole)[0]
+    indptr, indices, values = lower_of_dense(whole)[0]
+    return indptr[:-1], np.diff(indptr), indices, values
 
 
 def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> Any:
     """(indptr, indices, data) of J, scaled by row."""
-    values = np.ravel(data.efc_J)
+    values = data.efc_J
+    values = values if values.ndim == 1 else np.ravel(values)
     if not mj.mj_isSparse(model):
         if len(values) < m * n:
             raise InputError(
                 f"efc_J holds {len(values)} numbers; {m} x {n} are needed where opt.jacobian says dense. {CHANGED}"
             )
         return export.rows_of_dense(values, m, n, scale)
-    count = np.ascontiguousarray(data.efc_J_rownnz, np.int32)
-    first = np.ascontiguousarray(data.efc_J_rowadr, np.int32)
-    columns = np.ascontiguousarray(np.ravel(data.efc_J_colind), np.int32)
+    count, first, columns = data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind
+    columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
         raise InputError(
             f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED}"
@@ -270,6 +299,7 @@ def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> 
     return found
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def _compliance(data: Any) -> FloatArray:
     """R (m,) [1/kg] where efc_R and 1 / efc_D are not the same: the latter where a copy did not fill the former."""
     r, inverse = data.efc_R, data.efc_D
@@ -288,15 +318,19 @@ def _before(model: Any, data: Any) -> FloatArray:
     gap, size = export.motion_gap(parent, bodies, axis, spatial, data.qvel)
     if gap < 0.0:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
-    unfilled = not np.any(spatial) and np.any(data.efc_vel)  # by a copy
-    if gap <= SUMMED * size or unfilled:
+    if gap <= SUMMED * size or (not np.any(spatial) and np.any(data.efc_vel)):  # not filled by a copy
         return data.qvel
-    v, known = np.array(data.qvel), True
+    return _before_step(parent, bodies, axis, spatial, SUMMED * size)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def _before_step(parent: Any, bodies: Any, axis: Any, spatial: Any, allowed: float) -> FloatArray:
+    v, known = np.zeros(len(axis)), True
     for body in np.unique(bodies):
         own = np.flatnonzero(bodies == body)
         v[own], _, rank, _ = np.linalg.lstsq(axis[own].T, spatial[body] - spatial[parent[body]], rcond=ALIKE)
         known &= bool(rank == len(own))
-    if not known or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
+    if not known or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= allowed:
         raise CapabilityError(
             "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
             "MjData was changed since its forward pass: run mj_forward"
@@ -304,30 +338,17 @@ def _before(model: Any, data: Any) -> FloatArray:
     return v
 
 
-def _check_smooth(mj: Any, model: Any, data: Any, mass: Any, smooth: Any) -> None:
-    """M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem."""
-    gap = export.mass_mismatch(*mass, np.ascontiguousarray(smooth), np.ascontiguousarray(data.qfrc_smooth))
-    if not gap <= ROUNDING:
-        word = mj.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_").lower()
-        why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
-        raise CapabilityError(
-            f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "
-            f"{CHANGED if word in OF_M else why}"
-        )
-
-
-def _check_jacobian(
-    data: Any, jac: Any, scale: Any, rhs: Any, own: Any, v: Any, free: Any, dt: float
-) -> None:
+def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> None:
     """J must be the matrix that made what MuJoCo made by it, as far as rounding lets it be: whatever its solver did."""
-    *gaps, finite = export.row_gaps(
-        *jac, scale, rhs, own, dt, v, data.efc_vel, free, data.efc_b, data.qfrc_constraint, data.qacc
-    )
     if finite != 0.0:
         raise InputError(
             "qacc holds numbers that are not finite: the simulation has diverged, or was changed"
         )
-    for found, words in zip(gaps, MADE_BY_J, strict=True):
+    for found, words in (
+        (velocity, "J qvel and efc_vel"),
+        (row, "J qacc_smooth - efc_aref and efc_b"),
+        (push, "J^T efc_force and qfrc_constraint"),
+    ):
         if not found <= SUMMED:
             raise CapabilityError(
                 f"{words} differ by {found:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
@@ -335,56 +356,35 @@ def _check_jacobian(
             )
 
 
-class _Held(NamedTuple):
-    """What blocks and their names depend on, copied, for the data go on."""
-
-    types: IntArray  # (m,)
-    ids: IntArray  # (m,)
-    dim: IntArray  # (c,)
-    geom: IntArray  # (c, 2)
-
-    @classmethod
-    def of(cls, data: Any) -> _Held:
-        contact = data.contact
-        return cls(
-            np.array(data.efc_type, np.int32),
-            np.array(data.efc_id, np.int32),
-            np.array(contact.dim, np.int32),
-            np.array(contact.geom, np.int32).reshape(-1, 2),
-        )
-
-
-def _blocks(mj: Any, model: Any, data: Any, held: _Held, dt: float) -> tuple[Cones, FloatArray, Any]:
-    """Cones, factor of each row, key of each block."""
-    contacts, tendons = len(held.dim), model.ntendon
+def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArray, Any, IntArray]:
+    """Cones, factor of each row, key of each block; type and id of rows, dim and geoms of contacts, for their names."""
+    contact = data.contact if data.ncon else NO_CONTACT
+    contacts, tendons = len(contact.dim), model.ntendon
     most = (model.neq, model.nv, tendons, model.njnt, tendons, contacts, contacts, contacts)
+    types, ids, dims = data.efc_type, data.efc_id, contact.dim
     found = export.blocks(
-        held.types,
-        held.ids,
-        _codes(mj),
-        most,
-        held.dim,
-        np.ascontiguousarray(data.contact.friction, float).reshape(-1, 5),
-        held.geom,
-        np.ascontiguousarray(data.efc_frictionloss, float),
-        dt,
+        types, ids, _codes(mj), most, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
     if isinstance(found, int):
-        of, which, known = int(held.types[found]), int(held.ids[found]), _codes(mj).tolist()
+        of, which, known = int(types[found]), int(ids[found]), _codes(mj).tolist()
         if of not in known:
             raise CapabilityError(f"constraint row {found} is of type {of}, which is not known here")
         there = most[known.index(of)]
-        dim = f", of condim {held.dim[which]}" if known.index(of) > 4 and 0 <= which < there else ""
+        dim = f", of condim {dims[which]}" if known.index(of) > 4 and 0 <= which < there else ""
         raise InputError(
-            f"constraint row {found} of {len(held.types)} is of type {of} and names number {which} of {there}{dim}: "
+            f"constraint row {found} of {len(types)} is of type {of} and names number {which} of {there}{dim}: "
             f"that is not there, or has not so many rows. {CHANGED}"
         )
-    ptr, kind, lower, upper, mu, scale, key = found
-    return Cones._trusted(ptr, kind, lower, upper, mu, *np.zeros((2, len(mu)))), scale, key
+    blocks, scale, key, held = found
+    if blocks is None:
+        raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED}")
+    return Cones._of(blocks), scale, key, held
 
 
-def _words(mj: Any, model: Any, held: _Held) -> list[str]:
-    types, ids, geom, dim = held.types.tolist(), held.ids.tolist(), held.geom, held.dim
+def _words(mj: Any, model: Any, held: IntArray, m: int) -> list[str]:
+    types, ids, contacts = held[:m].tolist(), held[m : 2 * m].tolist(), (len(held) - 2 * m) // 3
+    dim = held[2 * m : 2 * m + contacts]
+    geom = held[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)
     kinds = mj.mjtConstraint
     names: list[str] = []
     i = 0

@@ -141,11 +141,7 @@ def record(
         write_text(folder / ENGINE, "".join(f"{json.dumps(line)}\n" for line in (*kept, *left_out)))
     far = [line for line in kept if line["verdict"] in (EARLY, WRONG)]
     worst = max(far, key=lambda line: float(line["velocity"]), default=None)
-    short = (
-        ""
-        if worst is None
-        else f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
-    )
+    short = worst and f"{worst['velocity']:.2g} m/s short at {worst['worst']} (step {worst['step']})"
     return Recording(
         folder=folder,
         files=tuple(line["file"] for line in kept),
@@ -154,7 +150,7 @@ def record(
         above_floor=sum(line["verdict"] != AT_FLOOR for line in kept),
         stopped=len(far),
         threshold=threshold,
-        worst=short,
+        worst=short or "",
     )
 
 

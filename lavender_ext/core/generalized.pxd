@@ -550,3 +550,6 @@ cdef class Operator:
     cdef readonly object jac            # (indptr, indices, data) of J
     cdef readonly object mass           # the same of the lower triangle of M
     cdef list keep
+
+    cdef bint has_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx)
+    cdef tuple find_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx)

@@ -20,15 +20,15 @@ cdef class Operator:
     """J in compressed rows and M by its lower triangle, diagonal included, with M = L^T D L.
 
     The caller passes checked int32 and float64 arrays with ascending columns; they are kept alive here. `failed`
-    is the row of M whose pivot is not positive, -1 where M is positive definite.
+    is the row of M whose pivot is not positive, -1 where M is positive definite. `like` is another operator, whose
+    pattern of L is shared where its M has entries in the same places.
     """
 
-    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_):
+    def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None):
         # Kept as they came: a view made an object again costs more than the view.
         cdef const int32_t[::1] jptr = jptr_, jidx = jidx_, mptr = mptr_, midx = midx_
         cdef const double[::1] jval = jval_, mval = mval_
-        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, count, room, i
-        cdef int32_t[::1] whole, indices
+        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, i
         cdef double[::1] numbers
         self.jac = (jptr_, jidx_, jval_)
         self.mass = (mptr_, midx_, mval_)
@@ -38,7 +38,43 @@ cdef class Operator:
         if jidx.shape[0]:
             self.g.jidx = &jidx[0]
             self.g.jval = &jval[0]
-        room = <int32_t>midx.shape[0] + 1
+        if like is not None and like.has_pattern(mptr, midx):
+            marks, entries = like.keep[0], like.keep[1]
+            self.g.lptr = like.g.lptr
+            self.g.lidx = like.g.lidx
+            self.g.parent = like.g.parent
+        else:
+            marks, entries = self.find_pattern(mptr, midx)
+        factor = new(2 * n + self.g.lptr[n] + 1)
+        numbers = factor
+        self.keep = [marks, entries, factor]
+        self.g.lval = &numbers[2 * n]
+        self.g.inv_pivot = &numbers[0]
+        self.g.root = &numbers[n]                       # the factor's pivots, until it is there
+        self.failed = -1
+        if n:
+            self.failed = lav_tree_factor(n, &mptr[0], &midx[0], &mval[0], self.g.lptr, self.g.lidx, &numbers[2 * n],
+                                          &numbers[n], &numbers[0])
+        for i in range(n):
+            numbers[n + i] = sqrt(numbers[i])
+
+    cdef bint has_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
+        cdef const int32_t[::1] own_ptr = self.mass[0], own_idx = self.mass[1]
+        cdef Py_ssize_t i
+        if own_ptr.shape[0] != mptr.shape[0] or own_idx.shape[0] != midx.shape[0]:
+            return False
+        for i in range(mptr.shape[0]):
+            if own_ptr[i] != mptr[i]:
+                return False
+        for i in range(midx.shape[0]):
+            if own_idx[i] != midx[i]:
+                return False
+        return True
+
+    cdef tuple find_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
+        # L's columns by the elimination of M; the arrays that hold them.
+        cdef int32_t n = self.g.n, count, room = <int32_t>midx.shape[0] + 1
+        cdef int32_t[::1] whole, indices
         marks = new(5 * n + 2 + room, I4)
         whole = marks
         # lptr, parent, scratch, then the columns of L
@@ -53,20 +89,9 @@ cdef class Operator:
             self.g.lidx = &indices[0]
             count = tree_pattern(n, &mptr[0], &midx[0], room, &whole[0], &indices[0], &whole[n + 1],
                                  &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
-        factor = new(2 * n + count + 1)
-        numbers = factor
-        self.keep = [marks, entries, factor]
         self.g.lptr = &whole[0]
         self.g.parent = &whole[n + 1]
-        self.g.lval = &numbers[2 * n]
-        self.g.inv_pivot = &numbers[0]
-        self.g.root = &numbers[n]                       # the factor's pivots, until it is there
-        self.failed = -1
-        if n:
-            self.failed = lav_tree_factor(n, &mptr[0], &midx[0], &mval[0], &whole[0], self.g.lidx, &numbers[2 * n],
-                                          &numbers[n], &numbers[0])
-        for i in range(n):
-            numbers[n + i] = sqrt(numbers[i])
+        return marks, entries
 
     @property
     def n(self):

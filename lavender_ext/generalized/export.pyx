@@ -11,11 +11,14 @@ from libc.stdint cimport int32_t, uint64_t
 import numpy as np
 
 from lavender_ext.core.block cimport CONTACT, ROUND, ROW
+from lavender_ext.core.blocks cimport Blocks
 
 
 cpdef enum:
     JOINED = 6                  # rows of an equality that are one block; a flex has one for each edge
     CODES = 8                   # kinds of constraints
+
+cdef object new = np.empty, I4 = np.dtype(np.int32), U8 = np.dtype(np.uint64)
 
 
 cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int32_t* id_, const int32_t* codes,
@@ -109,30 +112,55 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def blocks(const int32_t[::1] type_, const int32_t[::1] id_, const int32_t[::1] codes, tuple most,
-           const int32_t[::1] dim, const double[:, ::1] friction, const int32_t[:, ::1] geom, const double[::1] loss,
-           double dt):
-    """(ptr, kind, lower, upper, mu, scale, key), or the number of a row that is unknown, or names what is not there."""
-    cdef int32_t m = <int32_t>type_.shape[0], k
+def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] codes, tuple most,
+           const int32_t[:] dim, const double[:, :] friction, const int32_t[:, :] geom, const double[:] loss, double dt):
+    """(blocks, scale, key, held), or the number of a row that is unknown, or names what is not there.
+
+    The blocks are None where some bound is no number; held is a copy of type, id, dim and geom, one after the other.
+    """
+    cdef int32_t m = <int32_t>type_.shape[0], c = <int32_t>dim.shape[0], k, i, j
     cdef int32_t limits[CODES]
+    cdef Blocks made = Blocks.__new__(Blocks)
     for k in range(CODES):
         limits[k] = most[k]
-    whole = np.empty(2 * m + 1, np.int32)
-    numbers = np.empty(4 * m)
-    keys = np.empty(m, np.uint64)
-    cdef int32_t[::1] w = whole
+    if not m == id_.shape[0] == loss.shape[0] or not c == friction.shape[0] == geom.shape[0]:
+        raise ValueError("arrays of rows or of contacts that differ in length")
+    whole, copy, numbers, keys = new(2 * m + 1, I4), new(2 * m + 3 * c + 1, I4), new(7 * m + 5 * c + 1), new(m + 1, U8)
+    cdef int32_t[::1] w = whole, held = copy
     cdef double[::1] x = numbers
     cdef uint64_t[::1] key = keys
-    if m == 0:
-        whole[0] = 0
-        return whole, whole[:0], numbers, numbers, numbers, numbers, keys
-    k = lav_export_blocks(m, &type_[0], &id_[0], &codes[0], limits, &dim[0] if dim.shape[0] else NULL,
-                          &friction[0, 0] if friction.shape[0] else NULL, &geom[0, 0] if geom.shape[0] else NULL,
-                          &loss[0], dt, &w[0], &w[m + 1], &x[0], &x[m], &x[2 * m], &x[3 * m], &key[0])
+    for i in range(m):
+        held[i] = type_[i]
+        held[m + i] = id_[i]
+        x[6 * m + i] = loss[i]
+        x[4 * m + i] = x[5 * m + i] = 0.0               # no patch, nothing rolls by itself
+    for i in range(c):
+        held[2 * m + i] = dim[i]
+        for j in range(2):
+            held[2 * m + c + 2 * i + j] = geom[i, j]
+        for j in range(5):
+            x[7 * m + 5 * i + j] = friction[i, j]
+    k = lav_export_blocks(m, &held[0], &held[m], &codes[0], limits, &held[2 * m], &x[7 * m], &held[2 * m + c],
+                          &x[6 * m], dt, &w[0], &w[m + 1] if m else NULL, &x[0], &x[m], &x[2 * m], &x[3 * m], &key[0])
     if k < 0:
         return -1 - k
-    return (whole[:k + 1].copy(), whole[m + 1:m + 1 + k].copy(), numbers[:m].copy(), numbers[m:2 * m].copy(),
-            numbers[2 * m:2 * m + k].copy(), numbers[3 * m:], keys[:k])
+    made.at.n_blocks = k
+    made.at.n_rows = m
+    made.at.ptr = &w[0]
+    if m:
+        made.at.kind = &w[m + 1]
+        made.at.lower = &x[0]
+        made.at.upper = &x[m]
+        made.at.mu = &x[2 * m]
+        made.at.patch_radius = &x[4 * m]
+        made.at.rolling = &x[5 * m]
+    fits = made.check()
+    made.spell()
+    whole.setflags(False)
+    numbers.setflags(False)
+    made.arrays = (whole[:k + 1], whole[m + 1:m + 1 + k], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
+                   numbers[4 * m:4 * m + k], numbers[5 * m:5 * m + k])
+    return made if fits else None, numbers[3 * m:4 * m], keys[:k], copy
 
 
 def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[::1] scale):
@@ -140,9 +168,9 @@ def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[:
     cdef int32_t i, j
     cdef Py_ssize_t at = 0
     cdef double x
-    indptr_ = np.empty(m + 1, np.int32)
-    indices_ = np.empty(m * n, np.int32)
-    data_ = np.empty(m * n)
+    indptr_ = new(m + 1, I4)
+    indices_ = new(m * n, I4)
+    data_ = new(m * n)
     cdef int32_t[::1] indptr = indptr_, indices = indices_
     cdef double[::1] data = data_
     indptr[0] = 0
@@ -172,9 +200,9 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
         if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
             return i
         total += count[i]
-    indptr_ = np.empty(m + 1, np.int32)
-    indices_ = np.empty(total, np.int32)
-    data_ = np.empty(total)
+    indptr_ = new(m + 1, I4)
+    indices_ = new(total, I4)
+    data_ = new(total)
     cdef int32_t[::1] indptr = indptr_, indices = indices_
     cdef double[::1] data = data_
     indptr[0] = 0
@@ -200,72 +228,47 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
     return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at].copy(), data_[:at].copy())
 
 
-def numbers(const double[:] force, const double[:] aref, const double[:] r, const double[:] inverse,
-            const double[::1] scale, double dt):
-    """(impulse, target, compliance) of every row from efc_force, efc_aref and efc_R; and max |efc_R efc_D - 1|."""
-    cdef Py_ssize_t i, m = scale.shape[0]
-    cdef double gap = 0.0, x
-    impulse_ = np.zeros(m)
-    target_ = np.empty(m)
-    compliance_ = np.empty(m)
-    cdef double[::1] impulse = impulse_, target = target_, compliance = compliance_
-    for i in range(m):
-        if scale[i] != 0.0:
-            impulse[i] = dt * force[i] / scale[i]
-        target[i] = dt * scale[i] * aref[i]
-        compliance[i] = r[i] * scale[i] * scale[i]
-        x = fabs(r[i] * inverse[i] - 1.0)
-        if gap == gap and not x <= gap:                 # NaN stays
-            gap = x
-    return impulse_, target_, compliance_, gap
+def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, const double[::1] values,
+          const double[:] x, const double[:] y):
+    """M's rows by first place and length as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
-
-def lower_pointers(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, Py_ssize_t entries):
-    """Pointers (n + 1) of M's rows by first place and length; None where they are no lower triangle, row behind row.
-
-    Columns ascend to the diagonal entry, and as many numbers go with them.
+    Columns ascend to the diagonal entry. None where these are no lower triangle, row behind row.
     """
-    cdef Py_ssize_t i, q, n = first.shape[0], nnz = columns.shape[0]
-    out = np.empty(n + 1, np.int32)
-    cdef int32_t[::1] at = out
-    cdef int32_t last
-    at[0] = 0
-    if entries != nnz or count.shape[0] != n:
+    cdef int32_t i, q, j, last, n = <int32_t>first.shape[0], nnz = <int32_t>columns.shape[0]
+    cdef double gap = 0.0, big = 0.0, own, size
+    if not n == count.shape[0] == x.shape[0] == y.shape[0] or nnz != values.shape[0]:
         return None
+    whole, copy, scratch = new(n + 1 + nnz, I4), new(nnz), np.zeros(2 * n + 1)
+    cdef int32_t[::1] at = whole
+    cdef double[::1] value = copy, s = scratch          # M x, |M| |x|
+    at[0] = 0
     for i in range(n):
         if first[i] != at[i] or not 0 < count[i] <= nnz - at[i]:
             return None
         at[i + 1] = at[i] + count[i]
         last = -1
+        own = size = 0.0
         for q in range(at[i], at[i + 1]):
-            if columns[q] <= last:
+            j = columns[q]
+            if not last < j <= i:
                 return None
-            last = columns[q]
+            last = j
+            at[n + 1 + q] = j
+            value[q] = values[q]
+            own += values[q] * x[j]
+            size += fabs(values[q] * x[j])
+            s[j] += values[q] * x[i]
+            s[n + j] += fabs(values[q] * x[i])
         if last != i:
             return None
-    return out if at[n] == nnz else None
-
-
-def mass_mismatch(const int32_t[::1] mptr, const int32_t[::1] midx, const double[::1] mval, const double[::1] x,
-                  const double[::1] y):
-    """max |M x - y| over max (|M| |x| + |y|), M by its lower triangle; 0 where both vanish."""
-    cdef int32_t i, q, n = <int32_t>x.shape[0]
-    cdef double gap = 0.0, big = 0.0
-    scratch = np.zeros(2 * n + 1)
-    cdef double[::1] s = scratch
+        s[i] = own                                      # the diagonal entry once
+        s[n + i] = size
+    if at[n] != nnz:
+        return None
     for i in range(n):
-        for q in range(mptr[i], mptr[i + 1]):
-            s[i] += mval[q] * x[midx[q]]
-            s[n + i] += fabs(mval[q] * x[midx[q]])
-            if midx[q] != i:
-                s[midx[q]] += mval[q] * x[i]
-                s[n + midx[q]] += fabs(mval[q] * x[i])
-    for i in range(n):
-        if fabs(s[i] - y[i]) > gap or s[i] != s[i] or y[i] != y[i]:
-            gap = fabs(s[i] - y[i])
-        if s[n + i] + fabs(y[i]) > big:
-            big = s[n + i] + fabs(y[i])
-    return gap / big if big > 0.0 else 0.0
+        gap = widest(gap, s[i] - y[i])
+        big = widest(big, s[n + i] + fabs(y[i]))
+    return (whole[:n + 1], whole[n + 1:], copy), gap / big if big > 0.0 else gap
 
 
 def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
@@ -300,38 +303,53 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
     return (gap if filled != 0.0 else 0.0), big
 
 
-def row_gaps(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale,
-             const double[::1] rhs, const double[::1] impulse, double dt, const double[:] v, const double[:] vel,
-             const double[:] free, const double[:] b, const double[:] push, const double[:] a):
-    """How far J, scaled by row, is from vectors that were made by it, each by the size of its terms.
+def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale, double dt,
+            const double[:] v, const double[:] smooth, const double[:] aref, const double[:] r, const double[:] inverse,
+            const double[:] force, const double[:] vel, const double[:] b, const double[:] push, const double[:] a):
+    """(b, compliance, v*, whether they are finite, max |efc_R efc_D - 1|, gaps) of J scaled by row.
+
+        b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
+
+    The gaps are how far J is from vectors that were made by it, each by the size of its terms:
 
         J v = efc_vel   (1)      J a0 - aref = efc_b   (2)      J^T f = qfrc_constraint   (3)
 
-    with v before the step, rhs = dt (aref - J a0), free = dt a0, impulse = dt f. 0 where such a vector is all zeros: one
-    that a copy did not fill. The size of terms is |J_i|_1 |x|_max for (1) and (2), the largest of |J|^T |f| for (3).
-    The fourth number is 0, or NaN where a is not finite.
+    with v before the step and f = efc_force. 0 where such a vector is all zeros: one that a copy did not fill. The size
+    of terms is |J_i|_1 |x|_max for (1) and (2), the largest of |J|^T |f| for (3). The fourth is NaN where a is not finite.
     """
     cdef int32_t i, j, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>v.shape[0]
     cdef Py_ssize_t q
-    cdef double c, size, s_v, finite = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
+    cdef double c, size, s_v, s_free, f, finite = 0.0, sound = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0
-    cdef double[::1] pushed = np.zeros(2 * n + 1)       # dt J^T f, and the same of absolute values
+    rhs_, compliance_, free_, scratch = new(m), new(m), new(n), np.zeros(2 * n + 1)
+    cdef double[::1] rhs = rhs_, compliance = compliance_, free = free_
+    cdef double[::1] pushed = scratch                   # J^T f, and the same of absolute values
     for j in range(n):
+        free[j] = v[j] + dt * smooth[j]
+        sound += 0.0 * free[j]
         top_v = widest(top_v, v[j])
-        top_free = widest(top_free, free[j])
+        top_free = widest(top_free, dt * smooth[j])
         said_3 = widest(said_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
-        size = s_v = 0.0
+        size = s_v = s_free = 0.0
+        f = force[i] / scale[i] if scale[i] != 0.0 else 0.0
         for q in range(jptr[i], jptr[i + 1]):
             j = jidx[q]
             c = jval[q]
             s_v += c * v[j]
+            s_free += c * (dt * smooth[j])
             size += fabs(c)
-            c *= impulse[i]
+            c *= f
             pushed[j] += c
             pushed[n + j] += fabs(c)
+        rhs[i] = dt * scale[i] * aref[i] - s_free
+        compliance[i] = r[i] * scale[i] * scale[i]
+        sound += 0.0 * rhs[i] + 0.0 * compliance[i]
+        if compliance[i] < 0.0:
+            sound = 1.0
+        gap_0 = widest(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
         gap_1 = widest(gap_1, s_v - c)
         big_1 = widest(big_1, size * top_v + fabs(c))
@@ -341,12 +359,12 @@ def row_gaps(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1]
         big_2 = widest(big_2, size * top_free + fabs(rhs[i]) + fabs(c))
         said_2 = widest(said_2, b[i])
     for j in range(n):
-        c = dt * push[j]
-        gap_3 = widest(gap_3, pushed[j] - c)
-        big_3 = widest(big_3, pushed[n + j] + fabs(c))
-    return (gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
-            gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
-            gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
+        gap_3 = widest(gap_3, pushed[j] - push[j])
+        big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
+    return rhs_, compliance_, free_, sound == 0.0, gap_0, (
+        gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
+        gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
+        gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
 
 
 cdef inline double widest(double so_far, double x) noexcept nogil:

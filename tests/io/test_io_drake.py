@@ -75,12 +75,39 @@ def test_saps_impulses_give_its_next_velocity(approximation):
     assert (problem.operator, problem.law, problem.m) == ("generalized", "coulomb", 5 * 3 + 4)
     assert problem.row_name(12) == "world arm 4, normal"
     # Products of A with a dozen entries: rounding, and the tolerance of SAP's own momentum balance.
-    own = drake.impulse(plant, context)
-    np.testing.assert_allclose(problem.velocity(own), next_velocity(plant, context), atol=1e-8)
-    assert own.any()
-    assert (
-        problem.guess is None
-    )  # SAP's answer is no start: who times a solve from it times less than a solve
+    np.testing.assert_allclose(
+        problem.velocity(drake.impulse(plant, context)), next_velocity(plant, context), atol=1e-8
+    )
+    assert problem.guess is None  # an answer is no start
+    assert drake.impulse(plant, context).any()
+
+
+@pytest.mark.parametrize(("ratio", "count", "seed", "steps"), [(1, 3, 2, 36), (1000, 4, 1, 10)])
+def test_states_at_which_sap_stopped_at_its_tolerance_are_taken(ratio, count, seed, steps):
+    """Balls that fall on one another, the upper one heavier: what SAP leaves of one velocity's momentum is more."""
+    rng, builder = np.random.default_rng(seed), DiagramBuilder()
+    plant, _ = AddMultibodyPlantSceneGraph(builder, time_step=DT)
+    plant.SetUseSampledOutputPorts(False)
+    friction = CoulombFriction(0.5, 0.5)
+    plant.RegisterCollisionGeometry(plant.world_body(), RigidTransform(), HalfSpace(), "ground", friction)
+    balls = []
+    for i in range(count):
+        solid = SpatialInertia.SolidSphereWithMass(ratio ** (i / (count - 1)), 0.1)
+        balls.append(plant.AddRigidBody(f"ball {i}", solid))
+        plant.RegisterCollisionGeometry(balls[i], RigidTransform(), Sphere(0.1), f"sphere {i}", friction)
+    plant.Finalize()
+    diagram = builder.Build()
+    whole = diagram.CreateDefaultContext()
+    context = plant.GetMyMutableContextFromRoot(whole)
+    for i, ball in enumerate(balls):
+        place = [0.02 * rng.normal(), 0.02 * rng.normal(), 0.09 + 0.19 * i]
+        plant.SetFreeBodyPose(context, ball, RigidTransform(place))
+    plant.SetVelocities(context, rng.normal(size=plant.num_velocities()))
+    for _ in range(steps):
+        problem, after = lv.io.from_drake(plant, context), next_velocity(plant, context)
+        own = problem.velocity(drake.impulse(plant, context))
+        assert np.abs(own - after).max() < 1e-5 * (1.0 + np.abs(after).max())
+        context.SetDiscreteState(0, np.array(plant.EvalUniquePeriodicDiscreteUpdate(context).value()))
 
 
 def test_rows_are_relative_velocities_of_the_surfaces():

@@ -106,6 +106,55 @@ def test_joint_limits_are_measured_at_q():
         np.testing.assert_allclose(problem.jacobian.toarray()[:, k], (ahead - behind) / 2e-6, atol=1e-7)
 
 
+KINDS = (
+    "RX", "PZ", "RUBX", "Spherical", "SphericalZYX", "Planar", "Translation", "FreeFlyer", "RevoluteUnaligned",
+)  # fmt: skip
+
+
+def vectors(joint):
+    """Positions of a joint that a limit holds: not the numbers of a quaternion, or a cosine and a sine."""
+    whole = {"FreeFlyer": 3, "Planar": 2, "RUBX": 0, "Spherical": 0}
+    return range(whole.get(joint.shortname().removeprefix("JointModel"), joint.nq))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_limits_and_friction_of_any_joint_hold_in_pinocchios_own_dynamics(seed):
+    rng = np.random.default_rng(seed)
+    model = pin.Model()
+    for i, kind in enumerate(rng.choice(KINDS, rng.integers(1, 5))):
+        axis = (np.array([0.6, 0.0, 0.8]),) if kind == "RevoluteUnaligned" else ()
+        turn = pin.SE3(pin.exp3(rng.normal(size=3)), rng.normal(size=3))
+        model.addJoint(i, getattr(pin, f"JointModel{kind}")(*axis), turn, f"{kind} {i}")
+        model.appendBodyToJoint(i + 1, pin.Inertia.FromBox(1.0, *rng.uniform(0.1, 0.5, 3)), turn)
+    q = pin.integrate(model, pin.neutral(model), rng.normal(size=model.nv))
+    model.lowerPositionLimit = q - rng.uniform(-0.02, 0.2, model.nq)
+    model.upperPositionLimit = model.lowerPositionLimit + rng.uniform(0.0, 0.5, model.nq)
+    model.upperDryFrictionLimit = rng.uniform(0.0, 2.0, model.nv)
+    model.lowerDryFrictionLimit = -rng.uniform(0.0, 2.0, model.nv)
+    v, tau, dt = rng.normal(size=model.nv), rng.normal(size=model.nv), 0.01
+    joints = list(range(1, model.njoints))
+    models = [pin.JointLimitConstraintModel(model, joints), pin.JointFrictionConstraintModel(model, joints)]
+    problem = problem_of(model, models, q, v, dt, tau=tau, correction=1.0)
+    solution = lv.solve(problem, tol=1e-10, max_iter=20_000).raise_for_status()
+    own, first = solution.impulse, problem.m - model.nv
+    # Pinocchio's velocity under these efforts, and what each joint does then.
+    effort = tau + problem.jacobian.T @ own / dt
+    after = v + dt * pin.aba(model, model.createData(), q, v, effort)
+    near = 1e-6 * (1.0 + np.abs(after).max())
+    np.testing.assert_allclose(problem.velocity(own), after, atol=near)
+    np.testing.assert_array_equal(problem.jacobian.toarray()[first:], np.eye(model.nv))
+    sticks = (own[first:] > -dt * -model.lowerDryFrictionLimit) & (
+        own[first:] < dt * model.upperDryFrictionLimit
+    )
+    assert np.abs(after[sticks]).max(initial=0.0) <= near
+    assert (own[first:] * after <= near).all()  # what slides is braked
+    rate = 1e6 * (pin.integrate(model, q, 1e-6 * after) - q)  # of the positions
+    places = [j.idx_q + i for j in list(model.joints)[1:] for i in vectors(j)]
+    end = (q + dt * rate)[places]
+    assert (end - model.lowerPositionLimit[places]).min(initial=0.0) >= -1e-5
+    assert (model.upperPositionLimit[places] - end).min(initial=0.0) >= -1e-5
+
+
 @pytest.mark.parametrize("kind", ["contact", "anchor"])
 def test_a_desired_velocity_is_the_targets(kind):
     model, models, q, v = robot()

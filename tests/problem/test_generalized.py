@@ -505,3 +505,26 @@ def test_many_rows_on_many_trees_are_ordered_whoever_else_holds_the_pattern():
     )  # fmt: skip
     assert problem.generalized is not None
     assert np.isfinite(lv.solve(problem, tol=1e-3, max_iter=50).residual.relative)
+
+
+@given(seed=seeds, same=st.sampled_from(["tree", "size", "nothing"]))
+def test_the_pattern_of_a_factor_serves_again_where_it_is_the_same_and_nowhere_else(seed, same):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 12))
+    tree = random_tree(rng, n)
+    other = tree if same == "tree" else random_tree(rng, n if same == "size" else n + 1)
+
+    def made(parent, like=None):
+        lower = sp.csr_array(np.tril(tree_mass(rng, parent)))
+        mass = lower.indptr.astype(np.int32), lower.indices.astype(np.int32), lower.data
+        jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
+        return mass, lv.Generalized.compressed(jac, mass, np.zeros(len(parent)), like=like)
+
+    _, before = made(other)
+    mass, shared = made(tree, before.operator)
+    jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
+    alone = lv.Generalized.compressed(jac, mass, np.zeros(n))
+    x = rng.normal(size=n)
+    assert np.array_equal(shared.solve(x), alone.solve(x))
+    assert np.array_equal(shared.operator.parents, alone.operator.parents)
+    assert (shared.operator.fill, shared.operator.work) == (alone.operator.fill, alone.operator.work)
