@@ -24,6 +24,7 @@ NAMES = (
     "newton",
     "page",
     "peers",
+    "planted",
     "shapes",
     "stability",
     "stand",

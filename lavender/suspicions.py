@@ -7,6 +7,10 @@ that hold in data of real bodies:
                 n.(c_b - c_a) > 0 between bodies without hollows                                        (1)
     size        k^2 = tr(I) / 2m, the radius of gyration, is of the size of the arms                    (2)
     targets     target = b + J v*: zero on tangents, not negative where bodies overlap                  (3)
+    speeds      v* is a velocity, not g = 9.81 m/s^2; targets and approaches are those of things that move (4)
+
+Of J and M, (1) is known where contacts are of rigid bodies alone: six velocities, coupled to no other, of which three
+have one mass, in the frame of the world: a row of direction d has J = (d, r x d) there, with the arm r.
 
 Every threshold keeps a distance from the values in the built-in suite, the scenes of the gallery, robots and recorded
 problems. If the numbers would be ordinary under another reading (M^-1 read as M), the suspicion says so.
@@ -19,18 +23,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
 from lavender.cones import ROUND, ROW
 from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
+from lavender.rows import Rows
 
 __all__ = ["Suspicion", "diagnose"]
 
 MU = 10.0  # -, beyond any pair of materials
 LARGE = 600  # velocities up to which an inverse of M is looked at
 FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
+G = 9.81  # m/s^2
+PUSHED = 30.0  # m/s, of a target that moves bodies apart: 6 cm in a step of 2 ms
+LET = 1000.0  # m/s, of one that lets them approach: over a gap of 2 m in such a step
+FAST = 30.0, 1e4  # m/s, of a contact's approach before a step; what is faster is told in another unit
 
 
 @dataclass(frozen=True)
@@ -222,20 +232,59 @@ def _targets(p: Problem) -> Iterator[Suspicion]:
         reason = f"tangents have targets up to {np.abs(target[tangent]).max():.3g} m/s, and none with the {joints} "
         yield _of(p, "targets", reason + "targets of joints put first, where their rows stand")
         return
-    un, tn = u[normal], target[normal]
-    if p.rows is None or not _at_rest(p):
+    full = np.flatnonzero(c.n_tangents == 2)
+    each = np.abs(target[c.ptr[full][:, None] + np.arange(3)])
+    used, most = each.any(axis=0), each.max(axis=1, initial=0.0)
+    # A conveyor's are equal.
+    if not used[:1].any() and used[1:].sum() == 1 and np.ptp(most) > 0.01 * most.max():
+        reason = f"targets stand in the {'second' if used[1] else 'third'} row of contacts and never in the first; a "
+        yield _of(p, "tangents first", reason + "contact's rows are normal, tangent, tangent", full)
         return
-    if np.all(p.b[normal] <= 0.0) and np.all(tn < 0.0) and np.any(un < 0.0):
-        reason = f"every contact has a negative target (to {tn.min():.3g} m/s), which lets its bodies approach as over "
-        reason += "a gap, and nothing holds them; of a depth that is positive inside the target is +depth/dt"
-        yield _of(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
+    un, tn = u[normal], target[normal]
+    r = _bodies(p)
+    rest = None if r is None or not _at_rest(r) else np.linalg.norm(r.v_free[:, :3], axis=1)
+    wild = (tn > (PUSHED if rest is None else max(1.0, 20.0 * float(rest.max())))) | (tn < -LET)
+    if wild.any():
+        most = float(tn[np.argmax(np.abs(tn) * wild)])
+        reason = (
+            f"{np.count_nonzero(wild)} contacts have targets up to {most:.3g} m/s, more than moves there; "
+        )
+        reason += "a depth or a gap in m is divided by dt once, and a gap counts as negative"
+        yield _of(p, "targets", reason, np.flatnonzero(contact)[wild], target=most)
+        return
+    if r is None or rest is None:
+        return
+    if np.all(tn < 0.0) and np.any(un < 0.0) and np.any(np.all(r.contact_body >= 0, axis=1)):
+        least = float(np.median(-tn))
+        if least > 0.1 * float(np.median(rest)):
+            reason = f"bodies at rest approach at every contact as over a gap (targets to {tn.min():.3g} m/s); of a "
+            reason += "depth that is positive inside the target is +depth/dt"
+            yield _of(p, "targets", reason, np.flatnonzero(contact), target=float(tn.min()))
+
+
+def _speeds(p: Problem) -> Iterator[Suspicion]:
+    motion, r = _motion(p), _bodies(p)
+    contact = np.flatnonzero(p.cones.kind != ROW)
+    if motion is None or not len(contact):
+        return
+    if r is not None and np.any(r.inv_mass > 0.0):
+        v = np.linalg.norm(r.v_free[r.inv_mass > 0.0, :3], axis=1)
+        if np.median(np.abs(v - G)) <= 0.01 * G:
+            reason = f"v* of bodies is {np.median(v):.3g} m/s, as g is in m/s^2: is it v + dt a?"
+            yield _of(p, "v_free", reason, speed=float(np.median(v)))
+            return
+    toward = -motion[0][p.cones.normal_rows]
+    if FAST[0] < toward.max() < FAST[1]:
+        i = int(np.argmax(toward))
+        reason = f"bodies approach each other with {toward[i]:.3g} m/s; v* is v + dt a: do accelerations lack their dt?"
+        yield _of(p, "v_free", reason, contact[toward > FAST[0]], speed=float(toward[i]))
 
 
 def _above(p: Problem) -> Iterator[Suspicion]:
     # Most bodies have one velocity v*, that of a step of gravity; what stands still holds some of them from below.
-    if p.rows is None or np.count_nonzero(p.rows.inv_mass) < 2:
+    r = _bodies(p)
+    if r is None or np.count_nonzero(r.inv_mass) < 2:
         return
-    r = p.rows
     still = np.flatnonzero((r.contact_body < 0).any(axis=1))
     v = r.v_free[r.inv_mass > 0.0, :3]
     fall = np.median(v, axis=0)
@@ -245,16 +294,17 @@ def _above(p: Problem) -> Iterator[Suspicion]:
     toward = np.where(r.contact_body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
     if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
         reason = "what stands still pushes bodies the way they fall: are normals flipped, or bodies swapped?"
-        yield _of(p, "normals", reason, r.n_joints + still, along=float(toward.mean()))
+        yield _of(
+            p, "normals", reason, np.flatnonzero(p.cones.kind != ROW)[still], along=float(toward.mean())
+        )
 
 
-def _at_rest(p: Problem) -> bool:
+def _at_rest(r: Rows) -> bool:
     """Bodies have about one velocity v*, and each touches another: what one step of gravity makes of rest."""
-    assert p.rows is not None
-    moving = p.rows.inv_mass > 0.0
-    if not np.isin(np.flatnonzero(moving), p.rows.contact_body).all() or not moving.any():
+    moving = r.inv_mass > 0.0
+    if not np.isin(np.flatnonzero(moving), r.contact_body).all() or not moving.any():
         return False
-    v = p.rows.v_free[moving, :3]
+    v = r.v_free[moving, :3]
     fall = np.median(v, axis=0)
     return bool(np.linalg.norm(v - fall, axis=1).max() <= 0.1 * np.linalg.norm(fall))
 
@@ -262,31 +312,78 @@ def _at_rest(p: Problem) -> bool:
 # -- contacts of bodies --------------------------------------------------------------------------------------
 
 
+def _bodies(p: Problem) -> Rows | None:
+    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
+    g, c = p.generalized, p.cones
+    contact = c.kind != ROW
+    if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
+        return p.rows
+    mass, part = g.mass.toarray(), g.jac.toarray()[c.ptr[:-1][contact][:, None] + np.arange(3)]
+    six: list[npt.NDArray[np.intp]] = []
+    for j in _free(mass):  # a ball's spin has one mass, too
+        if j + 6 <= g.nv and (not six or j > six[-1][-1]):
+            six.append(np.arange(j, j + 6))
+    if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
+        return None
+    at = np.array(six)
+    push, turn = part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)  # (bodies, c, 3, 3)
+    moment = push.swapaxes(2, 3) @ turn  # sum of d (r x d)^T = [r]^T
+    on = push.any(axis=(2, 3))
+    k, count, first, last = (
+        np.arange(len(part)),
+        on.sum(axis=0),
+        on.argmax(axis=0),
+        -1 - on[::-1].argmax(axis=0),
+    )
+    axes = push[last, k]
+    other = push[first, k] + np.where(count == 2, 1.0, -1.0)[:, None, None] * axes
+    off = np.abs(axes @ axes.swapaxes(1, 2) - np.eye(3)).max() + np.abs(other).max()
+    off += np.abs(moment + moment.swapaxes(2, 3)).max() / max(1.0, np.abs(moment).max())
+    if not off < 1e-6 or np.delete(part, at, axis=2).any() or count.min() < 1 or count.max() > 2:
+        return None
+    arm = np.stack([moment[..., 1, 2], moment[..., 2, 0], moment[..., 0, 1]], axis=-1)
+    return Rows(
+        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.broadcast_to(np.eye(3), (len(six), 3, 3)),
+        v_free=g.v_free[at], normal=axes[:, 0], tangent=axes[:, 1], arm_a=arm[first, k], arm_b=arm[last, k],
+        contact_body=np.stack([np.where(count == 2, first, -1), len(six) + last], axis=1),
+    )  # fmt: skip
+
+
 def _geometry(p: Problem) -> Iterator[Suspicion]:
-    if p.rows is None or not p.rows.n_contacts:
+    r = _bodies(p)
+    if r is None or not r.n_contacts:
         return
-    r = p.rows
-    first = r.n_joints
+    blocks = np.flatnonzero(p.cones.kind != ROW)
     a, b = r.contact_body.T
     reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
     size = reach.sum(axis=0)
-    along = np.einsum("ij,ij->i", r.normal, r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None])
+    between = r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None]
+    axes = np.stack([r.normal, r.tangent, np.cross(r.normal, r.tangent)], axis=1)
+    along, *aside = np.einsum("cki,ci->kc", axes, between)
+    for row, other in zip(("second", "third"), aside, strict=True):
+        for sign in (1.0, -1.0):
+            if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
+                reason = f"bodies lie behind each other along the {row} row of contacts and not along the first; a "
+                reason += "contact's rows are normal, tangent, tangent"
+                yield _of(p, "tangents first", reason, blocks)
+                return
     against = np.flatnonzero(along < -0.1 * size)  # (1)
     if len(against):
         i = int(against[np.argmin(along[against] / size[against])])
         reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
         reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
-        yield _of(p, "normals", reason, first + against, along=float(along[i]))
+        yield _of(p, "normals", reason, blocks[against], along=float(along[i]))
+    if p.rows is None:
+        return  # repeated rows are told by J
     again, opposed = _same_place(r, size)
     if len(again):
-        yield _of(
-            p, "duplicate rows", f"{len(again)} contacts stand where another of the pair does", first + again
-        )
+        reason = f"{len(again)} contacts stand where another of the pair does"
+        yield _of(p, "duplicate rows", reason, blocks[again])
     if len(opposed):
         reason = "two contacts of a pair in one place push opposite ways"
-        yield _of(p, "opposed normals", reason, first + opposed)
+        yield _of(p, "opposed normals", reason, blocks[opposed])
     moving = np.flatnonzero((a >= 0) & (b >= 0))
-    off = _loops(np.stack([a, b], axis=1)[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    off = _loops(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
     wrong = moving[off > FAR * size[moving]]
     if len(wrong) and len(wrong) <= 0.2 * len(moving):
         i = int(wrong[0])
@@ -294,11 +391,15 @@ def _geometry(p: Problem) -> Iterator[Suspicion]:
             f"by its arms contact {i} has the centres of bodies {a[i]} and {b[i]} elsewhere than the others "
         )
         yield _of(
-            p, "bodies", reason + "have them: does it name another body?", first + wrong, off=float(off.max())
+            p,
+            "bodies",
+            reason + "have them: does it name another body?",
+            blocks[wrong],
+            off=float(off.max()),
         )
 
 
-def _same_place(r: Any, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _same_place(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Contacts that repeat another of their pair to rounding, and those that oppose one within a hundredth."""
     pair = np.sort(r.contact_body, axis=1)
     turned = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
@@ -455,5 +556,5 @@ def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
 
 
 _CHECKS: tuple[Callable[[Problem], Iterator[Suspicion]], ...] = (
-    _friction, _keys, _order, _twins, _targets, _above, _geometry, _masses, _inverse,
+    _friction, _keys, _order, _twins, _targets, _speeds, _above, _geometry, _masses, _inverse
 )  # fmt: skip

@@ -1,0 +1,224 @@
+"""Mistakes planted in problems that hold none, and the share that `lv.diagnose` finds: `python -m benchmarks planted`.
+
+30 steps of the gallery's scenes, of bodies and with the same J and M; contacts overlap by up to 1 mm or have a gap. Of
+MuJoCo models that are named (`--models`), states of random controls with J, M, v* = v + dt a and targets as above. A
+mistake that changes nothing in a problem (a sign of gaps where there are none) is not counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from benchmarks.output import markdown
+from lavender.cones import ROW, Cones
+from lavender.engine import Simulation
+from lavender.errors import LavenderError
+from lavender.io import from_mujoco
+from lavender.problem import Problem
+from lavender.rows import Rows
+from lavender.scene import Scene
+from lavender.suspicions import diagnose
+
+SCENES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("stack", {"n": 12}),
+    ("stack", {"n": 4, "size": 0.5, "mass": 60.0}),
+    ("pyramid", {"base": 6}),
+    ("card_house", {"levels": 2}),
+    ("pile", {"n": 40, "size": 0.3}),
+    ("pile", {"n": 30, "kind": "boxes", "size": 0.3}),
+    ("bridge", {}),
+    ("bridge", {"n": 8, "load": 3.0}),
+    ("heavy_on_light", {}),
+    ("heavy_on_light", {"ratio": 10.0, "n": 4}),
+    ("table", {}),
+    ("ramp", {}),
+    ("ramp", {"angle": 0.6}),
+    ("stack", {"n": 2}),
+    ("card_house", {"levels": 3}),
+)
+STEPS = (2, 45)
+DEPTH, SHARE = 1e-3, 0.2  # m, the deepest overlap; - of it that one step takes back
+STATES = (60, 150, 300, 500, 700, 900, 1200, 1500)  # steps of a MuJoCo model
+NONE = "none"
+MARGIN = 0.02  # m, a gap from which it reports contacts
+
+
+@dataclass
+class Given:
+    """What somebody gives: J, M and v*, or rows; the targets of contacts (c, 3), and what v* was made of."""
+
+    jac: Any  # (m, nv)
+    mass: Any  # (nv, nv)
+    before: Any  # (nv,) v
+    change: Any  # (nv,) a
+    dt: float
+    target: Any  # (m,)
+    cones: Cones
+    rows: Rows | None = None
+    v_free: Any = None  # v + dt a
+
+    def __post_init__(self) -> None:
+        self.v_free = self.before + self.dt * self.change if self.v_free is None else self.v_free
+
+    @property
+    def problem(self) -> Problem:
+        """Of rows where there are rows."""
+        c = self.cones
+        if self.rows is None:
+            return Problem.from_jacobian(self.jac, self.mass, self.v_free, target=self.target, cones=c)
+        rows, kj = replace(self.rows, v_free=self.v_free.reshape(-1, 6)), self.rows.n_joints
+        mj = len(rows.jac)
+        return Problem.from_rows(
+            rows,
+            self.target,
+            lower=c.lower[:mj],
+            upper=c.upper[:mj],
+            mu=c.mu[kj:],
+            tangents=c.n_tangents[kj:],
+        )
+
+    @property
+    def contacts(self) -> Any:
+        """Rows of each contact (c, 3)."""
+        return self.cones.ptr[:-1][self.cones.kind != ROW][:, None] + np.arange(3)
+
+    def turned(self, to: tuple[int, int, int], sign: float = 1.0) -> Given:
+        """With other rows of J in the place of normal, tangent, tangent; the targets move with them."""
+        at = self.contacts
+        jac, target = self.jac.copy(), self.target.copy()
+        jac[at], target[at] = self.jac[at[:, to]], self.target[at[:, to]]
+        jac[at[:, 0]] *= sign
+        rows = self.rows
+        if rows is not None:
+            axes = (rows.normal, rows.tangent, np.cross(rows.normal, rows.tangent))
+            rows = replace(rows, normal=sign * axes[to[0]], tangent=axes[to[1]])
+        return replace(self, jac=jac, target=target, rows=rows)
+
+    def aimed(self, factor: float) -> Given:
+        """Targets of normals times a factor."""
+        target = self.target.copy()
+        target[self.contacts[:, 0]] *= factor
+        return replace(self, target=target)
+
+    def rubbed(self) -> Given:
+        """Coefficients of friction as angles in degrees."""
+        c = self.cones
+        degrees = np.degrees(np.arctan(c.mu))
+        values = {f.name: getattr(c, f.name) for f in fields(c)} | {
+            "mu": np.where(c.kind == ROW, c.mu, degrees)
+        }
+        return replace(self, cones=Cones(**values))
+
+
+def planted(given: Given) -> Iterator[tuple[str, Given]]:
+    """Each mistake that changes something; first none."""
+    yield NONE, given
+    yield "normals flipped", given.turned((0, 1, 2), -1.0)
+    yield "tangents first", given.turned((1, 2, 0))
+    if given.target[given.contacts[:, 0]].any():
+        yield "gap or depth of the wrong sign", given.aimed(-1.0)
+        yield "targets times dt once more", given.aimed(given.dt)
+        yield "targets divided by dt twice", given.aimed(1.0 / given.dt)
+    yield "v* = v + a, without dt", replace(given, v_free=given.before + given.change)
+    if np.any(given.cones.mu > 0.0):
+        yield "mu in degrees", given.rubbed()
+
+
+def scenes() -> Iterator[tuple[str, Given]]:
+    """Steps of the gallery's scenes that have contacts, of bodies."""
+    for (name, parameters), steps in ((s, n) for s in SCENES for n in STEPS):
+        simulation = Simulation(Scene(name, **parameters))
+        for _ in range(steps):
+            simulation.step()
+        p = simulation.constraint_problem()
+        rows, contact = p.rows, p.cones.normal_rows
+        if rows is None or not len(contact):
+            continue
+        given = simulation.scene.parameters
+        dt = given.dt / (given.substeps or np.ceil(given.dt / given.max_substep - 1e-9))
+        target = p.b + p.jacobian @ rows.v_free.ravel()
+        touch = contact[np.abs(target[contact]) < 1e-9]
+        depth = np.random.default_rng(steps).uniform(0.0, DEPTH, len(touch))
+        target[np.abs(target) < 1e-9] = 0.0
+        target[touch] = SHARE * depth / dt
+        fall = np.where(rows.inv_mass[:, None] > 0.0, [0.0, 0.0, -9.81, 0.0, 0.0, 0.0], 0.0).ravel()
+        mass = np.linalg.inv(rows.inverse_mass_matrix().toarray()) if np.all(rows.inv_mass > 0.0) else None
+        v = rows.v_free.ravel() - dt * fall
+        yield f"{name} {steps}", Given(p.jacobian.toarray(), mass, v, fall, dt, target, p.cones, rows)
+
+
+def robots(models: tuple[str, ...]) -> Iterator[tuple[str, Given]]:
+    """States of MuJoCo models under random controls, each with contacts at once and from a gap of MARGIN on."""
+    for path, margin in ((m, g) for m in models for g in (0.0, MARGIN)):
+        import mujoco as mj
+
+        model = mj.MjModel.from_xml_path(path)
+        model.geom_margin[:] = margin
+        data, rng, dt = mj.MjData(model), np.random.default_rng(1), float(model.opt.timestep)
+        low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+        for step in range(STATES[-1] + 1):
+            if step % 20 == 0:
+                data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
+            mj.mj_step(model, data)
+            mj.mj_forward(model, data)
+            if step not in STATES or not data.ncon:
+                continue
+            try:
+                general = from_mujoco(model, data).generalized
+            except LavenderError:
+                continue
+            assert general is not None
+            jac, target, mu = [], [], []
+            for contact in data.contact:
+                bodies = model.geom_bodyid[contact.geom]
+                at = [np.zeros((3, model.nv)) for _ in bodies]
+                for x, body in zip(at, bodies, strict=True):
+                    mj.mj_jac(model, data, x, None, contact.pos, body)
+                jac.append(contact.frame.reshape(3, 3) @ (at[1] - at[0]))
+                target += [-contact.dist / dt * (1.0 if contact.dist > 0.0 else SHARE), 0.0, 0.0]
+                mu.append(contact.friction[0])
+            mass, cones = general.mass.toarray(), Cones.contacts(np.array(mu))
+            acceleration = (general.v_free - data.qvel) / dt
+            given = np.concatenate(jac), mass, data.qvel.copy(), acceleration, dt, np.array(target), cones
+            yield f"{Path(path).stem} {step}", Given(*given)
+
+
+def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]]:
+    """For each form the problems with each mistake in which something was found, and their number."""
+    found: dict[str, dict[str, tuple[int, int]]] = {}
+    of_bodies = list(scenes())
+    forms = {
+        "bodies": of_bodies,
+        "the same, J and M": [(name, replace(x, rows=None)) for name, x in of_bodies],
+        "robots, J and M": robots(models),
+    }
+    for form, problems in forms.items():
+        for _, given in problems:
+            right: set[str] = set()
+            for mistake, wrong in planted(given):
+                kinds = {suspicion.kind for suspicion in diagnose(wrong.problem)}
+                right = kinds if mistake == NONE else right
+                hit, all_ = found.setdefault(form, {}).get(mistake, (0, 0))
+                found[form][mistake] = hit + bool(kinds if mistake == NONE else kinds - right), all_ + 1
+    return found
+
+
+def table(found: dict[str, dict[str, tuple[int, int]]]) -> str:
+    """As docs/failures.md shows it."""
+    lines = [["mistake", *found]]
+    for mistake in found["bodies"]:
+        lines.append([mistake, *("{} of {}".format(*of.get(mistake, (0, 0))) for of in found.values())])
+    return markdown(lines[0], lines[1:])
+
+
+@click.command("planted")
+@click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
+def command(models: tuple[str, ...]) -> None:
+    """Mistakes planted in good problems: in how many of them `lv.diagnose` finds something."""
+    click.echo(table(shares(models)))
