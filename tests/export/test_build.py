@@ -214,6 +214,43 @@ def test_vectors_are_of_what_the_report_of_these_records_recommends(tmp_path):
         vectors.made(records, "direct", 1)
 
 
+def test_the_programs_of_the_page_run_verbatim(folder, shared, compiler, tmp_path, monkeypatch):
+    page = (Path(__file__).resolve().parents[2] / "docs" / "c.md").read_text()
+    program, steps = re.findall(r"^```c\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (python,) = re.findall(r"^```py\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    records = tmp_path / "records.jsonl"
+    bench.run(["granularF(n=3)"], ["auto"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1), records)
+    (tmp_path / "chosen.h").write_text(vectors.made(records, None, 1)["chosen.h"])
+    (tmp_path / "drop.c").write_text(program)
+    call = "  if (solve(chosen, q, impulse, &result) || !(result.verdict.relative < 1e-6)) return 2;\n"
+    whole = program.replace("int main(", steps + "\nint main(").replace(
+        "  free(solver.memory);", call + "  free(solver.memory);"
+    )
+    more = "  solver_t chosen[STEPS] = {{NULL, NULL, 0}};\n  double impulse[3 * MOST];\n  lav_problem q;\n"
+    (tmp_path / "both.c").write_text(whole.replace("  lav_problem q;\n", more, 1))
+    link = [shared, f"-Wl,-rpath,{shared.parent}", "-lm", "-I", folder]
+    for name in ("drop", "both"):
+        run(
+            compiler,
+            "-std=c99",
+            *WARNINGS,
+            "-ffp-contract=off",
+            tmp_path / f"{name}.c",
+            *link,
+            "-o",
+            tmp_path / name,
+        )
+    (tmp_path / "steps").mkdir()
+    assert run(tmp_path / "drop", tmp_path / "steps").startswith("converged")
+    run(tmp_path / "both")
+    found = [lv.load(path) for path in sorted((tmp_path / "steps").glob("*.npz"))]
+    assert len(found) == 240 and lv.solve(found[-1], "newton").success
+    monkeypatch.chdir(shared.parent)
+    said = []
+    exec(python, {"print": said.append})
+    np.testing.assert_allclose(said[0], [0.5, 0.0], atol=1e-15)
+
+
 def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, compiler, tmp_path):
     records = tmp_path / "records.jsonl"
     plan = bench.Plan(levels=(1e-3, 1e-6, 1e-9), budgets=(), repeats=1)
