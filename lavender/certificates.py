@@ -14,6 +14,7 @@ made it, in the metric of D = diag(d), k the rows of y:
 
     A given           |z_i| <= (k + 2) 2^-53 sqrt(d_i) sum_j sqrt(d_j) |y_j|                      (3)
     J, M and R given  |J^T y|_M^-1 <= (k + 2) 2^-53 sum_j sqrt(d_j) |y_j|,   R y = 0 exactly      (4)
+    bodies            the same, with J as float64 has it
 
 and no solution with an impulse as large as (2) could be told from a failure: its floor would be above 1e-6. The error
 of any impulse (`lavender.residuals`) is
@@ -45,9 +46,7 @@ FAR = 1e-10  # of b.y: what z may reach, so that the floor of a solution is abov
 SURE = 1e3  # times its rounding: a sum beyond is known well enough as it comes
 NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
 SIMPLE = 16  # rows of a certificate up to which numbers are looked for that make A^T y zero exactly
-POLISHED = (
-    600  # rows of a certificate up to which it is polished: a dense least-squares problem of so many unknowns
-)
+POLISHED = 600  # rows of a certificate up to which it is polished, by dense least squares
 
 
 @dataclass(frozen=True)
@@ -88,9 +87,8 @@ def prove(problem: Problem, y: Any, tol: float = 0.0) -> Proof:
     with np.errstate(all="ignore"):  # what overflows proves nothing
         y, inner = np.asarray(y, float), problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
-            return Proof(
-                y, 0.0, f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
-            )
+            reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
+            return Proof(y, 0.0, reason)
         found = _proof(inner, problem.on_disk(y), tol)
         if 0.0 < found.impulse_bound < math.inf and (found.reason or np.count_nonzero(y) <= SIMPLE):
             for nearer in _polished(inner, found.y):
@@ -131,12 +129,10 @@ def _proof(problem: Problem, y: FloatArray, tol: float) -> Proof:
     if np.any(slack > zero):
         words = f"A^T y reaches {over:.2e}, above rounding: impulses within the bounds can meet b.y"
         return Proof(given, bound, f"{words}, of at least {rounded_down(bound)} N s")
-    least = _least(problem, net, y, np.where(slack > 0.0, 0.0, np.maximum(-low, high)))
-    if not least > max(tol, _rounded(problem)):
-        return Proof(
-            given, bound, f"no exact solution, but one to a relative residual of {least:.1g} may exist"
-        )
-    return Proof(given, bound)
+    least, rounded = _least(problem, net, y, np.where(slack > 0.0, 0.0, np.maximum(-low, high)))
+    if least > max(tol, rounded):
+        return Proof(given, bound)
+    return Proof(given, bound, f"no exact solution, but one to a relative residual of {least:.1g} may exist")
 
 
 def _slack(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -216,25 +212,20 @@ def _pull(
     return np.where(endless, 0.0, pull), np.where(endless, size, 0.0), zero
 
 
-def _least(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> float:
-    """The least relative residual (5) of any impulse."""
-    data = problem.metric
+def _least(problem: Problem, net: float, y: FloatArray, z: FloatArray) -> tuple[float, float]:
+    """The least relative residual (5) of any impulse, and what rounding of b, or of target and J v*, may leave."""
+    data, size = problem.metric, np.abs(problem.b)
     reference(problem)
     energy = net / (_energy(data, y * data.d) + _energy(data, z))
     velocity = 0.0 if np.any(z) else net / np.sum(data.d * np.abs(y) / data.weight)
-    return float(relative_of(data, energy, velocity)) if energy + velocity < math.inf else 0.0
-
-
-def _rounded(problem: Problem) -> float:
-    """The relative residual that rounding of b, or of the target and J v* that made it, may leave."""
-    data, size = problem.metric, np.abs(problem.b)
+    if not energy + velocity < math.inf:
+        return 0.0, 0.0
     if problem.matrix is None:
         free = problem.generalized.v_free if problem.rows is None else problem.rows.v_free  # type: ignore[union-attr]
         size = size + 2.0 * (abs(problem.jacobian) @ np.abs(free.ravel()))
     off = 4.0 * UNIT * size
-    return float(
-        relative_of(data, _energy(data, off), float(np.max(data.weight * off / data.d, initial=0.0)))
-    )
+    most = np.max(data.weight * off / data.d)
+    return relative_of(data, energy, velocity), relative_of(data, _energy(data, off), most)
 
 
 def _energy(data: Any, w: FloatArray) -> Any:

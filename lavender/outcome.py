@@ -14,7 +14,7 @@ from lavender.cones import ROW
 from lavender.errors import InputError
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, in_one_call
-from lavender.residuals import FLOOR_MOST, Residual, at_floor, reference, relative_of, residual
+from lavender.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
 from lavender.solution import Claim, History, Solution, SolverRun, Status
 from lavender_ext.judge.measure import Judged, all_finite
 
@@ -47,7 +47,11 @@ def finish(
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
         status = DIVERGED
-    elif status is CONVERGED and tol < relative == judged.floor and _meets(problem, judged, tol):
+    elif (
+        status is CONVERGED
+        and tol < relative == judged.floor
+        and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+    ):
         status = DIVERGED
         message = _joined(message, "beside such impulses float64 loses b")
     elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
@@ -116,11 +120,6 @@ def _joined(message: str, more: str) -> str:
     return message if more in message else f"{message}; {more}".removeprefix("; ")
 
 
-def _meets(problem: Problem, judged: Residual, tol: float) -> bool:
-    """Whether w, as float64 has it, is within tol, whatever rounding hides."""
-    return relative_of(problem.metric, judged.energy, judged.velocity) <= tol
-
-
 def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
     """Within tol or at the floor of A as it was formed: what the given data add is rounding in its forming."""
     try:
@@ -145,9 +144,11 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
 
 def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
-    cones = problem.cones
-    for i in problem.metric.empty:
-        block = problem.block_of(int(i))
+    cones, worst, empty = problem.cones, -1, problem.metric.empty
+    if not len(empty):
+        return None
+    for i in np.setdiff1d(empty, problem.vanished_rows).tolist():
+        block = problem.block_of(i)
         if cones.kind[block] != ROW and i != cones.ptr[block]:
             continue  # tangents and spin: bounded by mu lambda_n
         b = problem.b[i]
@@ -156,10 +157,12 @@ def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tupl
             continue
         if np.isfinite(bound):
             impulse[i] = bound
-            continue
-        y = np.zeros(problem.m)
-        y[i] = math.copysign(1.0, b)
-        if prove(problem, y, tol).reason:
-            continue  # its products vanish or overflow, but it is not zero; or b is dust
-        return f"{problem.row_name(int(i))}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
-    return None
+        elif worst < 0 or abs(b) > abs(problem.b[worst]):
+            worst = i
+    if worst < 0:
+        return None
+    y, b = np.zeros(problem.m), problem.b[worst]
+    y[worst] = math.copysign(1.0, b)
+    if prove(problem, y, tol).reason:
+        return None  # b is dust
+    return f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y
