@@ -90,6 +90,20 @@ def test_recorded_steps_are_known_by_themselves_and_kept_apart(tmp_path):
     assert {i.sequence for i in alike} == {"my steps", "a/My_steps"}
 
 
+def test_folders_in_a_folder_are_taken_too(tmp_path):
+    from lavender import io
+
+    for place in ("a.npz", "piles/b.npz", "piles/c.npz", "chains/d.npz", "deep/er/e.npz"):
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        io.save(stack(4), tmp_path / place)
+    (tmp_path / "notes").mkdir()
+    assert [i.name for i in bench.resolve([tmp_path, "stack(n=2)"])] == ["a", "stack(n=2)", "d", "b", "c"]
+    (tmp_path / "a.npz").unlink()
+    assert [i.name for i in bench.resolve([tmp_path])] == ["d", "b", "c"]
+    with pytest.raises(lv.InputError, match="holds no problem file"):
+        bench.resolve([tmp_path / "deep" / "er" / "..", tmp_path / "notes"])
+
+
 def test_a_folder_is_a_sequence_in_numeric_order(tmp_path):
     from lavender import io
 
