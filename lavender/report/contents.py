@@ -75,7 +75,7 @@ def sections(report: Report) -> list[Section]:
     else:
         by_structure = (
             "to a level: mean time, share of cases that get there, budget; in a time or with sweeps: share of cases "
-            "served, residual at the 90th percentile; ≈ as good within noise"
+            "served, nine of ten at least, residual at the 90th percentile; ≈ as good within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"

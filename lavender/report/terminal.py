@@ -36,9 +36,9 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
     for i, told in enumerate(report.verdict.told):
         if whole or i == 0 or told.asked:
             said.append(Text(told.text, style="" if i else "bold"))
-            said += [
-                Text(f"    {line}") for line in ((*told.code, *told.in_c) if whole else (told.line,)) if line
-            ]
+            around = "  # the lines around it: --tables" if len(told.code) > 1 else ""
+            code = (*told.code, *told.in_c) if whole else (told.line + around,) * bool(told.line)
+            said += [Text(f"    {line}") for line in code]
     if report.busy:
         said.append(Text(report.busy, style="yellow"))
     notes = [Text.assemble((text, style)) for text, style in _notes(report, MOST if whole else 1)]

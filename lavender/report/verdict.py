@@ -23,7 +23,6 @@ from lavender.suite import FAMILIES
 
 __all__ = ["Told", "Verdict", "verdict"]
 
-PYTHON_SHARE = 2e-4  # s: below it what is measured is largely the way through Python, some 50 µs of it
 SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
 
 
@@ -118,17 +117,15 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
     for budget in sweeps:
         same = [f for f in plain if f.line.mode == "budget" and f.line.max_iter == budget]
         swept = in_time(records, same, math.inf, n)
-        if swept is not None:
+        if swept is not None and swept.ranking[0][1].is_for(QUANTILE):
             best, choice = swept.ranking[0]
-            told.append(
-                _told(records, best, _serves(f"With {count(budget, 'sweep')}", choice, math.inf), True)
-            )
+            said = _serves(f"With {count(budget, 'sweep')}", choice, math.inf)
+            told.append(_told(records, best, said, True))
+        elif swept is not None:
+            told.append(Told(f"With {count(budget, 'sweep')} nothing serves nine cases of ten.", asked=True))
     foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
     if foreign and subject.way == "call":
         said = f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
-        told.append(Told(said))
-    if first.score < PYTHON_SHARE:
-        said = f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver."
         told.append(Told(said))
     return Verdict(tuple(told), tuple(dict.fromkeys(leaders))[:3])
 

@@ -245,8 +245,7 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert text.index(said.told[0].text) < text.index(said.told[0].line) < text.index("<table")
     nobody = verdict(records_of(record("a", "x", 1.0, 0.5)))
     assert nobody.text == "No solver brings your stack down to 1e-6 of the error of doing nothing."
-    quick = verdict(records_of(record("a", "x", 1e-4, 1e-7)))
-    assert "Python's share" in quick.text
+    assert "Python's share" in text  # a limitation, on every page
 
 
 def test_each_run_says_how_busy_the_machine_was(real):

@@ -1,14 +1,18 @@
 """How sure a recommendation is: resamplings, misses that count, drift, and what others take by their own interface."""
 
+import io
 import math
 import random
 import re
 
 import pytest
+from rich.console import Console
 
 from lavender import bench, report
 from lavender.report import tables
+from lavender.report.findings import Report
 from lavender.report.tables.finals import in_time, lines, to_level
+from lavender.report.terminal import print_report
 from lavender.report.verdict import verdict
 from tests.report.test_report import record, records_of
 
@@ -133,6 +137,8 @@ def test_in_a_time_misses_count_and_the_sentence_says_how_many():
     assert alone.endswith("Nothing serves in 1.00 ms.")  # 7 of 10 are not nine of ten, in whatever time
     assert (swept.target, swept.best.solver) == (8.0, "wide")
     assert "With 8 sweeps, take wide" in verdict(found, sweeps=[8]).text
+    rest = records_of(*(r for r in made if r.solver != "wide"))
+    assert verdict(rest, sweeps=[8]).text.endswith("With 8 sweeps nothing serves nine cases of ten.")
 
 
 def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
@@ -185,3 +191,8 @@ def test_the_headline_is_of_all_sequences():
     assert verdict(found).text.startswith(
         "Use auto: it solves the 12 steps of your 3 sequences in 1.00 ms on average, down to 1e-6"
     )
+    told, out = verdict(found).told[0], io.StringIO()
+    assert told.line == 'solution = lv.solve(problem, "auto", impulse=start, tol=1e-6)'
+    assert len(told.code) == 5  # with the loop that carries impulses, which a terminal shows on request
+    print_report(Report(found), Console(file=out, width=200))
+    assert out.getvalue().splitlines()[1] == f"    {told.line}  # the lines around it: --tables"
