@@ -85,7 +85,7 @@ Source = str | Path | Problem | Case | Item
 
 
 def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> list[Item]:
-    """Cases behind files, folders (their problem files), names or cases of the suite, problems; all of it if none.
+    """Cases behind files, folders (their files, those of folders in them), names or cases of the suite: all if none.
 
     Nothing is solved, and as a rule nothing loaded yet, but every word is checked to exist.
 
@@ -123,7 +123,13 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
             items += [*steps, *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in lost)]
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
-            if not paths:
+            inner = [
+                p
+                for p in sorted(Path(word).iterdir())
+                if p.is_dir() and os.access(p, os.R_OK) and _problem_files(p)
+            ]
+            words += inner
+            if not paths and not inner:
                 kept = Path(word) / "records.jsonl"
                 shown = f": {kept} shows its report again" if kept.is_file() else ""
                 raise InputError(f"{word} holds no problem file ({', '.join(SUFFIXES)}){shown}")

@@ -29,6 +29,7 @@ __all__ = [
     "load",
     "memory",
     "memory_share",
+    "running",
     "versions",
 ]
 
@@ -114,6 +115,13 @@ def load() -> float | None:
     with contextlib.suppress(AttributeError, OSError):
         return float(os.getloadavg()[0])
     return None
+
+
+def running() -> float | None:
+    """Processes that want a processor now, this one among them; elsewhere than on Linux as `load`."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return float(Path("/proc/loadavg").read_text().split()[3].partition("/")[0])
+    return load()
 
 
 def clock() -> dict[str, str]:

@@ -231,6 +231,7 @@ class Record(_Texts):
     times: tuple[float, ...] = ()  # s, of each repeat
     reached: tuple[float, ...] = ()  # relative residual of each repeat, where they differ (mode "time")
     pace: float | None = None  # s, of a loop of fixed work beside the repeats: what the machine was worth
+    load: float | None = None  # processes that wanted a processor when it was made, this one among them
     own_min: float | None = (
         None  # s, of a backend of others on data that it was given before, by its own interface
     )

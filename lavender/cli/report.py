@@ -79,7 +79,7 @@ __all__ = ["report"]
     help="Time budgets in seconds, each with a recommended solver; default: three decades around the fastest times.",
 )
 @recording_options
-@click.option("--tables", is_flag=True, help="Also print every case and sequence.")
+@click.option("--tables", is_flag=True, help="Print every table, warning and line of code.")
 @click.option("--fresh", is_flag=True, help="Repeat runs that the folder already holds.")
 @click.option(
     "--paper",
@@ -135,7 +135,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         from lavender.report.paper import write_paper
 
         _say(f"figures, tables and method of a paper: {write_paper(found, out / 'paper')}")
-    _say(f"\n{len(done.records)} runs in {out / 'records.csv'}, page: {index}")
+    _say(f"\n{count(len(done.records), 'run')}; page: {index}")
     if done.note:
         _say(done.note)
     if done.stopped:
@@ -164,7 +164,6 @@ def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tupl
             "pass_limit",
             "time_budgets",
             "sequence",
-            "tables",
             "fresh",
         ]
         refuse_unused(

@@ -164,8 +164,11 @@ def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
     """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one."""
     path = Path(path)
     path = path if path.suffix else path.with_name(path.name + ".png")
+    from matplotlib import rc_context
+
     try:
-        write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **how))
+        with rc_context({"pdf.fonttype": 42}):  # TrueType: publishers refuse Type 3
+            write_atomically(path, lambda part: canvas.savefig(part, format=path.suffix[1:].lower(), **how))
     except (ValueError, OverflowError) as error:
         if isinstance(error, InputError):
             raise

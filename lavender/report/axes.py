@@ -12,6 +12,7 @@ from lavender.report.curves import Curve, Figure
 __all__ = ["Axis", "Shown", "shown"]
 
 LEAST_DECADES = 1.0  # a logarithmic axis spans so much, at least
+UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 
 
 class Axis:
@@ -27,6 +28,10 @@ class Axis:
             low, high = middle - 0.5 * least, middle + 0.5 * least
         room = 0.03 * (high - low) if high > low else 0.5
         self.low, self.high = low - room, high + room  # of the decimal logarithm, where it is logarithmic
+        # Times in the unit of the middle, which title and ticks share.
+        middle = 10.0 ** (0.5 * (low + high)) if log else 0.5 * (low + high)
+        self.scale, unit = next((u for u in UNITS if middle >= u[0]), UNITS[-1]) if self.is_time else UNITS[0]
+        self.title = title.replace("[s]", f"[{unit}]")
 
     def share(self, value: float) -> float:
         """0 at its beginning, 1 at its end."""
@@ -57,15 +62,10 @@ class Axis:
         return [step * k for k in range(first, first + 12) if step * k <= self.high]
 
     def text(self, tick: float) -> str:
-        """What stands at a tick: 20 µs of times, 1e-3 of powers, 0.5."""
-        if self.is_time:
-            scale, unit = next(
-                ((s, u) for s, u in ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs")) if tick >= 0.999 * s),
-                (1e-9, "ns"),
-            )
-            return f"{tick / scale:.3g} {unit}"
+        """What stands at a tick, in the unit of the title: 1e-3 of powers, 0.5."""
+        tick /= self.scale
         if self.log:
-            return f"{tick:.3g}" if 0.09 < tick < 1e4 else level_name(tick)
+            return f"{tick:.6g}" if (9e-4 if self.is_time else 0.09) < tick < 1e4 else level_name(tick)
         return f"{tick:.6g}"
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lavender.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.bench.store import Records
@@ -36,6 +36,7 @@ __all__ = [
     "reach_table",
     "robustness_table",
     "sections",
+    "short_table",
     "skip_table",
     "speed_table",
     "spread_table",
@@ -56,7 +57,6 @@ class Section:
     note: str  # what its numbers are
     table: Table
     grouped: bool = False  # rows of one case or structure stand together
-    details: bool = False  # of single cases, sequences: a terminal shows them if they are few, or on request
     empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
 
 
@@ -75,7 +75,8 @@ def sections(report: Report) -> list[Section]:
     else:
         by_structure = (
             "to a level: mean time (cold, if not carried), share of cases that get there, budget; in a time or with "
-            "sweeps: share of cases served, residual at the 90th percentile; ≈ as good within noise"
+            "sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good within "
+            "noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
@@ -87,9 +88,9 @@ def sections(report: Report) -> list[Section]:
             Section("By sweeps", by_sweeps, sweeps_table(report.lines)),
             Section("Inside the engine", inside, engine_table(report.engines)),
             Section("By motion error", moved, speed_table(report)),
-            Section("Motion error of each case", moved, moved_table(report), grouped=True, details=True),
-            Section("Cases", every, cases, grouped=True, details=True),
-            Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True, details=True),
+            Section("Motion error of each case", moved, moved_table(report), grouped=True),
+            Section("Cases", every, cases, grouped=True),
+            Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True),
         ]
     if report.before is not None:
         changed = change_table(report.before, records)
@@ -99,6 +100,25 @@ def sections(report: Report) -> list[Section]:
     return [s for s in found if s.table.rows or s.empty]
 
 
+def short_table(report: Report) -> Table:
+    """To the middle level alone: who is first in each structure, of one structure its solvers; shares of a campaign."""
+    middle = len(report.levels) // 2
+    if report.is_campaign:
+        found = robustness_table(tables.robustness(report.records), report.levels[middle : middle + 1])
+        return found.without(*(head for head in found.heads if "iterations" in head), "hardest")
+    by_motion = any(run.plan.get("speed_levels") for run in report.every.runs.values())
+    if len(report.lines) == 1 and not by_motion:
+        ranking = report.lines[0].by_level[report.levels[middle]].ranking
+        rows: Rows = [
+            [c.solver, seconds(c.score) + share(c.solved, c.cases), c.how] for c in ranking if c.solved
+        ]
+        return Table(["solver", f"to {level_name(report.levels[middle])}", "asked"], rows)
+    found = speed_table(report) if by_motion else advice_table(report)
+    column = 1 + (len(report.speeds) // 2 if by_motion else middle)
+    rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
+    return Table(["structure", found.heads[column]], rows, words=WORDS | {found.heads[column]})
+
+
 # -- recommendations ---------------------------------------------------------------------------------------
 
 
@@ -106,7 +126,8 @@ def advised(advice: Advice, in_time: bool) -> Cell:
     """Who is first, in what time or with what residual, on how many cases and with which budget."""
     best, ties = advice.best, advice.ties
     if best is None:
-        return Cell("nobody")
+        most = advice.ranking[0] if advice.ranking else None
+        return Cell("nobody", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
     say = residual if in_time else seconds
     after = f", {best.how}" if best.how else ""
     if ties:

@@ -75,6 +75,13 @@ class Figure:
     y_log: bool = True
     levels: tuple[float, ...] = ()
     floor: float = math.nan
+    left_out: tuple[str, ...] = ()  # solvers without a curve, for more of them cannot be told apart
+
+    @property
+    def heading(self) -> str:
+        """The title, and how many solvers are left out."""
+        left = count(len(self.left_out), "more solver")
+        return f"{self.title}; {left} not drawn" if self.title and self.left_out else self.title
 
 
 def _in_order_of_work(runs: list[Record]) -> list[Record]:
@@ -145,9 +152,9 @@ def overall_figure(records: Records) -> Figure:
         first = max((i for i, b in enumerate(bands) if b[0] == 1.0), default=0)
         lower, middle, upper = (tuple(column) for column in zip(*bands[first:], strict=True))
         curves.append(Curve(solver, solver, tuple(grid[first:]), middle, low=lower, high=upper))
-    over = count(len(cases), "case" if single else "step")
+    over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
     return Figure(
-        "over all", f"Error against time over all {over}: median, middle half",
+        "over all", f"Error against time{over if len(cases) > 1 else ''}",
         "time: set-up and solve [s]", "relative residual [-]", tuple(curves), levels=tables.levels_of(records),
     )  # fmt: skip
 
@@ -200,12 +207,11 @@ def profile_figure(profile: tables.Profile) -> Figure:
     curves = [
         Curve.of(name, name, [(r, 100.0 * s) for r, s in profile.curves[name]], steps=True) for name in shown
     ]
-    left = sum(bool(steps) and steps[-1][1] > 0.0 for steps in profile.curves.values()) - len(curves)
+    left = tuple(sorted(set(profile.curves) - set(shown)))
     return Figure(
         f"profile {profile.law} {level_name(profile.level)}",
-        f"{profile.law}, to {level_name(profile.level)} ({count(profile.cases, 'case')}"
-        + (f"; {count(left, 'more solver')} not drawn)" if left else ")"),
-        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False,
+        f"{profile.law}, to {level_name(profile.level)} ({count(profile.cases, 'case')})",
+        "time / fastest time", "cases solved [%]", tuple(curves), y_log=False, left_out=left,
     )  # fmt: skip
 
 

@@ -16,26 +16,38 @@ from lavender.report.style import Look
 __all__ = ["matplotlib_figure", "matplotlib_panels", "save"]
 
 
+COLUMNS = 3  # of a legend over the axes
 MANY = 60  # points of a curve, above which marks would cover it
 
 
 def matplotlib_figure(
     figure: Figure, look: Mapping[str, Look], size: tuple[float, float] = (7.6, 4.6)
 ) -> Any:
-    """The figure drawn, `size` in inches, without pyplot and its global state."""
+    """The figure drawn, `size` in inches, without pyplot and its global state.
+
+    The legend stands to the right; of a figure without a title in its place, over the axes.
+    """
     canvas = _canvas(size)
+    names = len(figure.curves) + (figure.floor > 0.0)
+    rows = -(-names // COLUMNS) + bool(figure.left_out)
+    right, top = (2.05, 0.41) if figure.title else (0.15, 0.17 * rows + 0.1)
     # A fixed place for the axes: fitting it to the labels would take most of the time of a figure.
-    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], 1.0 - 2.81 / size[0], 1.0 - 1.01 / size[1]))
+    wide, high = 1.0 - (0.76 + right) / size[0], 1.0 - (0.6 + top) / size[1]
+    axes = canvas.add_axes((0.76 / size[0], 0.6 / size[1], wide, high))
     _draw(axes, figure, look)
-    axes.set_xlabel(_plain(figure.x_title))
-    axes.set_ylabel(_plain(figure.y_title))
+    where: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.01, 0.5)}
+    if not figure.title:
+        where = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "ncols": COLUMNS, "borderpad": 0.2}
+    if figure.left_out:
+        drawn = len({c.solver for c in figure.curves})
+        where |= {"title": f"{drawn} of {drawn + len(figure.left_out)} solvers", "title_fontsize": 7}
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.01, 0.5), frameon=False, handlelength=3)
+        axes.legend(fontsize=7, frameon=False, handlelength=3, **where)
     return canvas
 
 
 def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look], columns: int = 3) -> Any:
-    """Figures of the same quantities beside each other, with the names of the axes and a legend once.
+    """Figures of the same quantities beside each other, with a legend once.
 
     In an SVG a curve has the id SOLVER--PANEL, and the legend `legend`.
     """
@@ -49,13 +61,13 @@ def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look], colum
         axes.set_axis_on()
         _draw(axes, figure, look)
         axes.tick_params(labelsize=7)
+        axes.xaxis.label.set_size(7)
+        axes.yaxis.label.set_size(7)
         for line in axes.get_lines():
             line.set_gid(f"{line.get_label()}--{i}")
         shown |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     legend = canvas.legend(shown.values(), shown.keys(), fontsize=6, frameon=False, loc="outside right upper")
     legend.set_gid("legend")
-    canvas.supxlabel(_plain(figures[0].x_title), fontsize=9)
-    canvas.supylabel(_plain(figures[0].y_title), fontsize=9)
     return canvas
 
 
@@ -96,6 +108,7 @@ def _draw(axes: Any, figure: Figure, look: Mapping[str, Look]) -> None:
     axes.set_yscale("log" if figure.y_log else "linear")
     for axis, drawn in ((laid.across, axes.xaxis), (laid.up, axes.yaxis)):
         ticks = axis.ticks()
+        drawn.set_label_text(_plain(axis.title))
         drawn.set_ticks(ticks, labels=[axis.text(tick) for tick in ticks])
     axes.minorticks_off()
     axes.set(xlim=laid.across.limits, ylim=laid.up.limits)
@@ -110,7 +123,7 @@ def _draw(axes: Any, figure: Figure, look: Mapping[str, Look]) -> None:
             label="floor of float64",
             zorder=0,
         )
-    axes.set_title(_plain(figure.title), fontsize=10)
+    axes.set_title(_plain(figure.heading), fontsize=10)
 
 
 LONGEST_TITLE = 80  # characters

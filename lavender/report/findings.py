@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
 from lavender._derived import cached_property
 from lavender.bench.store import Records
 from lavender.report import tables
 from lavender.report.engine import Contestant
 from lavender.report.moved import by_speed, speed_levels, working
+from lavender.report.text import count
 from lavender.report.verdict import Verdict, verdict
 
 __all__ = ["Report"]
@@ -58,6 +60,21 @@ class Report:
     def is_campaign(self) -> bool:
         """Times were left out on purpose."""
         return tables.is_campaign(self.records)
+
+    @cached_property
+    def busy(self) -> str:
+        """What is to be said of times that were taken while others used the processors too; empty where nothing is."""
+        if self.is_campaign or not len(self.every):
+            return ""
+        (run,) = self.every.runs.values()
+        loads = [load for r in self.every if (load := run.load if r.load is None else r.load) is not None]
+        # A half more: on one core this process makes a load of 1, and the system's own a little.
+        if not loads or fmean(loads) <= run.cores + 0.5:
+            return ""
+        return (
+            f"The machine was busy: load {fmean(loads):.1f} on {count(run.cores, 'core')} while this was timed. These "
+            "times are void; measure again with --fresh."
+        )
 
     @cached_property
     def levels(self) -> tuple[float, ...]:

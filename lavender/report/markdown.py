@@ -18,8 +18,9 @@ def summary(report: Report) -> str:
     for run in records.runs.values():
         machine = f"{run.cpu}, {run.threads} thread; lavender {run.lavender}, Python {run.python}"
         lines += [plain(f"{machine}; run {run.run}, {run.started}"), ""]
-    if found.sentences:
-        lines += [plain(found.text), "", "```python", *found.code, "```", ""]
+    lines += [f"**{plain(report.busy)}**", ""] if report.busy else []
+    for told in found.told:
+        lines += [plain(told.text), "", *(["```python", *told.code, "```", ""] if told.code else [])]
     for what, reason in left_out(records):
         lines += [plain(f"Left out, and in no number here: {what}: {reason}"), ""]
     for section in sections(report):

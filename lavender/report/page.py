@@ -14,7 +14,6 @@ from lavender.report.curves import Figures
 from lavender.report.findings import Report
 from lavender.report.svg import svg
 from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.report.tables.finals import WAYS, line_table
 from lavender.report.text import count, left_out, residual, seconds, suspicions, without
 from lavender.report.verdict import Verdict
 
@@ -67,7 +66,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         **_cases(records, levels),
         **_changes(report.before, records),
         "verdict": found,
-        "others": _others(report),
+        "busy": report.busy,
         "idle": contents.idle_table(report.every),
         "suspicions": suspicions(records),
         "left_out": left_out(records),
@@ -81,8 +80,6 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
         "levels": levels,
         "advice": contents.advice_table(report, _links(report.lines)),
         "swept": contents.sweeps_table(report.lines),
-        "lines": line_table(records),
-        "ways": {way: head for way, head in WAYS.items() if any(r.turns and r.way == way for r in records)},
         "families": tables.families(records),
         "claims": contents.claim_table(records),
         "n_failures": len(failures),
@@ -111,7 +108,7 @@ def _content(report: Report, figures: Figures) -> dict[str, Any]:
             for name, passes in tables.by_sequence(records).items()
         },
         "n_records": len(records),
-        "n_cases": len({r.case for r in records if r.step < 0}),
+        "n_cases": len({r.case for r in records}),
     }
 
 
@@ -177,35 +174,6 @@ def _changes(old: Records | None, records: Records) -> dict[str, Any]:
         "n_changes": len(found),
         "not_compared": contents.NOT_COMPARED,
     }
-
-
-MOST_OTHERS = 6
-
-
-def _others(report: Report) -> list[str]:
-    """What would change the choice: other levels and times, single structures, each with who is first there."""
-    records, levels, found, lines = report.records, report.levels, report.verdict, report.lines
-    if not found.leaders or not lines:
-        return []
-    cases = list(dict.fromkeys(r.case for r in records if r.step < 0))
-    middle = levels[len(levels) // 2]
-    asked: dict[str, tables.Advice] = {}
-    if cases:
-        asked |= {
-            f"to {level_name(x)}": tables.to_level(records, "all", cases, x) for x in levels if x != middle
-        }
-        asked |= {f"in {seconds(t)}": tables.within(records, "all", cases, t) for t in report.times}
-    asked |= {f"on {line.name}": line.by_level[middle] for line in lines if len(lines) > 1}
-    by_solver: dict[str, list[str]] = {}
-    for where, advice in asked.items():
-        if advice.best and found.leaders[0] not in (advice.best.solver, *advice.ties):
-            by_solver.setdefault(advice.best.solver, []).append(where)
-    most = 3  # places of one solver
-    told = [
-        f"{name} {'; '.join(some[:most])}{f'; and {len(some) - most} more' if len(some) > most else ''}"
-        for name, some in sorted(by_solver.items(), key=lambda pair: -len(pair[1]))
-    ]
-    return told[:MOST_OTHERS]
 
 
 def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:

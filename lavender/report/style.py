@@ -26,7 +26,7 @@ class Look:
 
 
 # These come first, so that what is compared most often never shares a colour.
-FIRST = ("pgs", "direct", "block_gauss_seidel", "osqp", "newton", "clarabel", "jacobi", "sequential_impulses")
+FIRST = ("auto", "direct", "newton", "anderson", "nncg", "osqp", "pgs", "sequential_impulses")
 
 
 def looks(solvers: Iterable[str]) -> dict[str, Look]:

@@ -53,7 +53,7 @@ def svg(
     parts = [
         f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(figure.title)}"',
         f' data-x="{across.data()}" data-y="{up.data()}" data-t="{said}">',
-        f'<text class="t" x="{LEFT}" y="24">{escape(_short(figure.title if title is None else title))}</text>',
+        f'<text class="t" x="{LEFT}" y="24">{escape(_short(figure.heading if title is None else title))}</text>',
     ]
     parts += _grid(figure, across, up)
     names = _names(laid.curves, across, up, leaders)
@@ -85,9 +85,9 @@ def _grid(figure: Figure, across: _Scale, up: _Scale) -> list[str]:
     out = [f'<path class="g" d="{"".join(lines)}"/>', *words]
     middle = (LEFT + right) // 2
     out.append(
-        f'<text class="a" x="{middle}" y="{HEIGHT - 20}" text-anchor="middle">{escape(figure.x_title)}</text>'
+        f'<text class="a" x="{middle}" y="{HEIGHT - 20}" text-anchor="middle">{escape(across.axis.title)}</text>'
     )
-    out.append(f'<text class="a" x="{LEFT}" y="{TOP - 8}">{escape(figure.y_title)}</text>')
+    out.append(f'<text class="a" x="{LEFT}" y="{TOP - 8}">{escape(up.axis.title)}</text>')
     marks = [(level, "l", "") for level in figure.levels]
     if math.isfinite(figure.floor) and figure.floor > 0.0:
         marks.append((figure.floor, "f", "floor"))

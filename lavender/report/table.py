@@ -116,8 +116,8 @@ def latex(table: Table, caption: str, label: str) -> str:
 # -- a terminal --------------------------------------------------------------------------------------------
 
 
-def print_table(console: Console, table: Table, grouped: bool = False) -> None:
-    """Within the terminal: nothing is cut.
+def print_table(console: Console, table: Table, grouped: bool = False, cut: bool = False) -> None:
+    """Within the terminal: nothing is cut, or, with `cut`, what stands first, so that a row is a line.
 
     Where a table is wider its cells fold; one that `folds` becomes a line for each cell under the first of its row.
     `grouped` says what stands first only where it is another than in the row above, and parts such groups. Texts are
@@ -131,9 +131,12 @@ def print_table(console: Console, table: Table, grouped: bool = False) -> None:
         made.add_column(
             Text(head), justify="right" if table.is_number(head) else "left", no_wrap=not table.folds
         )
+    made.columns[0].no_wrap = not (table.folds or cut)  # where there is little room it gives way
     before = ""
     for i, row in enumerate(table.rows):
         cells = [Text(str(c), style=COLOURS.get(c.mark, "") if isinstance(c, Cell) else "") for c in row]
+        if cut:
+            cells[0].no_wrap, cells[0].overflow = True, "ellipsis"
         first = str(row[0])
         if grouped and first == before:
             cells[0] = Text("")
@@ -142,14 +145,14 @@ def print_table(console: Console, table: Table, grouped: bool = False) -> None:
         made.add_row(*cells, style=COLOURS.get(table.marks[i], "") if table.marks else "")
         before = first
     wide = console.measure(made, options=console.options.update(width=100_000)).maximum > console.width
-    if wide and table.folds:
+    if wide and table.folds and not cut:
         room = max(map(len, table.heads[1:]))
         for name, *cells_of in table.texts:
             console.print(name, highlight=False, markup=False)
             for head, text in zip(table.heads[1:], cells_of, strict=True):
                 console.print(f"  {head:<{room}}  {text}", highlight=False, markup=False)
         return
-    if wide:
+    if wide and not cut:
         for column in made.columns:
             column.no_wrap, column.overflow = False, "fold"
     console.print(made, highlight=False)

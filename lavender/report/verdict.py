@@ -1,4 +1,4 @@
-"""What a whole report comes to: one sentence, and lines of Python to copy."""
+"""What a whole report comes to: one sentence and a line of Python to copy, then what is asked next."""
 
 from __future__ import annotations
 
@@ -15,30 +15,44 @@ from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
 from lavender.report.tables import Choice
-from lavender.report.tables.finals import STARTS, WAYS, Final, Race, in_time, lines
+from lavender.report.tables.advice import QUANTILE
+from lavender.report.tables.finals import STARTS, Final, Race, in_time, lines, serves_in
 from lavender.report.tables.finals import to_level as race_to_level
 from lavender.report.text import count, residual, seconds, without
 from lavender.report.text import times as times_of
 from lavender.suite import FAMILIES
 
-__all__ = ["Verdict", "verdict"]
+__all__ = ["Told", "Verdict", "verdict"]
 
-PYTHON_SHARE = 2e-4  # s: below it what is measured is largely the way through Python, some 50 µs of it
 SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """The first thing to read."""
+class Told:
+    """A sentence, and the lines that do what it says."""
 
-    sentences: tuple[str, ...]
-    code: tuple[str, ...]  # lines of Python
+    text: str
+    code: tuple[str, ...] = ()  # Python, as it was timed
+    in_c: tuple[str, ...] = ()
+    asked: bool = False  # for a time or a number of sweeps that somebody asked for
+
+    @property
+    def line(self) -> str:
+        """The call alone, without the loop around it; empty where there is none."""
+        return next((line.strip() for line in self.code if "lv.solve" in line), "")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the whole comes to: the first thing to read, then what may be asked of it."""
+
+    told: tuple[Told, ...]
     leaders: tuple[str, ...]  # solvers that the page draws in colour, the recommended one first
 
     @property
     def text(self) -> str:
         """All sentences in one line."""
-        return " ".join(self.sentences)
+        return " ".join(t.text for t in self.told)
 
 
 def _until(speed: float) -> str:
@@ -53,7 +67,7 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     if none are given.
     """
     if tables.is_campaign(records) or not len(records):
-        return Verdict((), (), ())
+        return Verdict((), ())
     newest = next(reversed(list(records.runs.values())), None)
     plan = {} if newest is None else newest.plan
     speeds = speed_levels(records)
@@ -62,14 +76,14 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     times = tuple(times) or tuple(plan.get("times", ()))
     sweeps = tuple(sweeps) or tuple(plan.get("sweeps", ()))
     parts = [_of(records, subject, times, sweeps) for subject in subjects(records, times)]
-    sentences = [s for part in parts for s in part.sentences]
+    told = [t for part in parts for t in part.told]
     if speeds and parts:
         best = subjects(by_speed(records))[0].best.best
         if best is not None:
             reached = _until(speeds[len(speeds) // 2])
-            sentences.append(f"By motion error {best.solver}: {seconds(best.score)} {reached}.")
+            told.append(Told(f"By motion error {best.solver}: {seconds(best.score)} {reached}."))
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
-    return Verdict(tuple(sentences), tuple(c for part in parts for c in part.code), tuple(leaders)[:3])
+    return Verdict(tuple(told), tuple(leaders)[:3])
 
 
 def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequence[int]) -> Verdict:
@@ -77,82 +91,94 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
     level, n = subject.best.target, subject.best.ranking[0].cases if subject.best.ranking else 0
     in_turns = lines(records, subject.way)
     race = race_to_level(records, in_turns or lines(records, subject.way, rounds=False), level, n)
-    what, reached = _what(records, subject), f"to {level_name(level)}"
+    what, reached = _what(records, subject, n), f"down to {level_name(level)} of the error of doing nothing"
     if race is None or not race.ranking[0][1].solved:
         near = tuple(c.solver for c in subject.best.ranking[:3] if c.solved)
-        return Verdict((f"Nobody brings any of {what} {reached}.",), (), near)
+        return Verdict((Told(f"No solver brings {what} {reached}."),), near)
     final, first = race.ranking[0]
-    said = [_head(first, f"{STARTS[final.line.start]}, {reached}", what), *_sure(race)]
-    code = _told(records, final, first.score, WAYS[subject.way])
+    told = [
+        _told(records, final, _head(records, first, f"{STARTS[final.line.start]}, {reached}", what)),
+        *_sure(race),
+    ]
     leaders = [c.solver for _, c in race.ranking[:3] if c.solved]
     some = [
         f for f in lines(records, "batch") if f.line.solver == first.solver and set(f.runs) <= set(final.runs)
     ]
     for batch in some[:1] if len(final.runs) > 1 else ():
-        code += _told(records, batch, batch.time, WAYS["batch"])
+        told.append(_told(records, batch, f"As a batch: {seconds(batch.time)} for each problem."))
     plain = lines(records, subject.way, rounds=False)
     for t in times or [a.target for a in subject.quick if a.target <= QUICKER * first.score][-1:]:
         if first.worst <= t and first.solved == first.cases:
             continue  # there is time for the whole
-        quick = in_time(records, [f for f in in_turns if f.line.mode != "tol"] or plain, t, n)
-        asked = f"If you have only {seconds(t)}"
-        if quick is None or not quick.ranking[0][1].solved:
-            said += [f"{asked}, nobody gets any of {what} to half of the start's residual."] if times else []
+        races = (in_time(records, some, t, n) for some in (in_turns, plain))
+        quick = next((r for r in races if r is not None and r.ranking[0][1].is_for(QUANTILE)), None)
+        if quick is None:
+            told.append(Told(_nothing(plain, t), asked=bool(times)))
             continue
-        said.append(_serves(asked, *quick.ranking[0], t))
-        code += _told(records, quick.ranking[0][0], quick.ranking[0][0].time, f"for {seconds(t)}")
-        leaders.insert(1, quick.ranking[0][1].solver)
+        best, choice = quick.ranking[0]
+        told.append(_told(records, best, _serves(f"If you have only {seconds(t)}", choice, t), bool(times)))
+        leaders.insert(1, choice.solver)
     for budget in sweeps:
         same = [f for f in plain if f.line.mode == "budget" and f.line.max_iter == budget]
         swept = in_time(records, same, math.inf, n)
-        if swept is not None:
-            said.append(_serves(f"With {count(budget, 'sweep')}", *swept.ranking[0], math.inf))
-            code += _told(records, swept.ranking[0][0], swept.ranking[0][0].time, count(budget, "sweep"))
+        if swept is not None and swept.ranking[0][1].is_for(QUANTILE):
+            best, choice = swept.ranking[0]
+            said = _serves(f"With {count(budget, 'sweep')}", choice, math.inf)
+            told.append(_told(records, best, said, True))
+        elif swept is not None:
+            told.append(Told(f"With {count(budget, 'sweep')} nothing serves nine cases of ten.", asked=True))
     foreign = [f"{b.solver} on {b.wins} of {b.solved} cases" for b in tables.backends(records) if b.wins]
     if foreign and subject.way == "call":
-        said.append(
-            f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
-        )
-    if first.score < PYTHON_SHARE:
-        said.append(f"Below {seconds(PYTHON_SHARE)} Python's share of a call decides as much as the solver.")
-    return Verdict(tuple(said), tuple(dict.fromkeys(code)), tuple(dict.fromkeys(leaders))[:3])
+        said = f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
+        told.append(Told(said))
+    return Verdict(tuple(told), tuple(dict.fromkeys(leaders))[:3])
 
 
-def _what(records: Records, subject: Subject) -> str:
+def _what(records: Records, subject: Subject, n: int) -> str:
     names, lost = subject.names, records.left_out
     if subject.way == "call":
         return _name(records, names) + without(len(lost.get("", ())))
-    told = f"a step of {names[0]}" if len(names) == 1 else f"a step of your {count(len(names), 'sequence')}"
-    return told + without(sum(len(lost.get(name, ())) for name in names))
+    of = names[0] if len(names) == 1 else f"your {count(len(names), 'sequence')}"
+    return f"the {count(n, 'step')} of {of}" + without(sum(len(lost.get(name, ())) for name in names))
 
 
-def _head(first: Choice, reached: str, what: str) -> str:
-    said = f"Use {first.solver}: {seconds(first.score)} {reached} on {what}"
-    if first.solved < first.cases:
-        said += f", of which it brings {first.solved} of {first.cases} there"
+def _head(records: Records, first: Choice, reached: str, what: str) -> str:
+    missed = first.solved < first.cases
+    said = f"Use {first.solver}: it solves {f'{first.solved} of ' if missed else ''}{what} in {seconds(first.score)}"
+    if first.cases > 1:
+        said += " on average"
+    if missed:
+        said += f" (a miss counted as {seconds(tables.limit_of(records))})"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
-        said += f" (at worst {seconds(first.worst)}: {first.hardest})"
+        said += f" ({seconds(first.worst)} at worst, {first.hardest})"
+    return f"{said}, {reached}."
+
+
+def _sure(race: Race) -> list[Told]:
+    """How often the choice is among the fastest, and who else is, with the time of each."""
+    if len(race.ranking) < 2:
+        return []
+    shares = [
+        f"{c.solver} ({seconds(c.score)}) in {int(100.0 * share + 1e-9)} %"  # rounded down: 100 is all
+        for (_, c), share in zip(race.ranking, race.shares, strict=True)
+        if c.solver in race.named
+    ]
+    said = f"Among the fastest, within noise, in resamplings of cases and repetitions: {', '.join(shares)}."
+    if race.loss > 1.0:
+        said += f" Where {race.named[0]} is not, it takes {times_of(race.loss)} the fastest's time."
+    return [Told(said)]
+
+
+def _nothing(some: Sequence[Final], limit: float) -> str:
+    """That nobody serves enough of the cases in a time, and in what time somebody does."""
+    least = min(map(serves_in, some), default=math.inf)
+    said = f"Nothing serves in {seconds(limit)}"
+    if math.isfinite(least):
+        said += f": to leave at most half of the start's residual on nine cases of ten takes {seconds(least)}"
     return f"{said}."
 
 
-def _percent(share: float) -> int:
-    """Rounded down: 100 is all."""
-    return int(100.0 * share + 1e-9)
-
-
-def _sure(race: Race) -> list[str]:
-    """How often the choice wins, and which solvers are as good."""
-    if len(race.ranking) < 2:
-        return []
-    share = f"It wins in {_percent(race.shares[0])} % of resamplings"
-    if race.loss > 1.0:
-        share += f" and takes {times_of(race.loss)} the best's time in the others"
-    others = [f"{name} ({_percent(s)} %)" for (_, c), s in zip(race.ranking, race.shares, strict=True)
-              if (name := c.solver) in race.named[1:]]  # fmt: skip
-    return [f"{share}; as good: {', '.join(others)}." if others else f"{share}."]
-
-
-def _serves(asked: str, final: Final, choice: Choice, limit: float) -> str:
+def _serves(asked: str, choice: Choice, limit: float) -> str:
     how = f", {choice.how}" if choice.how and math.isfinite(limit) else ""
     said = (
         f"{asked}, take {choice.solver}{how}: it serves {choice.solved} of {choice.cases} (at most half of the start's "
@@ -176,36 +202,38 @@ def _not_in_c(records: Records, final: Final) -> str:
     return ""
 
 
-def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
-    """Lines to copy, with what they were timed at."""
-    *before, last = final.code
-    timed = f"{seconds(time)}, {what}, {STARTS[final.line.start]}"
-    timed = timed if final.line.times else f"not timed as a line: {timed}"
-    calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
-    in_c = [f"# in C (docs/c.md): {calls}, lav_run(solver, &budget, &result);"] if calls else []
+def _told(records: Records, final: Final, said: str, asked: bool = False) -> Told:
+    """A sentence with its lines, of Python and of C."""
+    if not final.line.times:
+        said += " Records of an earlier version: the line itself was not timed."
+    calls, reason = c_of(final.line), _not_in_c(records, final)
+    in_c = (
+        ["/* docs/c.md */", *(f"{call};" for call in calls), "lav_run(solver, &budget, &result);"]
+        if calls
+        else []
+    )
     if final.line.solver == "auto" and records.source:  # its steps, as data
-        in_c = [f"# in C: lavender export c liblavender --solver auto --for {quote(records.source)}"]
+        in_c = [f"/* lavender export c liblavender --solver auto --for {quote(records.source)} */"]
     if calls and reason:
-        in_c = [f"# not in C: {reason}"]
-    if final.line.start == "carried":
-        return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
-    return [*before, f"{last}  # {timed}", *in_c]
+        in_c = [f"/* not in C: {reason} */"]
+    return Told(said, final.code, tuple(in_c), asked)
 
 
 def _by_advice(records: Records) -> Verdict:
     """By motion error: lines are not timed for it."""
     subject = subjects(records)[0]
-    best, what, reached = subject.best, _what(records, subject), _until(subject.best.target)
+    best, n = subject.best, subject.best.ranking[0].cases if subject.best.ranking else 0
+    what, reached = _what(records, subject, n), _until(subject.best.target)
     leaders = tuple(c.solver for c in best.ranking[:3] if c.solved)
     first = best.best
     if first is None:
-        return Verdict((f"Nobody brings any of {what} {reached}.",), (), leaders)
-    ties = (f"As good within noise: {', '.join(best.ties)}.",) if best.ties else ()
+        return Verdict((Told(f"No solver brings {what} so far {reached}."),), leaders)
+    ties = (Told(f"As good within noise: {', '.join(best.ties)}."),) if best.ties else ()
     tol = _tolerance(records, first.solver, best.target)
     asked = f"tol={level_name(tol)}" if math.isfinite(tol) else f"tol=0, max_iter={first.iterations}"
     code = f'lv.solve(problem, "{first.solver}", {asked})'
     start = STARTS["carried" if "carried" in first.how else "cold"]
-    return Verdict((_head(first, f"{start}, {reached}", what), *ties), (code,), leaders)
+    return Verdict((Told(_head(records, first, f"{start}, {reached}", what), (code,)), *ties), leaders)
 
 
 def _tolerance(records: Records, solver: str, level: float) -> float:

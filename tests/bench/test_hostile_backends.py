@@ -280,7 +280,9 @@ def test_what_a_worker_says_is_what_this_process_says():
             far, there = worker.measure(p, asked, start)
             near, here = timing.measure(p, asked, start)
             np.testing.assert_array_equal(here, there)
-            times = {n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace"))}
+            times = {
+                n: 0.0 for n in vars(near) if n.startswith(("time_m", "setup_", "solve_", "pace", "load"))
+            }
             assert dataclasses.replace(far, **times) == dataclasses.replace(near, **times)
 
 

@@ -107,7 +107,7 @@ def test_names_within_a_file_are_shown_and_change_nothing(lavender, tmp_path, na
     shown = text_io.StringIO()
     from rich.console import Console
 
-    print_report(Report(records), Console(file=shown, width=140))
+    print_report(Report(records), Console(file=shown, width=140), whole=True)
     assert printable(name)[:20] in shown.getvalue()
 
 

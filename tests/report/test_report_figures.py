@@ -12,6 +12,7 @@ import pytest
 from lavender import bench, report
 from lavender.bench.record import file_name
 from lavender.report import curves
+from lavender.report.axes import Axis
 from lavender.report.draw import matplotlib_figure
 from lavender.report.style import looks
 from lavender.report.svg import svg
@@ -187,6 +188,17 @@ def test_a_file_and_the_page_have_the_same_axes(name, real):
         assert ticks == words[: len(ticks)]
         del words[: len(ticks)]
         assert not drawn.get_minorticklocs().size
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "unit", "tick"),
+    [(1e-5, 1e-4, "µs", "100"), (1e-4, 1.0, "ms", "0.1"), (0.5, 50.0, "s", "10"), (1e-9, 1e-8, "ns", "1")],
+)
+def test_an_axis_and_its_ticks_have_one_unit(low, high, unit, tick):
+    axis = Axis([low, high], True, "time: set-up and solve [s]")
+    assert axis.title == f"time: set-up and solve [{unit}]"
+    words = [axis.text(t) for t in axis.ticks()]
+    assert tick in words and all(re.fullmatch(r"[\d.]+(e-?\d+)?", word) for word in words)
 
 
 def test_warm_runs_have_their_own_curves(real):

@@ -49,16 +49,16 @@ def test_the_first_sentence_is_by_motion_error_where_that_was_asked_for(records)
     said = verdict(working)
     line, *_ = tables.advice(moved.by_speed(working))
     best = line.by_level[1e-4].best
-    assert said.sentences[0].startswith(f"Use {best.solver}: ")
-    assert "until no body is wrong by more than 1e-4 m/s on stack(n=16)" in said.sentences[0]
+    assert said.text.startswith(f"Use {best.solver}: it solves stack(n=16) in ")
+    assert "until no body is wrong by more than 1e-4 m/s." in said.told[0].text
     # the line to copy does what the sentence says
     problem = lv.suite.case("stack(n=16)").problem
-    solution = eval(said.code[0], {"lv": lv, "problem": problem})
+    solution = eval(said.told[0].line, {"lv": lv, "problem": problem})
     assert solution.motion_error().speed <= 1e-4
     plain = records_without(records, "speed_levels")
     found = verdict(moved.working(plain))
-    assert found.sentences[0].startswith("Use ") and " to 1e-3 on stack(n=16)" in found.sentences[0]
-    assert found.sentences[-1].startswith("By motion error ") and "1e-3 m/s" in found.sentences[-1]
+    assert "down to 1e-3 of the error of doing nothing" in found.told[0].text
+    assert found.told[-1].text.startswith("By motion error ") and "1e-3 m/s" in found.told[-1].text
 
 
 def records_without(records, name):
@@ -131,7 +131,7 @@ def test_the_terminal_shows_speeds_on_request(tmp_path):
     ]
     asked = CliRunner().invoke(cli, [*args, "--speed-levels", "1e-2", "1e-3", "--out", str(tmp_path / "a")])
     assert asked.exit_code == 0, asked.output
-    assert "By motion error" in asked.output
+    assert "to 1e-3 m/s" in asked.output
     assert "to 1e-3 m/s" in asked.output
     plain = CliRunner().invoke(cli, [*args, "--out", str(tmp_path / "b")])
     assert "motion" not in plain.output
@@ -254,6 +254,8 @@ def test_one_switch_changes_the_axes_of_all_charts(records, tmp_path, script):
         page.goto(index.resolve().as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= 400
         one, other = page.locator(".row.r .chart"), page.locator(".row.m .chart")
+        assert not page.locator(".axes").is_visible()  # no chart of theirs is unfolded
+        page.locator("#cases > summary").click()
         assert one.count() == other.count() > 0
         assert one.first.is_visible()
         assert not other.first.is_visible()

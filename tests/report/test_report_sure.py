@@ -1,13 +1,18 @@
 """How sure a recommendation is: resamplings, misses that count, drift, and what others take by their own interface."""
 
+import io
 import math
 import random
+import re
 
 import pytest
+from rich.console import Console
 
 from lavender import bench, report
 from lavender.report import tables
-from lavender.report.tables.finals import in_time, line_table, lines, to_level
+from lavender.report.findings import Report
+from lavender.report.tables.finals import in_time, lines, to_level
+from lavender.report.terminal import print_report
 from lavender.report.verdict import verdict
 from tests.report.test_report import record, records_of
 
@@ -40,8 +45,10 @@ def test_a_clear_winner_is_named_alone_and_wins_every_resampling():
     assert found.named == ("fast",)
     assert found.shares[0] == 1.0
     assert found.loss == 1.0
-    (said,) = (s for s in verdict(in_turns({"auto": 1.5, "fast": 1.0}, 0)).sentences if "resamplings" in s)
-    assert said == "It wins in 100 % of resamplings."
+    told = verdict(in_turns({"auto": 1.5, "fast": 1.0}, 0)).told
+    assert re.fullmatch(
+        r"Among the fastest, within noise, .*: fast \([23]\.\d* ms\) in 100 %\.", told[1].text
+    )
 
 
 def test_cases_that_disagree_make_it_unsure_and_both_are_named():
@@ -50,8 +57,9 @@ def test_cases_that_disagree_make_it_unsure_and_both_are_named():
     assert set(found.named) == {"even", "odd"}
     assert found.shares[0] < 0.9
     assert found.loss > 1.05
-    text = verdict(in_turns(speeds, 0)).text
-    assert "as good: " in text
+    text = verdict(in_turns(speeds, 0)).told[1].text
+    assert all(re.search(rf"{name} \([\d.]* ms\) in \d* %", text) for name in speeds)
+    assert "it takes" in text  # and what the choice loses where the other is faster
 
 
 @pytest.mark.parametrize(
@@ -124,12 +132,13 @@ def test_in_a_time_misses_count_and_the_sentence_says_how_many():
         ("wide", 10, 0.1),
         ("deep", 7, 1.0),
     ]
-    said = verdict(found, [1e-3]).sentences
-    assert any("take wide, 8 sweeps: it serves 10 of 10" in s for s in said)
-    alone = verdict(records_of(*(r for r in made if r.solver != "wide")), [1e-3]).sentences
-    assert any("take deep, 8 sweeps: it serves 7 of 10" in s for s in alone)
+    assert "take wide, 8 sweeps: it serves 10 of 10" in verdict(found, [1e-3]).text
+    alone = verdict(records_of(*(r for r in made if r.solver != "wide")), [1e-3]).text
+    assert alone.endswith("Nothing serves in 1.00 ms.")  # 7 of 10 are not nine of ten, in whatever time
     assert (swept.target, swept.best.solver) == (8.0, "wide")
-    assert any(s.startswith("With 8 sweeps, take wide") for s in verdict(found, sweeps=[8]).sentences)
+    assert "With 8 sweeps, take wide" in verdict(found, sweeps=[8]).text
+    rest = records_of(*(r for r in made if r.solver != "wide"))
+    assert verdict(rest, sweeps=[8]).text.endswith("With 8 sweeps nothing serves nine cases of ten.")
 
 
 def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served():
@@ -146,9 +155,9 @@ def test_what_comes_too_late_in_more_than_one_repetition_of_twenty_is_not_served
 def test_no_iteration_limit_of_a_factorising_solver_is_offered_for_a_time():
     newton = {"mode": "budget", "tol": 0.0, "max_iter": 8, "work": {"factorisations": 8}, "claims": False}
     found = records_of(record("a", "newton", 1.0, 1e-7), record("a", "newton", 1e-4, 1e-3, **newton))
-    python, c = verdict(found, [1e-3]).code
-    assert python == 'lv.solve(problem, "newton", tol=1e-6)  # not timed as a line: 1.00 s, one call, cold'
-    assert "budget.iterations = 1500" in c
+    said = verdict(found, [1e-3])
+    assert said.told[0].code == ('lv.solve(problem, "newton", tol=1e-6)',)
+    assert "budget.iterations = 1500;" in said.told[0].in_c
 
 
 def test_a_slower_machine_is_no_slower_code():
@@ -175,8 +184,7 @@ def test_a_batch_of_some_of_the_cases_is_not_told_beside_a_call_on_all(n):
     made = in_turns({"auto": 1.0, "pgs": 2.0}, 0, cases=CASES[:3])
     for r in [r for r in made if r.turns and r.case in CASES[:n]]:
         made.add(bench.Record(**{**vars(r), "way": "batch"}))
-    assert ("batch" in line_table(made)["auto"]) == (n == 3)
-    assert any("solve_many" in line for line in verdict(made).code) == (n == 3)
+    assert any("solve_many" in line for t in verdict(made).told for line in t.code) == (n == 3)
 
 
 def test_a_line_says_where_it_starts_and_leaves_the_guess_out():
@@ -190,15 +198,14 @@ def test_a_line_says_where_it_starts_and_leaves_the_guess_out():
     carried.records = [
         bench.Record(**{**vars(r), **more, "step": CASES.index(r.case)}) for r in carried.records
     ]
-    said = verdict(cold)
-    assert said.code[0] == "problem = dataclasses.replace(problem, guess=None)"
-    assert said.code[1].startswith('lv.solve(problem, "auto", tol=1e-6)') and said.code[1].endswith(", cold")
-    assert " cold, to 1e-6 on " in said.sentences[0]
-    said = verdict(carried)
-    assert said.code[0].endswith("warm from the step before") and not any(
-        "dataclasses" in x for x in said.code
-    )
-    assert " warm from the step before, to 1e-6 on " in said.sentences[0]
+    said = verdict(cold).told[0]
+    assert said.code == (
+        "problem = dataclasses.replace(problem, guess=None)", 'lv.solve(problem, "auto", tol=1e-6)',
+    )  # fmt: skip
+    assert ", cold, down to 1e-6 " in said.text
+    said = verdict(carried).told[0]
+    assert any("impulse=start" in x for x in said.code) and not any("dataclasses" in x for x in said.code)
+    assert ", warm from the step before, down to 1e-6 " in said.text
 
 
 def test_the_headline_is_of_all_sequences():
@@ -210,5 +217,11 @@ def test_the_headline_is_of_all_sequences():
     found = records_of(*made)
     for case, info in list(found.cases.items()):
         found.add(bench.CaseInfo(**{**vars(info), "sequence": case[0], "step": int(case[2])}))
-    said = "Use auto: 1.00 ms warm from the step before, to 1e-6 on a step of your 3 sequences"
-    assert verdict(found).sentences[0].startswith(said)
+    assert verdict(found).text.startswith(
+        "Use auto: it solves the 12 steps of your 3 sequences in 1.00 ms on average, warm from the step before, down"
+    )
+    told, out = verdict(found).told[0], io.StringIO()
+    assert told.line == 'solution = lv.solve(problem, "auto", impulse=start, tol=1e-6)'
+    assert len(told.code) == 5  # with the loop that carries impulses, which a terminal shows on request
+    print_report(Report(found), Console(file=out, width=400))
+    assert out.getvalue().splitlines()[1] == f"    {told.line}  # the lines around it: --tables"

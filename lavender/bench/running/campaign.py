@@ -365,7 +365,7 @@ class _WithoutTimes(Runner):
         nan = math.nan
         record = replace(
             record, setup_min=nan, setup_median=nan, solve_min=nan, solve_median=nan, time_min=nan, time_median=nan,
-            pace=None, own_min=None, time_limit=self.plan.time_limit,
+            pace=None, load=None, own_min=None, time_limit=self.plan.time_limit,
         )  # fmt: skip
         return record, found
 

@@ -23,6 +23,7 @@ import numpy as np
 from lavender import registry
 from lavender._arrays import FloatArray
 from lavender._later import load
+from lavender.bench import machine
 from lavender.bench.line import asked_of
 from lavender.bench.record import ERROR, CaseInfo, Record, measurement_key
 from lavender.external.stopwatch import own_time
@@ -360,5 +361,6 @@ def record_of(task: Task, s: Solution, found: Outcome) -> Record:
         times=found.times if task.way else (),
         reached=found.reached,
         pace=found.pace,
+        load=machine.running(),
         own_min=found.own,
     )

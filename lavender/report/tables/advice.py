@@ -53,6 +53,10 @@ class Choice:
     iterations: int = 0  # of that budget, 0 where there is none
     overrun: float = math.nan  # 95th percentile of the line's time over what it was to take
 
+    def is_for(self, share: float) -> bool:
+        """It solves a case, and at least this share of them."""
+        return self.solved >= max(1, share * self.cases)
+
     @classmethod
     def of(cls, solver: str, values: Mapping[str, float], solved: int, score: float, **more: Any) -> Choice:
         """From what ranks it on each case, a time [s] or what is left of the residual [-]."""
@@ -76,11 +80,12 @@ class Advice:
     target: float  # level [-] or time [s]
     ranking: tuple[Choice, ...]
     equal: int = 1  # how many at the head are the best within noise; they stand in a fixed order
+    least: float = 0.0  # share of the cases below which nobody is recommended
 
     @property
     def best(self) -> Choice | None:
-        """The recommended one; None if no solver reached the level."""
-        return self.ranking[0] if self.ranking and self.ranking[0].solved else None
+        """The recommended one; None if no solver reached the level, or none serves enough of the cases in a time."""
+        return self.ranking[0] if self.ranking and self.ranking[0].is_for(self.least) else None
 
     @property
     def ties(self) -> tuple[str, ...]:
@@ -127,10 +132,10 @@ def advice(records: Records, times: Sequence[float] = ()) -> list[Line]:
     """Every recommendation: structures, then sequences; at each level, within each time [s], with each budget.
 
     To a level: first who brings most cases there, then who is fastest (shifted geometric mean). In a time, and with a
-    budget of those whose iterations are sweeps: who serves most cases, then the residual at the 90th percentile. A case
-    is served where at most half of the start's residual is left; who has nothing to show in the time scores 1 on it:
-    doing nothing. A solver whose claim was wrong on a case comes after all that were not. `times` [s]; `time_budgets`
-    if none are given.
+    budget of those whose iterations are sweeps: who serves most cases, then the residual at the 90th percentile; nobody
+    where nobody serves nine of ten. A case is served where at most half of the start's residual is left; who has
+    nothing to show in the time scores 1 on it: doing nothing. A solver whose claim was wrong on a case comes after all
+    that were not. `times` [s]; `time_budgets` if none are given.
     """
     times = tuple(times) or time_budgets(records)
     ways, swept, lost = _ways(records), _swept(records), records.left_out
@@ -254,6 +259,9 @@ def within(
 
     places = _best_of_each(standing(way, limit) for way in taking)
     found = ranked(family, limit, places, RESIDUAL_NOISE)
+    found = replace(
+        found, least=QUANTILE
+    )  # who serves fewer leaves 1.0 at the 90th percentile: noise decides who
     if found.best is None or math.isinf(limit):
         return found
     late = {c.solver: (key, c.score) for key, c in _best_of_each(standing(w, NOISE * limit) for w in taking)}
@@ -262,9 +270,8 @@ def within(
     rest = found.ranking[found.equal :]
     near = [c for c in rest if late[c.solver][0] <= first and late[c.solver][1] <= RESIDUAL_NOISE * best]
     others = [c for c in rest if all(c is not n for n in near)]
-    return Advice(
-        found.family, found.target, (*found.ranking[: found.equal], *near, *others), found.equal + len(near)
-    )
+    ranking = (*found.ranking[: found.equal], *near, *others)
+    return replace(found, ranking=ranking, equal=found.equal + len(near))
 
 
 def _liars(records: Records, cases: Sequence[str]) -> set[str]:

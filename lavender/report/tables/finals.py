@@ -20,7 +20,7 @@ from lavender.bench.store import Records
 from lavender.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
 from lavender.report.tables.means import SHIFT, limit_of
 
-__all__ = ["STARTS", "WAYS", "Final", "Race", "in_time", "line_table", "lines", "to_level"]
+__all__ = ["STARTS", "Final", "Race", "in_time", "lines", "serves_in", "to_level"]
 
 SAMPLES = 500
 SURE = 0.8  # share of resamplings below which a second name is told
@@ -105,17 +105,6 @@ def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
 
 
 STARTS = {"cold": "cold", "carried": "warm from the step before"}
-WAYS = {"call": "one call", "steps": "a step in its loop", "batch": "a problem of a batch"}
-
-
-def line_table(records: Records) -> dict[str, dict[str, Final]]:
-    """Solver -> way -> the line to the middle level, for the ways that were timed."""
-    found: dict[str, dict[str, Final]] = {}
-    for way in WAYS:
-        some = [f for f in lines(records, way) if f.line.mode == "tol"]
-        for final in _best_of_each(some, max((f.line.tol for f in some), default=0.0)):
-            found.setdefault(final.line.solver, {})[way] = final
-    return found
 
 
 def _best_of_each(some: Sequence[Final], level: float) -> list[Final]:
@@ -186,6 +175,15 @@ def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 
         )
 
     return _race(records, some, names, got, ~served, score, choice)
+
+
+def serves_in(final: Final) -> float:
+    """Time [s] in which a line of exactly so many sweeps serves nine cases of ten, as `in_time`; inf if in none."""
+    if final.line.mode != "budget":
+        return math.inf
+    times = _repeats([final], list(final.runs), lambda r: r.times or (r.time_min,))[0]
+    left = np.array([r.relative for r in final.runs.values()])
+    return float(_inverted_cdf(np.where(left <= HALF, _lower_quantile(times, LATE), math.inf), QUANTILE))
 
 
 def _names(some: Sequence[Final]) -> list[str]:

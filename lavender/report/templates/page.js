@@ -3,24 +3,12 @@
   const root = document.documentElement;
   const every = (selector, from) => Array.from((from || document).querySelectorAll(selector));
 
-  // -- dark or light, copying ---------------------------------------------------------------------
-  const theme = document.getElementById("theme");
-  const dark = matchMedia("(prefers-color-scheme: dark)");
-  theme.hidden = false;
-  const kept = (word) => {  // pages opened as files may have no storage
-    try { return word ? localStorage.setItem("lavender-theme", word) : localStorage.getItem("lavender-theme"); } catch { return null; }
-  };
-  if (["dark", "light"].includes(kept())) root.dataset.theme = kept();
-  theme.addEventListener("click", () => {
-    const isDark = root.dataset.theme ? root.dataset.theme === "dark" : dark.matches;
-    root.dataset.theme = isDark ? "light" : "dark";
-    kept(root.dataset.theme);
-  });
+  // -- copying -------------------------------------------------------------------------------------
   const copy = document.getElementById("copy");
   if (copy && navigator.clipboard) {
     copy.hidden = false;
     copy.addEventListener("click", () => {
-      navigator.clipboard.writeText(document.getElementById("code").textContent.trim());
+      navigator.clipboard.writeText(every(".code pre").find((pre) => pre.offsetParent).textContent);
       copy.textContent = "copied";
     });
   }
@@ -102,12 +90,10 @@
     const limit = /^\d+$/.test(note) ? `tol=0, max_iter=${note}` : /^to /.test(note) ? `tol=${note.slice(3)}` : "";
     const x = value(chart.dataset.x, best.x), y = value(chart.dataset.y, best.y);
     const said = [best.curve.dataset.l, asked, xs === "1" ? seconds(x) : number(x), ys === "1" ? seconds(y) : number(y)];
-    const run = every(".run").map((r) => r.textContent);
     const [name, start] = best.curve.dataset.l.split(" ");
     const from = start === "(warm)" ? "impulse=problem.guess, " : "";
     const line = limit && `lv.solve(problem, "${name}", ${from}${limit})`;
-    tip.textContent = [said.filter(Boolean).join(", "), line, run.length === 1 ? `run ${run[0]}` : ""]
-      .filter(Boolean).join("\n");
+    tip.textContent = [said.filter(Boolean).join(", "), line].filter(Boolean).join("\n");
     tip.hidden = false;
     tip.style.left = Math.min(event.pageX + 12, root.clientWidth + scrollX - tip.offsetWidth - 6) + "px";
     tip.style.top = event.pageY + 14 + "px";
@@ -115,7 +101,7 @@
   addEventListener("pointermove", show);
   addEventListener("pointerdown", show);
 
-  // -- cases: sorted by a column, searched ----------------------------------------------------------
+  // -- cases: sorted by a column --------------------------------------------------------------------
   const list = document.getElementById("list");
   if (list) {
     const rows = every("tbody tr", list);
@@ -138,22 +124,13 @@
       head.addEventListener("click", sort);
       head.addEventListener("keydown", (e) => { if (e.key === "Enter") sort(); });
     });
-    const search = document.getElementById("search");
-    search.parentElement.hidden = rows.length < 6;
-    const details = every("details.case");
-    search.addEventListener("input", () => {
-      const wanted = search.value.toLowerCase().split(/\s+/);
-      const fits = (row) => wanted.every((word) => row.textContent.toLowerCase().includes(word));
-      const shown = new Set(rows.filter(fits).map((row) => row.querySelector("a").getAttribute("href").slice(1)));
-      rows.forEach((row) => { row.hidden = !fits(row); });
-      details.forEach((d) => { d.hidden = !shown.has(d.id); });
-    });
   }
 
   // -- links open what they lead to; print opens everything but single cases ---------------------------
   function follow() {
     const target = location.hash ? document.getElementById(decodeURIComponent(location.hash.slice(1))) : null;
-    if (target && target.closest("details")) { target.closest("details").open = true; target.scrollIntoView(); }
+    for (let part = target; part; part = part.parentElement) if (part.tagName === "DETAILS") part.open = true;
+    if (target) target.scrollIntoView();
   }
   addEventListener("hashchange", follow);
   follow();
