@@ -240,12 +240,14 @@ def _mass(mj: Any, model: Any, data: Any, smooth: Any) -> Any:
         parts = model.M_rowadr, model.M_rownnz, model.M_colind, data.M
     except AttributeError:  # an earlier MuJoCo
         parts = _whole_mass(mj, model, data)
-    found = export.lower(*parts, smooth, data.qfrc_smooth)
-    if found is None:
+    made = export.lower(*parts, smooth, data.qfrc_smooth)
+    if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
-    mass, gap = found
+    mass, gap = made
     if not gap <= ROUNDING:
-        word = mj.mjtIntegrator(int(model.opt.integrator)).name.removeprefix("mjINT_").lower()
+        number = int(model.opt.integrator)
+        found = [name for name, value in mj.mjtIntegrator.__members__.items() if int(value) == number]
+        word = found[0].removeprefix("mjINT_").lower() if found else str(number)
         why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
         raise CapabilityError(
             f"M qacc_smooth differs from qfrc_smooth by {gap:.1e} of their size: these data are not those of M. "

@@ -216,6 +216,14 @@ def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_ju
         assert np.array_equal(lv.io.from_mujoco(model, data).b, problem.b)
 
 
+def test_an_integrator_that_is_none_is_told_by_its_number():
+    model, data = state()
+    model.opt.integrator = 7
+    data.qacc_smooth[:] = 2.0 * data.qacc_smooth
+    with pytest.raises(lv.CapabilityError, match="integrator='7'"):
+        lv.io.from_mujoco(model, data)
+
+
 def test_accelerations_that_hang_on_the_solver_are_no_part_of_the_problem():
     model, data = state()
     right = lv.io.from_mujoco(model, data)
