@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-from lavender.bench.line import c_of
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.io.stored import SUFFIXES
+from lavender.registry import specs
 from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
@@ -180,12 +180,12 @@ def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     *before, last = final.code
     timed = f"{seconds(time)}, {what}"
     timed = timed if final.line.times else f"not timed as a line: {timed}"
-    calls, reason = ", ".join(c_of(final.line)), _not_in_c(records, final)
-    in_c = [f"# in C (docs/c.md): {calls}, lav_run(solver, &budget, &result);"] if calls else []
-    if final.line.solver == "auto" and records.source:  # its steps, as data
-        in_c = [f"# in C: lavender export c liblavender --solver auto --for {quote(records.source)}"]
-    if calls and reason:
-        in_c = [f"# not in C: {reason}"]
+    line, reason, in_c = final.line, _not_in_c(records, final), []
+    spec = specs().get(line.solver)
+    if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
+        source = quote(records.source or "records.jsonl")
+        in_c = [f"# in C: lavender export c liblavender --solver {line.solver} --for {source}"]
+        in_c = [f"# not in C: {reason}"] if reason else in_c
     if final.line.start == "carried":
         return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
     return [*before, f"{last}  # {timed}", *in_c]
