@@ -235,8 +235,8 @@ def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, in
         The driver does not take the problem.
     """
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse, how = Driver(problem.metric, tol, budget), problem.start().copy(), OUTCOMES["more"]
-    done = 0
+    impulse = (problem.start() if problem.guess is None else problem.guess).copy()
+    driver, done, how = Driver(problem.metric, tol, budget), 0, OUTCOMES["more"]
     if not driver.start(impulse):
         raise NotTaken("the compiled driver of newton does not take this problem")
     while how in (OUTCOMES["more"], OUTCOMES["certificate"]):
