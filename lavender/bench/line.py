@@ -10,14 +10,7 @@ from lavender.bench.record import Record, level_name
 if TYPE_CHECKING:
     from lavender.bench.running.timing import Task
 
-__all__ = ["asked_of", "c_of", "code_of", "needs_more"]
-
-C_OPTIONS = {"memory": "{}", "convex": "{}", "omega": "{!r}"}
-C_WORDS = {
-    ("order", "symmetric"): "order = LAV_SYMMETRIC", ("order", "random"): "order = LAV_RANDOM",
-    ("order", "reverse"): "order = LAV_REVERSE", ("sweep", "pgs"): "sweep = LAV_PGS_SWEEP",
-    ("sweep", "blocks"): "sweep = LAV_BLOCK_SWEEP", ("restart", "against"): "keeps = 1",
-}  # fmt: skip
+__all__ = ["asked_of", "code_of", "needs_more"]
 
 COLD = "dataclasses.replace({}, guess=None)"  # a problem without the start that came with it
 CARRIED = (
@@ -77,29 +70,3 @@ def code_of(record: Record, guessed: bool = False) -> tuple[str, ...]:
         f'    solution = lv.solve(problem, "{record.solver}", impulse=start, {words})',
         "    before, impulse = problem, solution.impulse",
     )
-
-
-def c_of(record: Record) -> tuple[str, ...]:
-    """The C calls of a record, on `options` and `budget`; none where the library lacks the solver or an option."""
-    spec = registry.specs().get(record.solver)
-    if spec is None or spec.external or spec.delegates or not spec.own or record.way == "batch":
-        return ()
-    out = [f"lav_default_options(LAV_{record.solver.upper()}, &options)"]
-    for key, value in {"order": record.order or "given", **record.options}.items():
-        if not isinstance(value, (str, int, float)):
-            return ()  # of a file that somebody else wrote: no option of the library
-        if key in C_OPTIONS:
-            out.append(f"options.{key} = {C_OPTIONS[key].format(value)}")
-        elif isinstance(value, str) and (key, value) in C_WORDS:
-            out.append(f"options.{C_WORDS[key, value]}")
-        elif (key, value) != ("order", "given"):
-            return ()
-    if record.seed and record.order == "random":
-        out.append(f"options.seed = {record.seed}")
-    asked = asked_of(record, record.iterations)
-    out.append("lav_default_budget(&budget)")
-    out.append(f"budget.tol = {_exact(record.tol, f'{record.tol:g}')}")
-    out.append(f"budget.iterations = {asked.get('max_iter') or spec.max_iter}")
-    if "time_limit" in asked:
-        out.append(f"budget.seconds = {_exact(record.time_limit, f'{record.time_limit:g}')}")
-    return tuple(out)

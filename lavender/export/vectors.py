@@ -24,7 +24,6 @@ from lavender.bench.store import Records, read
 from lavender.errors import InputError
 from lavender.export.library import HERE
 from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
-from lavender.io.stored import write_bytes
 from lavender.report import tables
 from lavender.report.moved import working
 from lavender.report.verdict import verdict
@@ -32,7 +31,7 @@ from lavender.solvers.costs import METHODS as CANDIDATES
 from lavender_ext.driver.driver import Driver
 from lavender_ext.newton.solve import OUTCOMES
 
-__all__ = ["Step", "made", "pack", "pack_problem", "steps_of", "write_packed"]
+__all__ = ["Step", "driven", "file_of", "made", "pack", "pack_problem", "steps_of"]
 
 MAGIC = b"LAVVEC2\0"
 COUNTED = ("sweeps", "factorisations", "solves")  # what the library counts as iterations
@@ -83,7 +82,7 @@ class Step:
     def text(self) -> str:
         """As C has it: options, budget, relaxed."""
         whole, omega = ", ".join(map(str, self.whole()[1:])), choices(self.solver, self.options)[1]
-        options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {whole}, 0, 0, {omega!r}"
+        options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {whole}, 0, {omega!r}"
         budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0"
         return f"{{{{{options}}}, {{{budget}}}, {int(self.relaxed)}}}"
 
@@ -133,7 +132,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
             break
         try:
             problem = _again(records, record)
-            vector, ran = _pack(problem, record.solver, record.tol, record.max_iter, record.options)
+            vector, ran = pack(problem, record.solver, record.tol, record.max_iter, record.options)
         except (NotTaken, lv.LavenderError) as error:
             left.append(f"{record.case}: {error}")
             continue
@@ -153,7 +152,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
     lines = ",\n".join(f"  {step.text()}" for step in steps.values())
     header = CHOSEN.format(solver=measured[0].solver, tol=measured[0].tol, count=len(steps), lines=lines)
-    return {"vectors.bin": _file_of(packed[:most]), "check.c": check, "chosen.h": header}
+    return {"vectors.bin": file_of(packed[:most]), "check.c": check, "chosen.h": header}
 
 
 def _chosen(records: Records, solver: str | None) -> list[Record]:
@@ -186,24 +185,21 @@ def _again(records: Records, record: Record) -> lv.Problem:
     return problem
 
 
-def write_packed(out: Path, packed: Sequence[bytes]) -> None:
-    """Write `vectors.bin` of what `pack` has made."""
-    write_bytes(out / "vectors.bin", _file_of(packed))
-
-
-def _file_of(packed: Sequence[bytes]) -> bytes:
+def file_of(packed: Sequence[bytes]) -> bytes:
+    """`vectors.bin` of what `pack` has made."""
     return MAGIC + struct.pack("<q", len(packed)) + b"".join(packed)
 
 
-def pack(problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]) -> bytes:
-    """One vector; NotTaken where the library does not do what the package did."""
-    return _pack(problem, solver, tol, max_iter, options)[0]
-
-
-def _pack(
+def pack(
     problem: Any, solver: str, tol: float, max_iter: int, options: Mapping[str, Any]
 ) -> tuple[bytes, list[Step]]:
-    """One vector and the steps in it: bits of the package, or by the judge's verdict alone where it has others."""
+    """One vector and its steps: bits of the package, or by the judge's verdict alone where these are others.
+
+    Raises
+    ------
+    NotTaken
+        The library does not do what the package did.
+    """
     max_iter = max_iter or registry.specs()[solver].max_iter
     found = lv.solve(problem, solver, tol=tol, max_iter=max_iter, **options)
     form = found.solver.form
@@ -212,7 +208,11 @@ def _pack(
     ):
         raise NotTaken(f"{solver} formed A, which the library does not: give it the matrix, problem.csr")
     steps = [s for s in steps_of(found, Step(solver, max_iter, tol, options)) if takes(problem, s.solver)]
-    given = pack_problem(problem, solver, bool(steps))
+    given = pack_problem(problem)
+    if not steps:
+        raise NotTaken(
+            f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
+        )
     impulse, relative = found.impulse, found.residual.relative
     if solver == "newton" and problem.generalized is None:
         impulse = driven(problem, tol, max_iter)[0]
@@ -235,8 +235,8 @@ def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, in
         The driver does not take the problem.
     """
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse, how = Driver(problem.metric, tol, budget), problem.start().copy(), OUTCOMES["more"]
-    done = 0
+    impulse = (problem.start() if problem.guess is None else problem.guess).copy()
+    driver, done, how = Driver(problem.metric, tol, budget), 0, OUTCOMES["more"]
     if not driver.start(impulse):
         raise NotTaken("the compiled driver of newton does not take this problem")
     while how in (OUTCOMES["more"], OUTCOMES["certificate"]):
@@ -244,13 +244,9 @@ def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, in
     return impulse, done
 
 
-def pack_problem(problem: Any, solver: str, taken: bool | None = None) -> bytes:
-    """The problem itself: counts, then arrays in the order of `lav_problem`; NotTaken where the method refuses it."""
+def pack_problem(problem: Any) -> bytes:
+    """The problem itself: counts, then arrays in the order of `lav_problem`."""
     given = view(problem)
-    if not (takes(problem, solver) if taken is None else taken):
-        raise NotTaken(
-            f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
-        )
     out = struct.pack("<9q", *given.counts)
     for values in given.arrays.values():
         data = b"" if values is None else np.ascontiguousarray(values).tobytes()

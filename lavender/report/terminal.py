@@ -37,7 +37,8 @@ def print_report(report: Report, console: Console, whole: bool = False) -> None:
         if whole or i == 0 or told.asked:
             said.append(Text(told.text, style="" if i else "bold"))
             around = "  # the lines around it: --tables" if len(told.code) > 1 else ""
-            code = (*told.code, *told.in_c) if whole else (told.line + around,) * bool(told.line)
+            in_c = (f"# in C: {told.in_c}",) * bool(told.in_c)
+            code = (*told.code, *in_c) if whole else (told.line + around,) * bool(told.line)
             said += [Text(f"    {line}") for line in code]
     if report.busy:
         said.append(Text(report.busy, style="yellow"))

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
-from lavender.bench.line import c_of
 from lavender.bench.record import Record, level_name
 from lavender.bench.store import Records
 from lavender.io.stored import SUFFIXES
+from lavender.registry import specs
 from lavender.report import tables
 from lavender.report.contenders import QUICKER, Subject, subjects
 from lavender.report.moved import by_speed, speed_levels, speed_name
@@ -33,7 +33,7 @@ class Told:
 
     text: str
     code: tuple[str, ...] = ()  # Python, as it was timed
-    in_c: tuple[str, ...] = ()
+    in_c: str = ""  # the command that exports it to C, or why there is none
     asked: bool = False  # for a time or a number of sweeps that somebody asked for
 
     @property
@@ -203,20 +203,19 @@ def _not_in_c(records: Records, final: Final) -> str:
 
 
 def _told(records: Records, final: Final, said: str, asked: bool = False) -> Told:
-    """A sentence with its lines, of Python and of C."""
+    """A sentence with its lines, of Python and, as the command that exports them, of C."""
     if not final.line.times:
         said += " Records of an earlier version: the line itself was not timed."
-    calls, reason = c_of(final.line), _not_in_c(records, final)
-    in_c = (
-        ["/* docs/c.md */", *(f"{call};" for call in calls), "lav_run(solver, &budget, &result);"]
-        if calls
-        else []
-    )
-    if final.line.solver == "auto" and records.source:  # its steps, as data
-        in_c = [f"/* lavender export c liblavender --solver auto --for {quote(records.source)} */"]
-    if calls and reason:
-        in_c = [f"/* not in C: {reason} */"]
-    return Told(said, final.code, tuple(in_c), asked)
+    line, reason, in_c = final.line, _not_in_c(records, final), ""
+    spec = specs().get(line.solver)
+    if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
+        source = quote(records.source or "records.jsonl")
+        in_c = (
+            f"not in C: {reason}"
+            if reason
+            else f"lavender export c liblavender --solver {line.solver} --for {source}"
+        )
+    return Told(said, final.code, in_c, asked)
 
 
 def _by_advice(records: Records) -> Verdict:

@@ -16,7 +16,7 @@ from stacks import stack
 import lavender as lv
 from lavender import bench, cli, io, report
 from lavender.bench import machine
-from lavender.bench.line import c_of, code_of
+from lavender.bench.line import code_of
 from lavender.bench.lock import Lock
 from lavender.bench.record import KINDS, file_name, printable, to_json
 from lavender.report.findings import Report
@@ -200,7 +200,6 @@ def show_all(records, figure=True):
     shown = records.latest()
     for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
         assert code_of(record)
-        c_of(record)
     drawn = figures(shown)
     page(Report(shown, shown), drawn).encode("utf-8")
     summary(Report(shown)).encode("utf-8")

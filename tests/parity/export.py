@@ -88,7 +88,7 @@ def solved(given, number):
     for solver, asked in {swept: [(0.0, 1, {}), (0.0, 7, order), (0.0, 40, {})], **SOLVED}.items():
         for tol, iterations, options in asked:
             try:
-                yield vectors.pack(given, solver, tol, iterations, options)
+                yield vectors.pack(given, solver, tol, iterations, options)[0]
             except (NotTaken, lv.CapabilityError):
                 continue
 
@@ -118,7 +118,7 @@ def record(folder, steps=STEPS, scenes=SCENES):
     (folder / "scenes.bin").write_bytes(numbers(len(made)) + b"".join(made))
     given = [*problems(), *of_velocities()]
     packed = [vector for i, problem in enumerate(given) for vector in solved(problem, i)]
-    vectors.write_packed(folder, packed)
+    (folder / "vectors.bin").write_bytes(vectors.file_of(packed))
     return len(made), len(packed)
 
 

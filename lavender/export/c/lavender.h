@@ -150,7 +150,6 @@ typedef struct lav_options {
   int32_t sweep;               /* anderson, nncg: LAV_DEFAULT_SWEEP (blocks under the cone law, else pgs) | ... */
   int32_t convex;              /* anderson, nncg: iterations under the cone law first */
   int32_t keeps;               /* nncg: 1 restarts only against the sweep */
-  int32_t unused;
   uint64_t seed;               /* of LAV_RANDOM */
   double omega;                /* sor: 0 to 2; jacobi: > 0, or 0 for the safe damping */
 } lav_options;
@@ -192,7 +191,6 @@ typedef struct lav_result {
   int32_t iterations;          /* of this run */
   int32_t sweeps;
   int32_t restarts;            /* of anderson and nncg; blocks without an exact answer; factorisations of the others */
-  int32_t unused;
   lav_verdict verdict;
 } lav_result;
 

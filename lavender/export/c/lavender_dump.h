@@ -119,12 +119,13 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   static const char *const jac[] = {"general_jac_data", "general_jac_indices", "general_jac_indptr"};
   static const char *const mass[] = {"general_mass_data", "general_mass_indices", "general_mass_indptr"};
   static const char *const matrix[] = {"A_data", "A_indices", "A_indptr"};
-  const int32_t k = q->n_blocks, m = q->n_rows, n = q->n_bodies, c = k - q->n_joints, general = q->form == LAV_VELOCITIES;
-  const int32_t is_bodies = q->form == LAV_BODIES;
+  const int32_t k = q->n_blocks, m = q->n_rows, n = q->n_bodies, c = k - q->n_joints;
+  const int32_t is_bodies = q->form == LAV_BODIES, general = q->form == LAV_VELOCITIES;
   const int64_t version = 1, shape[2] = {m, m};
   double *b = (double *)calloc(2 * (size_t)m + 1, 8);
   int32_t *whole = (int32_t *)calloc(2 * (size_t)k + 2, 4), *kind = whole + k + 1, i, j, code;
-  char meta[128];
+  uint32_t end[8] = {0x06054b50, 0, 0, 0, 0, 0, 0, 0};
+  char meta[128], size[16];
   lav_dump_file d;
   lav_verdict verdict;
   verdict.size = (uint32_t)sizeof verdict;
@@ -150,8 +151,8 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   lav_dump_reals(&d, "cones_patch_radius", q->patch_radius, k, "", 1, 0.0);
   if (q->rolling) lav_dump_reals(&d, "cones_rolling", q->rolling, k, "", 1, 0.0);
   if (q->impulse) lav_dump_reals(&d, "guess", q->impulse, m, "", 1, 0.0);
-  snprintf(meta, sizeof meta, "%d,", (int)k);
-  if (q->key) lav_dump_array(&d, "key", "u8", meta, q->key, 8 * (size_t)k);
+  snprintf(size, sizeof size, "%d,", (int)k);
+  if (q->key) lav_dump_array(&d, "key", "u8", size, q->key, 8 * (size_t)k);
   if (is_bodies || general) lav_dump_reals(&d, "compliance", q->compliance, m, "", 1, 0.0);
   if (is_bodies) {
     lav_dump_reals(&d, "rows_inv_mass", q->inv_mass, n, "", 1, 0.0);
@@ -176,18 +177,12 @@ static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const c
   snprintf(meta, sizeof meta, "{\"operator\": \"%s\", \"friction\": \"%s\", \"name\": \"\", \"names\": null%s}",
            is_bodies ? "rows" : general ? "generalized" : "csr", q->law == LAV_CONE ? "cone" : "coulomb",
            general ? ", \"dof_names\": null" : "");
-  {
-    char size[16];
-    snprintf(size, sizeof size, "%d,", (int)strlen(meta));
-    lav_dump_array(&d, "meta", "u1", size, meta, strlen(meta));
-  }
-  {
-    const uint32_t at = (uint32_t)ftell(d.file), count = (uint32_t)d.count;
-    uint32_t end[] = {0x06054b50, 0, 0, count, count, 0, at, 0};
-    for (i = 0; i < d.count; i++) lav_dump_head(&d, i, 1);
-    end[5] = (uint32_t)ftell(d.file) - at;
-    lav_dump_numbers(&d, "42222442", end);
-  }
+  snprintf(size, sizeof size, "%d,", (int)strlen(meta));
+  lav_dump_array(&d, "meta", "u1", size, meta, strlen(meta));
+  end[3] = end[4] = (uint32_t)d.count, end[6] = (uint32_t)ftell(d.file);
+  for (i = 0; i < d.count; i++) lav_dump_head(&d, i, 1);
+  end[5] = (uint32_t)ftell(d.file) - end[6];
+  lav_dump_numbers(&d, "42222442", end);
   free(b), free(whole);
   return fclose(d.file) != 0 || d.is_bad ? LAV_ERROR_FILE : LAV_OK;
 }

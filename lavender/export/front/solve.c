@@ -344,7 +344,6 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   s->bytes = bytes - skip;
   s->used = sizeof(lav_solver);
   s->options = *options;
-  s->form = largest->form;
   take_kept(s, largest);
   s->begin = s->used;
 #ifndef LAV_SWEEPS_ONLY
@@ -356,29 +355,23 @@ int32_t lav_open(void *memory, uint64_t bytes, const lav_problem *largest, const
   return LAV_OK;
 }
 
+#define MOVED(array, type) (to->kept.array = (type *)(void *)(to->base + ((char *)s->kept.array - s->base)))
+
 int32_t lav_move(lav_solver *solver, void *memory, uint64_t bytes, lav_solver **out) {
-  lav_problem most;
-  lav_solver *to;
-  int32_t code;
-  GIVE_BACK(enter(solver));
-  if (!memory || !out) return leave(solver, LAV_ERROR_NULL);
-  keep_impulses(solver);
-  memset(&most, 0, sizeof most);
-  most.size = (uint32_t)sizeof most;
-  most.form = solver->form;
-  most.n_blocks = solver->kept.most_blocks;
-  most.n_rows = solver->kept.most_rows;
-  most.n_velocities = most.n_rows;
-  code = lav_open(memory, bytes, &most, &solver->options, &to);
-  if (code != LAV_OK) return leave(solver, code);
-  COPY(to->kept.key, solver->kept.key, solver->kept.n_blocks);
-  COPY(to->kept.ptr, solver->kept.ptr, solver->kept.n_blocks + 1);
-  COPY(to->kept.kind, solver->kept.kind, solver->kept.n_blocks);
-  COPY(to->kept.impulse, solver->kept.impulse, solver->kept.n_rows);
-  to->kept.n_blocks = solver->kept.n_blocks;
-  to->kept.n_rows = solver->kept.n_rows;
+  lav_solver *s = solver, *to;
+  const uint64_t skip = (16 - (uintptr_t)memory % 16) % 16;
+  GIVE_BACK(enter(s));
+  if (!memory || !out) return leave(s, LAV_ERROR_NULL);
+  if (bytes < skip + s->begin) return leave(s, LAV_ERROR_ROOM);
+  keep_impulses(s);
+  to = (lav_solver *)(void *)((char *)memory + skip);
+  memcpy(to, s, s->begin); /* what is carried lies behind the struct */
+  to->base = (char *)to;
+  to->bytes = bytes - skip;
+  MOVED(key, uint64_t), MOVED(ptr, int32_t), MOVED(kind, int32_t), MOVED(impulse, double);
+  to->busy = to->ready = 0;
   *out = to;
-  return leave(solver, LAV_OK);
+  return leave(s, LAV_OK);
 }
 
 const char *lav_refused(const lav_solver *solver, int32_t *index) {
