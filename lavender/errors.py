@@ -15,6 +15,7 @@ __all__ = [
     "LavenderError",
     "SolveFailed",
     "SolverUnavailable",
+    "TooLarge",
     "UnknownName",
     "last_words",
 ]
@@ -26,6 +27,10 @@ class LavenderError(Exception):
 
 class InputError(LavenderError, ValueError):
     """An argument, array or file that lavender cannot take."""
+
+
+class TooLarge(InputError):
+    """A matrix of more entries than indices reach; whoever needs it finds out when it is formed."""
 
 
 class UnknownName(LavenderError, KeyError):
@@ -75,7 +80,7 @@ class InUse(LavenderError, RuntimeError):
 
 # What may end a run of numbers that are valid, and makes a result with the error as its message: arithmetic that breaks
 # down, memory that is not there, an A that is too large and was not needed before.
-BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, InputError)
+BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, TooLarge)
 
 
 def last_words(error: BaseException) -> str:

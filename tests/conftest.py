@@ -36,6 +36,17 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: "parity" not in item.path.parts)
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """A test that asks for a backend which is not installed is skipped, with the package that it needs."""
+    from lavender import SolverUnavailable
+
+    try:
+        return (yield)
+    except SolverUnavailable as error:
+        pytest.skip(str(error))
+
+
 @pytest.fixture(scope="session")
 def problem_dir() -> Path:
     """Folder of the reference problems, named by LAVENDER_PROBLEMS."""

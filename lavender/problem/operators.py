@@ -10,7 +10,7 @@ from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
 from lavender._derived import cached_property, once
 from lavender._later import issparse
 from lavender._later import sparse as sp
-from lavender.errors import CapabilityError, InputError
+from lavender.errors import CapabilityError, TooLarge
 from lavender.problem.data import ProblemData
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
@@ -104,7 +104,7 @@ class Operators(ProblemData):
         try:
             view.prepare()
         except OverflowError as error:
-            raise InputError(f"the problem is too large: {error}") from None
+            raise TooLarge(f"the problem is too large: {error}") from None
         return view
 
     def _data(self, **operator: Any) -> Data:
@@ -128,7 +128,7 @@ class Operators(ProblemData):
             most, start, blocks = assemble.bound(self.data)
             most = min(most, self.m**2)  # blocks that share both bodies count twice
             if most >= MOST_ENTRIES:
-                raise InputError(
+                raise TooLarge(
                     f"A would have up to {most} entries, more than 32-bit indices reach: "
                     "use a solver that reads rows"
                 )
@@ -140,7 +140,7 @@ class Operators(ProblemData):
         # A = Y Y^T + diag(compliance): symmetric to the bit, as both triangles are summed in the same order.
         most = min(self.metric.entries_of_a + self.m, self.m**2)  # rows of no velocity have their compliance
         if most >= MOST_ENTRIES:
-            raise InputError(
+            raise TooLarge(
                 f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
                 "J and M as they are (operator 'generalized')"
             )

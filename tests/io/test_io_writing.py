@@ -4,6 +4,7 @@ import errno
 import os
 import signal
 import stat
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -51,7 +52,12 @@ WRITERS = {
     "records as JSON": (".json", lambda made, path: bench.write_json(Records(), path)),
     "text": (".txt", lambda made, path: write_text(path, "abc")),
 }
-everybody = pytest.mark.parametrize(("suffix", "write"), WRITERS.values(), ids=WRITERS)
+needs_hdf5 = pytest.mark.skipif(find_spec("h5py") is None, reason="FCLIB's files need h5py (extra: fclib)")
+everybody = pytest.mark.parametrize(
+    ("suffix", "write"),
+    [pytest.param(*how, marks=[needs_hdf5] if name == "hdf5" else []) for name, how in WRITERS.items()],
+    ids=WRITERS,
+)
 
 BEFORE = b"what stood there"
 
@@ -130,10 +136,10 @@ def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_p
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
+@needs_hdf5
 @pytest.mark.parametrize("room", [1, 4096, 16384, 24576])
 def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, room):
     """HDF5 itself ends the process by a signal where a write fails that is not its first."""
-    pytest.importorskip("h5py")
     path = tmp_path / "p.hdf5"
     lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5).save(path)
     before = path.read_bytes()
