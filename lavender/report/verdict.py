@@ -183,9 +183,8 @@ def _told(records: Records, final: Final, time: float, what: str) -> list[str]:
     line, reason, in_c = final.line, _not_in_c(records, final), []
     spec = specs().get(line.solver)
     if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
-        source = quote(records.source or "records.jsonl")
-        in_c = [f"# in C: lavender export c liblavender --solver {line.solver} --for {source}"]
-        in_c = [f"# not in C: {reason}"] if reason else in_c
+        made = f"lavender export c liblavender --solver {line.solver} --for {quote(records.source or 'records.jsonl')}"
+        in_c = [f"# not in C: {reason}" if reason else f"# in C: {made}"]
     if final.line.start == "carried":
         return [f"{before[0]}  # {timed}", *before[1:], last, *in_c]
     return [*before, f"{last}  # {timed}", *in_c]
