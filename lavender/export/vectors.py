@@ -127,6 +127,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     packed: list[bytes] = []
     left: list[str] = []
     steps: dict[tuple[str, bool], Step] = {}
+    longest = 2 * max(r.iterations for r in measured)
     for record in {(r.case, r.sha): r for r in measured}.values():
         if len(packed) >= most and record.solver != "auto":
             break
@@ -139,16 +140,12 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
         packed.append(vector)
         for step in ran:
             key = step.solver, step.relaxed
-            most_so_far = steps[key].iterations if key in steps else 0
-            steps[key] = replace(step, iterations=max(step.iterations, most_so_far))
+            count = step.iterations if record.solver == "auto" else min(step.iterations, longest)
+            steps[key] = replace(step, iterations=max(count, steps[key].iterations if key in steps else 1))
     if not packed:
         raise InputError(
             f"no problem of {measured[0].solver} in {path} makes a test vector: {'; '.join(left[:3])}"
         )
-    if len(steps) == 1 and measured[0].solver != "auto":  # twice what the longest took
-        key, step = steps.popitem()
-        longest = 2 * max(r.iterations for r in measured)
-        steps[key] = replace(step, iterations=max(1, min(longest, step.iterations)))
     check = (HERE / "front" / "check.c").read_text(encoding="utf-8")
     lines = ",\n".join(f"  {step.text()}" for step in steps.values())
     header = CHOSEN.format(solver=measured[0].solver, tol=measured[0].tol, count=len(steps), lines=lines)

@@ -209,12 +209,8 @@ def _told(records: Records, final: Final, said: str, asked: bool = False) -> Tol
     line, reason, in_c = final.line, _not_in_c(records, final), ""
     spec = specs().get(line.solver)
     if spec is not None and spec.own and not spec.external and line.mode == "tol" and line.way != "batch":
-        source = quote(records.source or "records.jsonl")
-        in_c = (
-            f"not in C: {reason}"
-            if reason
-            else f"lavender export c liblavender --solver {line.solver} --for {source}"
-        )
+        made = f"lavender export c liblavender --solver {line.solver} --for {quote(records.source or 'records.jsonl')}"
+        in_c = f"not in C: {reason}" if reason else made
     return Told(said, final.code, in_c, asked)
 
 

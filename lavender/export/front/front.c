@@ -301,8 +301,11 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 
 /* How far normals and tangents are from orthogonal unit vectors, the worst of a contact. */
 static double off_frame(const double *n, const double *t) {
-  const double nn = fabs(sqrt(core_rows_dot3(n, n)) - 1.0), tt = fabs(sqrt(core_rows_dot3(t, t)) - 1.0), nt = fabs(core_rows_dot3(n, t));
-  const double most = nn > tt ? nn : tt;
+  double nn = core_rows_dot3(n, n), tt = core_rows_dot3(t, t), most;
+  const double nt = fabs(core_rows_dot3(n, t));
+  if (fabs(nn - 1.0) <= EXACT && fabs(tt - 1.0) <= EXACT && nt <= EXACT) return 0.0; /* most are, without a root */
+  nn = fabs(sqrt(nn) - 1.0), tt = fabs(sqrt(tt) - 1.0);
+  most = nn > tt ? nn : tt;
   return most > nt ? most : nt;
 }
 
