@@ -225,7 +225,9 @@ def _dense_island(
     if not roots:
         tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
     else:
-        tails = [_by_qr(root.toarray().T, tol) for root in roots]
+        # On the columns that the island has; one at least.
+        own = [root[:, np.unique(np.append(root.indices, 0))] for root in roots]
+        tails = [_by_qr(root.toarray().T, tol) for root in own]
         tail, words = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
         if len({len(t) for t in tails}) > 1:
             words.append(

@@ -69,6 +69,7 @@ def test_own_time_is_a_part_of_the_whole(monkeypatch):
     ticks = itertools.count()
     monkeypatch.setattr(adapters, "process_time", lambda: float(next(ticks)))
     problem = suite.case("stack(n=4)").problem
+    pytest.importorskip("piqp", reason="backends with an interface of their own (extra: qp)")
     own = [c for c in adapters.contestants() if "own interface" in c.name and c.refuses(problem) is None]
     assert own
     for contestant in own:

@@ -4,6 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from kkt_truth import eliminate
@@ -277,3 +278,15 @@ def test_a_diagonal_that_is_rounding_is_not_scaled_by():
     # 1e-27 beside 1e-13: semidefinite to rounding alone, and so no size of the row.
     found = lv.redundancy(lv.Problem.linear([[1e-27, 1e-13], [1e-13, 1.0]], [0.0, 0.0]))
     assert found.rank == 1
+
+
+def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
+    """Of 300 boxes side by side each is small; with the columns of all, memory and time grow as their square."""
+    seen, qr = [], scipy.linalg.qr
+    monkeypatch.setattr(scipy.linalg, "qr", lambda a, **more: (seen.append(a.shape), qr(a, **more))[1])
+    one = np.random.default_rng(2).normal(size=(9, 4))
+    many = lv.Problem.from_jacobian(
+        np.kron(np.eye(300), one), np.eye(1200), np.ones(1200), cones=lv.Cones.free(2700)
+    )
+    assert lv.redundancy(many).rank == 1200
+    assert max(seen)[0] <= 5
