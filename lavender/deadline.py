@@ -1,11 +1,15 @@
-"""The deadline of a solve: the only clock of solvers, read between their steps."""
+"""The deadline of a solve: the only clock of solvers, read between their steps.
+
+It is the caller's: it runs from the call of `solve` to its return. What cannot be stopped is begun only if its counted
+time fits in what is left, and the time of what always follows, the judge's last pass, is kept free.
+"""
 
 from __future__ import annotations
 
 import math
 from time import perf_counter
 
-__all__ = ["CHUNK_TIME", "Deadline", "Stopwatch"]
+__all__ = ["CHUNK_TIME", "NEVER", "Deadline", "Stopwatch"]
 
 CHUNK_TIME = 0.01  # s between two readings of the clock; five times that is still unnoticeable after Ctrl-C
 
@@ -29,18 +33,32 @@ class Deadline:
 
     __slots__ = ("_at",)
 
-    def __init__(self, limit: float | None = None) -> None:
-        self._at = math.inf if limit is None else perf_counter() + limit
+    def __init__(self, limit: float | None = None, begun: float | None = None) -> None:
+        """`begun`: reading of this clock that the limit counts from; default: now."""
+        self._at = math.inf
+        if limit is not None:
+            self._at = (perf_counter() if begun is None else begun) + limit
 
     @property
     def is_set(self) -> bool:
         """Whether there is a limit."""
         return self._at < math.inf
 
+    def keep(self, seconds: float) -> None:
+        """End so much earlier: kept for what always follows."""
+        self._at -= seconds
+
     def passed(self, step: float = 0.0) -> bool:
         """Whether a step of so many seconds, begun now, would end after the deadline."""
         return self._at < math.inf and perf_counter() + step >= self._at
 
+    def nanoseconds(self) -> float:
+        """What is left, in the unit of counted costs; inf without a limit."""
+        return 1e9 * (self._at - perf_counter())
+
     def left(self, least: float = 0.0) -> float | None:
         """Seconds until then, at least `least`; None without a limit."""
         return None if self._at == math.inf else max(self._at - perf_counter(), least)
+
+
+NEVER = Deadline()

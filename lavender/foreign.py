@@ -28,6 +28,8 @@ class Foreign:
 
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
+        if hasattr(solver, "setup_time"):
+            self.setup_time = solver.setup_time
         if hasattr(solver, "ready"):
             self.ready = lambda held, time_limit: solver.ready(held.state, time_limit)
         if hasattr(solver, "until"):

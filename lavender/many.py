@@ -16,11 +16,14 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import whole_number
+from lavender.deadline import NEVER, Deadline
 from lavender.errors import InputError
+from lavender.loop import LEAST
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
+from lavender.residuals import judging_time
 from lavender.solution import Solution, Status, uninterrupted
-from lavender.solve import check_budget, rest_of, solve
+from lavender.solve import check_budget, rest_of, seconds_of, solve
 from lavender_ext.small.many import Batch
 
 __all__ = ["solve_many"]
@@ -34,6 +37,7 @@ def solve_many(
     threads: int = 1,
     tol: float = 1e-6,
     max_iter: int | None = None,
+    time_limit: float | None = None,
     **options: Any,
 ) -> list[Solution]:
     """Solve many problems, with the bits of `solve` on each for any number of threads.
@@ -48,6 +52,9 @@ def solve_many(
         Problems solved at the same time.
     tol, max_iter, **options
         As `solve`.
+    time_limit : float, optional, s
+        Limit of the whole call on the wall clock. Problems take their turns in order, each with all of the time left;
+        those whose turn comes too late keep their start.
 
     Returns
     -------
@@ -75,11 +82,17 @@ def solve_many(
     starts = [None] * len(given) if impulses is None else list(impulses)
     made: list[Solution | None] = [None] * len(given)
     spec = get(solver)
-    check_budget(spec, tol, max_iter, options.get("time_limit"))
+    limit = seconds_of(time_limit)
+    deadline = NEVER if limit == np.inf else Deadline(limit)
+    check_budget(spec, tol, max_iter)
+    # What the results of those to come take is kept free.
+    shares = [judging_time(p, False) if type(p) is Problem and deadline.is_set else 0.0 for p in given]
+    deadline.keep(sum(shares))
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
     together = spec.own and spec.small is not None and spec.small.limits is not None and not options
     together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+    together = together and not deadline.is_set
     at = [
         i
         for i, p in enumerate(given)
@@ -94,7 +107,8 @@ def solve_many(
     def alone(i: int) -> None:
         if stop[0]:
             return
-        found = solve(given[i], solver, impulse=starts[i], **more)
+        deadline.keep(-shares[i])
+        found = solve(given[i], solver, impulse=starts[i], time_limit=deadline.left(LEAST), **more)
         made[i] = found if "callback" in options else uninterrupted(found)
 
     parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []

@@ -26,7 +26,7 @@ from lavender._arrays import FloatArray
 from lavender._derived import cached_property
 from lavender.errors import InputError, SolverUnavailable, UnknownName
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
-from lavender.solution import Claim
+from lavender.solution import Claim, Status
 
 __all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
 
@@ -43,10 +43,12 @@ class SmallCall(Protocol):
     def limits(self) -> Any:
         """What it may cost over generalised velocities."""
 
-    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float) -> Any:
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
 
-    def claim(self, problem: Problem, counts: Any, start: FloatArray | None, after: float) -> Claim:
+    def claim(
+        self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
+    ) -> Claim:
         """What counts come to, from a start (m,) or from none to the residual `after`, with its turns."""
 
 
@@ -71,8 +73,10 @@ class State(Protocol):
 class Solver(Protocol):
     """What a factory returns; see the module.
 
-    A resumable solver with long single steps (factorisations) may also have `until(state, deadline)`. It is called
-    before `run` if there is a time limit, with the `lavender.deadline.Deadline` after which no such step should end.
+    Under a time limit `setup_time(problem)` is asked, if there is one: what `prepare` takes [s], counted from the size
+    of the problem. If that does not fit in the time left, nothing is begun. A resumable solver with long single steps
+    (factorisations) may also have `until(state, deadline)`. It is called before `run` if there is a time limit, with
+    the `lavender.deadline.Deadline` after which no such step should end.
     """
 
     def prepare(self, problem: Problem) -> Any:
@@ -246,15 +250,20 @@ def _importable(module: str) -> bool:
 registered: dict[str, SolverSpec] = {}
 
 
+def load_table(table: str) -> None:
+    """Fill `registered` with the SPECS of a module."""
+    for spec in importlib.import_module(table).SPECS:
+        object.__setattr__(spec, "own", True)
+        registered.setdefault(spec.name, spec)
+
+
 @cache
 def load() -> None:
     """Fill `registered` once, with the built-in solvers and those of plug-ins."""
     from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
 
     for table in TABLES:
-        for spec in importlib.import_module(table).SPECS:
-            object.__setattr__(spec, "own", True)
-            registered.setdefault(spec.name, spec)
+        load_table(table)
     for entry in entry_points(group="lavender.solvers"):
         try:
             spec = entry.load()
@@ -304,8 +313,10 @@ def get(name: str) -> SolverSpec:
     SolverUnavailable
         Its package is not installed; the message says what to install.
     """
-    load()
     spec = registered.get(name) if isinstance(name, str) else None
+    if spec is None:
+        load()
+        spec = registered.get(name) if isinstance(name, str) else None
     if spec is None:
         raise UnknownName("solver", name, specs())
     reason = spec.missing()

@@ -1,15 +1,8 @@
-"""`solve` and `prepare`: check the arguments, run the solver in short chunks of iterations, judge the result.
-
-Between two chunks this module reads the clock, records history, calls the callback, and turns Ctrl-C into a result.
-A chunk lasts about 10 ms. Chunks do not change the result, because every solver checks convergence at fixed numbers
-of iterations.
-"""
+"""`solve` and `prepare`: check the arguments, set up the solver, run it (`loop.py`), judge the result."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from functools import partial
 from threading import Lock
 from time import perf_counter
@@ -18,42 +11,37 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, equal, flag, number, whole_number
-from lavender.deadline import CHUNK_TIME, Deadline
+from lavender._arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
+from lavender.deadline import NEVER, Deadline, Stopwatch
 from lavender.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
 from lavender.foreign import Foreign
+from lavender.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.outcome import (
     CONVERGED,
     INFEASIBLE,
-    MAX_ITERATIONS,
     NUMERICAL_ERROR,
-    STALLED,
     TIME_LIMIT,
     decide_empty_rows,
     finish,
 )
 from lavender.problem import Problem, check_problem
-from lavender.registry import SMALL_ROWS, SolverSpec, State, get
+from lavender.registry import SMALL_ROWS, SolverSpec, get
 from lavender.residuals import (
     Residual,
-    judged,
+    judging_time,
     reference,
-    remember,
-    remembered,
-    residual,
+    setup_time,
     told,
     unstretched,
 )
-from lavender.solution import Claim, History, Solution, SolverRun, Status
+from lavender.solution import Claim, Solution, SolverRun, Status
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Prepared", "prepare", "solve"]
 
-FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
-Callback = Callable[[int, FloatArray, Residual], Any]
-Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
-NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
-INTERRUPTED = Status.INTERRUPTED
+LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
+         "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
+COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -84,9 +72,11 @@ def solve(
     max_iter : int, optional
         The most iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's spec.
     time_limit : float, optional, s
-        Limit of the solve time, checked between chunks of iterations. Solvers of other packages run in a separate
-        process, which is kept for later solves and killed at the limit (at twice the limit if the package has a time
-        limit of its own); `isolate=False` runs them in this process.
+        Limit of the whole call on the wall clock: set-up, iterations and the judge. What cannot be stopped, such as a
+        set-up or a factorisation, is begun only if its counted time fits in what is left. The result is no worse than
+        the start. Solvers of other packages run in a separate process, which is started before the clock of the first
+        limit, kept for later solves, and killed at the limit (at twice the limit if the package has a time limit of its
+        own); `isolate=False` runs them in this process.
     history : bool
         Record iterations, time and residual at fixed numbers of iterations.
     callback : callable (iterations, impulse, residual), optional
@@ -110,14 +100,17 @@ def solve(
     InputError
         `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
     """
+    begun = 0.0 if time_limit is None else perf_counter()
     check_problem(problem)  # first, for those who pass A and b
     spec = get(solver)
-    if max_iter is None and time_limit is None and callback is None and history is False and not options:
-        made = solve_small(problem, spec, impulse, tol)
+    limit = math.inf if time_limit is None else seconds_of(time_limit)
+    if max_iter is None and callback is None and history is False and not options:
+        made = solve_small(problem, spec, impulse, tol, limit)
         if made is not None:
             return made
-    return Prepared(problem, spec, options).solve(
-        impulse=impulse, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, callback=callback
+    deadline = NEVER if limit == math.inf else Deadline(limit, begun)
+    return Prepared(problem, spec, options, False)._solve(
+        None, impulse, tol, max_iter, deadline, history, callback
     )
 
 
@@ -165,8 +158,10 @@ class Prepared:
     raises `InUse`. Threads may share a `Problem`, but each needs a `Prepared` of its own.
     """
 
-    def __init__(self, problem: Problem, spec: SolverSpec, options: dict[str, Any]) -> None:
-        start = perf_counter()  # a check may form A, which is set-up
+    def __init__(
+        self, problem: Problem, spec: SolverSpec, options: dict[str, Any], begin: bool = True
+    ) -> None:
+        watch = Stopwatch()  # a check may form A, which is set-up
         _check_problem(problem, spec)
         for name in options:
             if name not in spec.accepts:
@@ -185,25 +180,26 @@ class Prepared:
         self._given, self.problem = problem, problem.disk
         self._lock = Lock()
         # `auto` prepares nothing before its compiled call for small problems was made.
-        if options or not spec.delegates:
-            self._begin()
-        self.setup_time = perf_counter() - start
+        if begin and (options or not spec.delegates):
+            self._begin(NEVER)
+        self.setup_time = watch.seconds
 
     solver: Any = None  # made when it is first needed
     setup_time = 0.0  # s
     _fresh = True  # nothing was solved with what was set up
     _broken = ""  # why there is no state
+    _late = False  # there is none, as it would have taken longer than the time limit
 
-    def _begin(self) -> None:
-        start = perf_counter()
+    def _begin(self, deadline: Deadline) -> None:
+        watch = Stopwatch()
         self.solver = _make(self.spec, self.options)
         try:
-            self._set_up(self.problem, anew=True)
+            self._set_up(self.problem, True, deadline)
         except BaseException:
             self.solver = None  # the next call begins again
             raise
         self._fresh = True
-        self.setup_time += perf_counter() - start
+        self.setup_time += watch.seconds
 
     def _replace(self, problem: Problem) -> None:
         """Another problem in the place of the prepared one; nothing is set up for it yet."""
@@ -227,35 +223,71 @@ class Prepared:
         InUse
             Another call of this object's `solve` has not returned yet.
         """
+        limit = seconds_of(time_limit)
+        deadline = NEVER if limit == math.inf else Deadline(limit)
+        return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
+
+    def _solve(
+        self,
+        problem: Problem | None,
+        impulse: ArrayLike | None,
+        tol: float,
+        max_iter: int | None,
+        deadline: Deadline,
+        history: bool,
+        callback: Callback | None,
+    ) -> Solution:
         if not self._lock.acquire(False):
             raise InUse(
                 f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
                 "make one for each thread (lavender.prepare)"
             )
         try:
-            plain = max_iter is None and time_limit is None and callback is None and history is False
+            plain = max_iter is None and callback is None and history is False
             if plain and self.spec.delegates and not self.options:
-                made = solve_small(self._given if problem is None else problem, self.spec, impulse, tol)
+                asked = self._given if problem is None else problem
+                made = solve_small(asked, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
                 if made is not None:
                     if problem is not None and problem is not self._given:
                         self._replace(problem)
                     return made
-            tol, max_iter, time_limit = check_budget(self.spec, tol, max_iter, time_limit)
+            tol, max_iter = check_budget(self.spec, tol, max_iter)
             _check_records(self.spec, history, callback)
+            if deadline.is_set:
+                asked = self.problem if problem is None else problem.disk
+                if deadline.passed(setup_time(asked)) and not self.spec.external:
+                    return self._unjudged(problem or self._given, asked, impulse, tol)
+                # Of what was found, and of where it began.
+                passes = 2 if impulse is not None or asked.guess is not None else 1
+                deadline.keep(passes * judging_time(asked))
             if self.solver is None:
                 if problem is not None and problem is not self._given:
                     _check_problem(problem, self.spec)
                     self._replace(problem)
-                self._begin()
-            self._refresh(problem)
-            loop = self._loop(impulse, tol, time_limit, history, callback)
+                self._begin(deadline)
+            self._refresh(problem, deadline)
+            loop = self._loop(impulse, tol, deadline, history, callback)
             return self._run(loop, max_iter)
         finally:
+            if self._late:
+                self.solver, self._late = None, False  # the next call begins again
             self._lock.release()
 
+    def _unjudged(self, given: Problem, problem: Problem, impulse: Any, tol: float) -> Solution:
+        """The start as it is, where even the judge would be late; he measures it for the first who asks."""
+        start = problem._start if problem.guess is None else problem.guess
+        if impulse is not None:
+            start = given.on_disk(problem.impulse_array(impulse))
+        claim = Claim(
+            TIME_LIMIT, 0, {}, "what the judge reads takes longer than the time limit: the start, unjudged"
+        )
+        answer = start if given is problem else given.cones.stretch * start
+        late = judged_later, (given, problem, self.spec, self.options, start.copy(), claim, tol)
+        return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late)
+
     def _loop(
-        self, impulse: Any, tol: float, time_limit: float | None, history: bool, callback: Callback | None
-    ) -> _Loop:
+        self, impulse: Any, tol: float, deadline: Deadline, history: bool, callback: Callback | None
+    ) -> Loop:
         problem, given = self.problem, self._given
         if given is not problem and callback is not None:
             callback = _in_rows_of(given, given.cones.stretch, callback)
@@ -263,17 +295,19 @@ class Prepared:
             lam = given.on_disk(problem.impulse_array(impulse))
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
-        if time_limit is not None and hasattr(self.solver, "ready"):
-            start = perf_counter()
-            self.solver.ready(self.state, time_limit)
-            self.setup_time += perf_counter() - start
+        left = deadline.left()
+        if left is not None and not self._late and hasattr(self.solver, "ready"):
+            watch = Stopwatch()
+            self.solver.ready(self.state, left)
+            deadline.keep(-watch.seconds)
+            self.setup_time += watch.seconds
         records: list[Record] | None = [] if history else None
-        return _Loop(
-            problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, time_limit=time_limit,
+        return Loop(
+            problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, deadline=deadline,
             callback=callback, records=records,
         )  # fmt: skip
 
-    def _run(self, loop: _Loop, max_iter: int) -> Solution:
+    def _run(self, loop: Loop, max_iter: int) -> Solution:
         spec, problem = self.spec, self.problem
         setup_time, self.setup_time = self.setup_time, 0.0
         proof = decide_empty_rows(problem, loop.impulse, loop.tol)
@@ -281,24 +315,30 @@ class Prepared:
             claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
+        elif self._late:
+            claim = Claim(TIME_LIMIT, 0, {}, "what has to be set up first takes longer than the time limit")
+            loop.not_worse(loop.impulse)
         else:
+            start = loop.impulse.copy() if loop.deadline.is_set else loop.impulse
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
+            if claim.status is TIME_LIMIT:
+                loop.not_worse(start)
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)),
         )  # fmt: skip
         return solution if self._given is problem else solution.unstretched(self._given)
 
-    def _refresh(self, problem: Problem | None) -> None:
+    def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
         if problem is None or problem is self._given:
             if not self._fresh:
-                self._set_up(self.problem, anew=False)
+                self._set_up(self.problem, False, deadline)
         else:
-            start = perf_counter()
+            watch = Stopwatch()
             _check_problem(problem, self.spec)
             given, problem = problem, problem.disk
-            self._set_up(problem, anew=not same_structure(self.problem, problem))
-            self.setup_time = perf_counter() - start
+            self._set_up(problem, not same_structure(self.problem, problem), deadline)
+            self.setup_time = watch.seconds
             self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
         self._fresh = False
 
@@ -306,11 +346,16 @@ class Prepared:
         """Copied or pickled it is prepared anew: a state is for one solve at a time."""
         return partial(prepare, **self.options), (self._given, self.spec.name)
 
-    def _set_up(self, problem: Problem, anew: bool) -> None:
-        """Prepare, or update the state of a problem of the same structure."""
+    def _set_up(self, problem: Problem, anew: bool, deadline: Deadline) -> None:
+        """Prepare, or update the state of a problem of the same structure, if that is counted to end in time."""
         if problem.metric.start_energy < 0.0:
             reference(problem)  # of the judge, before any solver has the problem in its hands
         anew, self._broken = anew or bool(self._broken), ""
+        if deadline.is_set and hasattr(self.solver, "setup_time"):
+            self._late = deadline.passed(self.solver.setup_time(problem))
+            if self._late:
+                self.state = None
+                return
         try:
             if anew:
                 self.state = self.solver.prepare(problem)
@@ -373,140 +418,20 @@ def same_structure(p: Problem, q: Problem) -> bool:
     return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
 
 
-@dataclass
-class _Loop:
-    """Chunks, clock, history and Ctrl-C around one solver's `run`."""
-
-    problem: Problem
-    solver: Any
-    state: Any
-    impulse: FloatArray  # (m,) N s, in place
-    tol: float
-    time_limit: float | None  # s
-    callback: Callback | None
-    records: list[Record] | None
-    time: float = 0.0  # s, of the solver alone
-    done: int = 0  # iterations
-    work: dict[str, int] = field(default_factory=dict)
-    broken: bool = False  # the solver did not return
-    next_record: int = 0  # iterations
-
-    def run_once(self, max_iter: int) -> Claim:
-        start_point = self.impulse.copy()
-        start = perf_counter()
-        try:
-            try:
-                claim = self._call(max_iter, self.time_limit)
-            finally:
-                self.time = perf_counter() - start
-            if not self.broken:
-                tell = getattr(self.solver, "tell", None)  # judges, and finds words
-                return claim if tell is None else tell(self.state, self.impulse, claim)
-        except KeyboardInterrupt:
-            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        if not all_finite(self.impulse) or (self.broken and self._is_worse_than(start_point)):
-            self.impulse[:] = start_point
-        return claim
-
-    def _is_worse_than(self, impulse: FloatArray) -> bool:
-        last, other = (judged(self.problem, x.copy()) for x in (self.impulse, impulse))
-        return last.relative > other.relative
-
-    def _call(self, max_iter: int, time_limit: float | None) -> Claim:
-        """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
-        try:
-            return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
-        except BREAKDOWN as error:
-            self.broken = True
-            return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
-
-    def run(self, max_iter: int) -> Claim:
-        # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
-        chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
-        records = self.records is not None or self.callback is not None
-        claim = NOTHING_DONE
-        if self.time_limit is not None:
-            chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
-            if hasattr(self.solver, "until"):
-                # For work that cannot be cut into chunks: a factorisation that would end too late is not begun.
-                self.solver.until(self.state, Deadline(self.time_limit))
-        try:
-            if records and self._record():
-                return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
-            while self.done < max_iter:
-                n = min(chunk, max_iter - self.done)
-                if records:
-                    n = min(n, self.next_record - self.done)
-                start = perf_counter()
-                claim = self._call(n, None)
-                elapsed = perf_counter() - start
-                self.time += elapsed
-                self.done += claim.iterations
-                for kind, count in claim.work.items():
-                    self.work[kind] = self.work.get(kind, 0) + count
-                stopped = records and self.done == self.next_record and self._record()
-                if claim.status is not MAX_ITERATIONS:
-                    break
-                if claim.iterations < 1:
-                    claim = Claim(STALLED, 0, {}, f"did none of the {n} iterations that it was asked for")
-                    break
-                if stopped:
-                    claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
-                    break
-                if self.time_limit is not None and self.time >= self.time_limit:
-                    claim = Claim(TIME_LIMIT, 0, {}, claim.message)
-                    break
-                if self.done < max_iter:
-                    chunk = self._next_chunk(n, elapsed)
-        except KeyboardInterrupt:
-            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        self._keep_best()
-        return self._total(claim)
-
-    def _next_chunk(self, n: int, elapsed: float) -> int:
-        aim = CHUNK_TIME
-        if self.time_limit is not None:
-            aim = min(aim, max(self.time_limit - self.time, 0.0))
-        return max(1, min(8 * n, int(n * aim / max(elapsed, 1e-7))))
-
-    def _keep_best(self) -> None:
-        # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
-        if self.tol == 0.0:
-            return
-        state: State = self.state
-        best = getattr(state, "best", None)
-        if best is None or best[1] is None:
-            return
-        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse.copy())
-        if last.relative <= best[0]:
-            remember(self.problem, last)  # for the result
-        else:
-            self.impulse[:] = best[1]
-
-    def _record(self) -> bool:
-        r = residual(self.problem, self.impulse, "float64")
-        if self.records is not None:
-            self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
-        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
-        return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
-
-    def _total(self, claim: Claim) -> Claim:
-        if claim.iterations == self.done and claim.work == self.work:
-            return claim  # of a single chunk
-        return replace(claim, iterations=self.done, work=self.work)
-
-    def recorded(self) -> History | None:
-        if self.records is None:
-            return None
-        if not self.records or self.records[-1][0] != self.done:
-            self._record()
-        columns = list(zip(*self.records, strict=True))
-        return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
+def judged_later(given: Problem, problem: Problem, *more: Any) -> dict[str, Any]:
+    """The fields that `Prepared._unjudged` leaves for later."""
+    spec, options, impulse, claim, tol = more
+    made = finish(problem, spec, options, impulse, claim, tol, 0.0, 0.0, None)
+    made = made if given is problem else made.unstretched(given)
+    return {name: getattr(made, name) for name in ("residual", *LATER)}
 
 
-def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) -> Solution | None:
+def solve_small(
+    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, limit: float = math.inf
+) -> Solution | None:
     """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
 
+    If its counted cost is more than the limit [s], the result is the best of what was found by then and of the start.
     The fields of claim, counts and residual are made when they are first read.
     """
     small = spec.small
@@ -514,8 +439,10 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
         return None
     if not 0.0 < tol < math.inf:
         return None
-    if problem.cones.has_ellipse or (problem.m > SMALL_ROWS and problem.generalized is None):
-        return None  # islands may take long: they are solved where Ctrl-C is heard
+    if problem.cones.has_ellipse or (
+        problem.m > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
+    ):
+        return None  # islands may take long: they are solved where Ctrl-C and the clock are heard
     start = perf_counter()
     if impulse is None:
         given = problem.guess
@@ -526,27 +453,38 @@ def solve_small(problem: Problem, spec: SolverSpec, impulse: Any, tol: float) ->
         given = impulse
     else:
         given = problem.impulse_array(impulse)
-    found = small.solve(problem, given, tol)
+    if limit == math.inf:
+        found = small.solve(problem, given, tol)
+    else:
+        found = small.solve(problem, given, tol, COUNTED * limit)
     if found is None:
         return None
     judged, counts = found
+    status = CONVERGED
+    if judged.relative > tol:
+        status, judged = TIME_LIMIT, best_of(problem, judged, given)
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
     judged.impulse.setflags(write=False)
     return Solution.late(
         judged.impulse,
-        CONVERGED,
+        status,
         tol,
         perf_counter() - start,
-        (rest_of, (problem, spec, judged, counts, kept)),
+        (rest_of, (problem, spec, judged, counts, kept, status)),
     )
 
 
 def rest_of(
-    problem: Problem, spec: SolverSpec, judged: Any, counts: Any, given: FloatArray | None
+    problem: Problem,
+    spec: SolverSpec,
+    judged: Any,
+    counts: Any,
+    given: FloatArray | None,
+    status: Status = CONVERGED,
 ) -> dict[str, Any]:
     """The fields of a solution of a compiled call that `Solution.late` leaves for later."""
     assert spec.small is not None
-    claim = spec.small.claim(problem, counts, given, judged.relative)
+    claim = spec.small.claim(problem, counts, given, judged.relative, status)
     return {
         "residual": told(problem, judged),
         "iterations": claim.iterations,
@@ -570,10 +508,23 @@ def _check_problem(problem: Problem, spec: SolverSpec) -> None:
         raise CapabilityError(f"solver {spec.name!r} {reason}")
 
 
-def check_budget(
-    spec: SolverSpec, tol: float, max_iter: int | None, time_limit: float | None
-) -> tuple[float, int, float | None]:
-    """The three as numbers, `max_iter` the spec's where it is None.
+def seconds_of(time_limit: Any) -> float:
+    """A time limit as a number, inf where it is None.
+
+    Raises
+    ------
+    InputError
+        No positive number.
+    """
+    if type(time_limit) is float and time_limit > 0.0:
+        return time_limit
+    if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
+        return math.inf
+    return number("time_limit", time_limit, above=0.0)
+
+
+def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
+    """Both as numbers, `max_iter` the spec's where it is None.
 
     Raises
     ------
@@ -581,10 +532,7 @@ def check_budget(
         A wrong one.
     """
     tol = number("tol", tol, low=0.0)
-    max_iter = whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
-    if time_limit is None or (isinstance(time_limit, (float, np.floating)) and time_limit == np.inf):
-        return tol, max_iter, None
-    return tol, max_iter, number("time_limit", time_limit, above=0.0)
+    return tol, whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
 
 
 def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:

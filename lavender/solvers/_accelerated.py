@@ -10,7 +10,8 @@ from lavender.errors import InputError, UnknownName
 from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.solution import Claim
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, swept
+from lavender.solvers.setup_times import forming
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core import assemble
 
@@ -60,6 +61,10 @@ class Accelerated(Sweeping):
         self._check(problem)
         state: AcceleratedState = super().prepare(problem)
         return state
+
+    def _forming(self, problem: Problem) -> float:
+        over_a = _entries(problem) is not None or not (problem.rows is not None or reads_whitened(problem))
+        return forming(problem) if over_a else 0.0
 
     def _check(self, problem: Problem) -> None:
         if self.sweep is not None and self.sweep not in SWEEPS:

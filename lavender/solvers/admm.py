@@ -31,6 +31,7 @@ from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
+from lavender.solvers.setup_times import loading
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.core import assemble
@@ -253,6 +254,10 @@ class ADMM:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
     @np.errstate(all="ignore")  # what overflows is judged
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted; what it leaves is begun by `run` if it fits there."""
+        return min(_opening(problem), AT_ONCE) + loading("scipy.sparse", "scipy.linalg.lapack")
+
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
         load()

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender._later import load
 from lavender.deadline import Deadline
 from lavender.errors import BREAKDOWN, last_words
 from lavender.problem import OPERATORS, Problem
@@ -28,7 +27,8 @@ from lavender.solvers.certify import certify
 from lavender.solvers.costs import Costs, Plan, candidates
 from lavender.solvers.methods import Candidate, Sweeps, in_short_time, make
 from lavender.solvers.schedule import race
-from lavender.solvers.small import AUTO, call_ends_within, prepared
+from lavender.solvers.setup_times import sweeping
+from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.structure import Structure
 
@@ -42,12 +42,9 @@ ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, tak
 
 @dataclass
 class State:
-    """What `auto` has prepared: nothing, except sweeps and what costs are counted from under a time limit."""
+    """What `auto` has prepared: nothing."""
 
     problem: Problem
-    structure: Structure | None = None
-    sweeps: Sweeps | None = None
-    call: bool = True  # the compiled call may be made
     log: SolveLog | None = None  # of the solve that has ended, as long as it is not told
 
 
@@ -70,38 +67,32 @@ class Auto:
     def prepare(self, problem: Problem) -> State:
         if self.plan is not None:
             self.plan.check(problem)
-        if problem.derived.vain is not None or (problem.m > SMALL_ROWS and problem.matrix is not None):
-            _load(problem)
         return State(problem)
 
     def update(self, state: State, problem: Problem) -> State:
         return self.prepare(problem)
-
-    def ready(self, state: State, time_limit: float) -> None:
-        """Before the clock of a limit [s] starts: set up the compiled call, and sweeps where others may not end."""
-        state.call = call_ends_within(state.problem, time_limit)
-        if not state.call or state.problem.m > SMALL_ROWS:
-            _load(state.problem)
-        if state.call and state.problem.generalized is None:
-            prepared(state.problem)
-        if state.problem.m and self.plan is None and not state.problem.cones.has_round:
-            costs = Costs(state.problem)
-            state.structure, state.sweeps = costs.structure, in_short_time(costs, 1e9 * time_limit)
 
     def run(
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem, state.log = state.problem, None
         deadline = Deadline(time_limit)
-        if max_iter >= ONE_CALL and state.call:
-            made = AUTO.solve(problem, impulse, tol, time_limit is not None)
-            claim = None if made is None else AUTO.claim(problem, made[1], impulse, made[0].relative)
-            if made is not None and claim is not None and claim.iterations <= max_iter:
-                impulse[:] = made[0].impulse
-                return claim
+        if max_iter >= ONE_CALL and _has_call(problem, deadline):
+            share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
+            made = AUTO.solve(problem, impulse, tol, share * deadline.nanoseconds())
+            if made is not None and made[0].relative <= tol:
+                claim = AUTO.claim(problem, made[1], impulse, made[0].relative)
+                if claim.iterations <= max_iter:
+                    impulse[:] = made[0].impulse
+                    return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        sweeps = state.sweeps
+        costs = sweeps = None
+        if deadline.is_set and self.plan is None and not problem.cones.has_round:
+            if deadline.passed(sweeping(problem)):
+                return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
+            costs = Costs(problem)
+            sweeps = in_short_time(costs, deadline)
         log = SolveLog(problem, tol, max_iter, deadline, None if sweeps is None else sweeps.state.data)
         log.offer(impulse)
         if log.best > 1.0:
@@ -110,7 +101,7 @@ class Auto:
         state.log = log
         try:
             if max_iter > 0 and log.best > tol:
-                solve(log, self.plan, sweeps, state.structure)
+                solve(log, self.plan, sweeps, None if costs is None else costs.structure)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
         except BREAKDOWN as error:
@@ -128,10 +119,10 @@ class Auto:
         return log.claim()
 
 
-def _load(problem: Problem) -> None:
-    """What those who follow the compiled call may factor with."""
-    lu = problem.matrix is not None and not problem.is_symmetric
-    load(*(["scipy.sparse.linalg"] if lu else []))
+def _has_call(problem: Problem, deadline: Deadline) -> bool:
+    """Whether the compiled call is made: of more rows only if it is counted to end in a quarter of the time left."""
+    left = deadline.left()
+    return left is None or problem.m <= SMALL_ROWS or call_ends_within(problem, QUARTER * left)
 
 
 def solve(
@@ -147,7 +138,7 @@ def solve(
 def others(log: SolveLog, plan: Plan | None, structure: Structure | None, begun: list[Candidate]) -> None:
     """All candidates, of which one may have begun, and at last the certificate."""
     costs = Costs(log.problem, log.tol, structure=structure, plan=plan)
-    names = candidates(costs.structure) if plan is None else tuple(name for name, _ in plan.candidates)
+    names = tuple(name for name, _ in plan.candidates) if plan else candidates(costs.structure, log.deadline)
     race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)

@@ -22,6 +22,7 @@ from lavender.ordering import blocks_of_each
 from lavender.problem import Problem
 from lavender.solution import Claim, Status
 from lavender.solvers.islands import restrict, rows_of
+from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 
 __all__ = ["certify"]
@@ -37,7 +38,7 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 def certify(log: SolveLog) -> None:
     """Look for a certificate that a problem without upper bounds has no solution, for any A."""
     problem = log.problem
-    if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM):
+    if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM + 1e9 * loading("scipy.optimize")):
         return
     asked = 0
     for part, rows in _parts(log):

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from hashlib import sha256
 from math import inf
 from typing import Any
 
+from lavender.deadline import NEVER, Deadline
 from lavender.errors import BREAKDOWN, InputError
 from lavender.problem import Problem
+from lavender.registry import get
 from lavender.solvers.structure import Structure
 from lavender.solvers.weights import READ, decades, law_of, of_law, rates
 
@@ -168,6 +169,8 @@ def _time(ns: float) -> str:
 
 def structure_of(problem: Problem) -> str:
     """A hash of blocks, law and operator."""
+    from hashlib import sha256  # 4 ms to import, needed only here
+
     found = sha256(f"{problem.law} {problem.operator} {problem.m}".encode())
     found.update(problem.cones.ptr.tobytes() + problem.cones.kind.tobytes())
     return found.hexdigest()[:12]
@@ -269,15 +272,23 @@ class Costs:
         return Cost(setup, r["row"] * s.m + r["work"] * factor, count)
 
 
-def candidates(structure: Structure) -> tuple[str, ...]:
-    """Names of the table that take a problem, in its order."""
+def candidates(structure: Structure, deadline: Deadline = NEVER) -> tuple[str, ...]:
+    """Names of the table that take a problem, in its order; `direct` only if there is time to look at all of A."""
     problem = structure.problem
     if problem.cones.has_round:
         return TABLE[problem.operator]["round"]
     if problem.cones.has_rolling:
         return ROLLING
     names = TABLE[problem.operator][problem.law]
-    return names if structure.is_definite else tuple(name for name in names if name != "direct")
+    asks = not deadline.passed(setup_time("direct", problem)) if "direct" in names else False
+    return names if asks and structure.is_definite else tuple(name for name in names if name != "direct")
+
+
+def setup_time(name: str, problem: Problem) -> float:
+    """What a candidate sets up, or what counts its cost, takes before its first iteration [s]; 0: next to nothing."""
+    solver, options = METHODS[name]
+    asked = getattr(get(solver).load()(**options), "setup_time", None)
+    return 0.0 if asked is None else float(asked(problem))
 
 
 def made(problem: Problem, tol: float) -> Plan:

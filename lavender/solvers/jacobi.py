@@ -18,6 +18,7 @@ from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
+from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import SweepState, run_kernel
 from lavender_ext.sweep import serial
 
@@ -45,6 +46,10 @@ class Jacobi:
     def __post_init__(self) -> None:
         if self.omega is not None:
             number("omega", self.omega, above=0.0)
+
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted."""
+        return forming(problem)
 
     def prepare(self, problem: Problem) -> JacobiState:
         return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)

@@ -25,6 +25,7 @@ from lavender.residuals import at_floor, remember
 from lavender.solution import Claim, Status
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
+from lavender.solvers.setup_times import over_rows
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
 
@@ -43,6 +44,10 @@ def _sizes(problem: Problem) -> tuple[int, int]:
 @dataclass(frozen=True)
 class Lemke:
     """Lemke's complementary pivoting; no options."""
+
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted."""
+        return over_rows(problem)
 
     def prepare(self, problem: Problem) -> PivotState:
         return PivotState(problem)

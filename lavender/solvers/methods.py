@@ -15,10 +15,11 @@ from lavender.errors import BREAKDOWN, last_words
 from lavender.registry import SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
-from lavender.solvers.costs import METHODS, TABLE, Cost, Costs
+from lavender.solvers.costs import METHODS, TABLE, Cost, Costs, setup_time
 from lavender.solvers.direct import Enough, Impatient
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.schedule import BELIEVED, remainder
+from lavender.solvers.setup_times import forming
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
@@ -28,6 +29,7 @@ __all__ = ["FIRST", "Candidate", "Sweeps", "in_short_time", "make"]
 FIRST = 32  # sweeps before the first prediction of their remaining cost
 MOST = 2**30  # sweeps of one call
 PROBE = 0.5  # share of the time left that iterations of unknown pace may take
+FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
 
 
 class Candidate:
@@ -39,14 +41,25 @@ class Candidate:
 
     def __init__(self, name: str, log: Any, costs: Costs, spec: SolverSpec) -> None:
         self.name, self.log, self.costs, self.spec = name, log, costs, spec
-        self.cost: Cost = costs.least(name)
-        self.rest, self.counted = self.cost.total, False
+        late = self.late
+        self.cost: Cost = Cost(np.inf, 1.0, 1.0) if late else costs.least(name)
+        self.rest, self.counted = self.cost.total, late
         self.spent = 0.0  # ns, as counted
         self.state: Any = None
 
+    @property
+    def late(self) -> bool:
+        """Its set-up, or counting its cost, would end after the deadline."""
+        deadline = self.log.deadline
+        return deadline.is_set and deadline.passed(setup_time(self.name, self.costs.problem))
+
     def count(self) -> None:
+        self.counted = True
+        if self.late:
+            self.rest = np.inf
+            return
         self.cost = self.costs.of(self.name)
-        self.rest, self.counted = self.cost.total, True
+        self.rest = self.cost.total
 
     @property
     def shown(self) -> str:
@@ -151,6 +164,7 @@ class Resumed(Candidate):
 class Sweeps(Resumed):
     """Accelerated sweeps with checks that predict their cost (`lavender_ext/small/checked_sweeps.pyx`)."""
 
+    late = False  # they form A only if there is time for it
     relative = 1.0  # residual of the last check
     least = 0.0  # ns, lower bound of the cost of any other method
     told = 0, 0  # sweeps and restarts of the turns before
@@ -158,11 +172,13 @@ class Sweeps(Resumed):
     before, begun = 1.0, 0  # the residual and the sweeps that it begins at,
     claim: Claim  # and what came of it
 
-    def set_up(self) -> None:
-        """Set up everything that does not depend on the impulse, and count the costs that short limits need."""
+    def set_up(self, deadline: Deadline) -> None:
+        """Everything that does not depend on the impulse; A is formed only if that is a small part of the time."""
         problem = self.costs.problem
         split = 0 if problem.rows is None else problem.rows.n_joints
-        self.state = CheckedSweeps(problem.metric, operator(problem), problem.law == "cone", split)
+        late = deadline.is_set and deadline.passed(FORMING * forming(problem))
+        over = problem.metric if late else operator(problem)
+        self.state = CheckedSweeps(problem.metric, over, problem.law == "cone", split)
         self.count()
 
     def run_first(self, log: SolveLog) -> bool:
@@ -223,7 +239,7 @@ class Sweeps(Resumed):
         self.impulse = log.impulse.copy() if log.given is None else log.given
         self.relative = log.best
         if self.state is None:
-            self.set_up()
+            self.set_up(log.deadline)
 
     def iterate(self, n: int) -> int:
         """Run at most n sweeps; stop early if they predict a larger remaining cost than that of the others."""
@@ -366,20 +382,18 @@ KINDS: dict[str, type[Candidate]] = {
 }  # fmt: skip
 
 
-def in_short_time(costs: Costs, limit: float) -> Sweeps | None:
-    """Sweeps that are set up, where others may not end within the limit [ns]: by the least that these take.
-
-    Where others may follow, velocities are analysed here, before the clock starts: that takes as long as many sweeps.
-    """
+def in_short_time(costs: Costs, deadline: Deadline) -> Sweeps | None:
+    """Sweeps that are set up, where others may not end before the deadline: by the least that these take."""
     problem = costs.problem
-    least = min(map(costs.floor, TABLE[problem.operator][problem.law]))
-    if 0.5 * limit > costs.sure * least:
-        costs.structure.kernel  # noqa: B018
-    if limit > costs.sure**2 * least:
+    least = min(
+        max(costs.floor(name), 1e9 * setup_time(name, problem))
+        for name in TABLE[problem.operator][problem.law]
+    )
+    if deadline.nanoseconds() > costs.sure**2 * least:
         return None
     sweeps = Sweeps("anderson", None, costs, get("anderson"))
     sweeps.least = least
-    sweeps.set_up()
+    sweeps.set_up(deadline)
     return sweeps
 
 

@@ -37,6 +37,7 @@ from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status, counted
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
+from lavender.solvers.setup_times import over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.newton.solve import COUNTED, OUTCOMES
@@ -75,6 +76,13 @@ class Newton:
     """
 
     form: str = "auto"
+
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted."""
+        if problem.generalized is not None and self.form != "impulse":
+            return over_velocities(problem)
+        bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
+        return over_bodies(problem) if bodies else over_rows(problem)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""
@@ -246,7 +254,10 @@ def _turns(
             most = WATCHED / max(system.seconds, 1e-6)
             left, watch = deadline.left(), Stopwatch()
             if left is not None:
-                most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9))
+                # Of the first the pace is only counted.
+                most = (
+                    min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.factorisations else 1.0
+                )
                 if left <= system.seconds:
                     late = True
                     solve.stop()

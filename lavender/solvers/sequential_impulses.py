@@ -62,6 +62,9 @@ class SequentialImpulses(Threaded):
     `threads` with "colored".
     """
 
+    def _forming(self, problem: Problem) -> float:
+        return 0.0
+
     def _state(self, problem: Problem, order: Order, before: ImpulseState | None) -> ImpulseState:
         return ImpulseState(problem, order, before)
 

@@ -23,16 +23,19 @@ from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn, counted
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
+from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import reads_whitened
 from lavender.solvers.weights import READ, SIXTH, decades, of_law, rates, sweep_cost
 from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first
 
+NO_TIME = "the time limit left no time for a solver"
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # The most rows of an island: up to these, dense factors cost less than sweeps and factors of all islands together.
 ISLAND = 150
 SWEPT = 32  # the most sweeps of a part before its first factorisation
-FACTORED = 0.05  # ns per multiply-add of the factorisations of parts
+QUARTER = 0.25  # of the time left, that islands may take, and that counted costs of velocities may
+SPLIT = 200.0  # ns for each row of what tells islands apart
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
@@ -69,18 +72,15 @@ def limits(most: float, rows: float = inf) -> Limits:
     ]))  # fmt: skip
 
 
-def call_ends_within(problem: Problem, time_limit: float | None) -> bool:
-    """Whether the compiled call, which may return nothing, takes at most a quarter of the limit [s]."""
-    if time_limit is None or (problem.generalized is None and problem.law in ("linear", "lcp")):
-        return True
+def call_ends_within(problem: Problem, seconds: float) -> bool:
+    """Whether the compiled call of more than a few rows, which may return nothing, is counted to take no longer."""
     if problem.generalized is not None:
         cost = velocities_cost(problem, problem.generalized.nv)
+    elif problem.law in ("linear", "lcp"):
+        return False
     else:
-        cost = SWEPT * sweep_cost(problem)
-        if 4e-9 * cost <= time_limit:
-            parts = prepared(problem)
-            cost += FACTORED * (0.0 if parts is None else parts.most_factored)
-    return 4e-9 * cost <= time_limit
+        cost = SPLIT * problem.m + 1e9 * forming(problem) + SWEPT * sweep_cost(problem)
+    return 1e-9 * cost <= seconds
 
 
 def prepared(problem: Problem) -> Any:
@@ -127,10 +127,10 @@ class SmallCall:
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
 
-    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, capped: bool = False) -> Any:
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf) -> Any:
         """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None if it does not converge.
 
-        capped: under a time limit, with no more factorisations than `call_ends_within` counts.
+        most: counted cost [ns] at which it ends with what was found by then, above tol.
         """
         kept = problem.derived
         if not tol > 0.0 or problem.m == 0:
@@ -142,6 +142,8 @@ class SmallCall:
         if problem.generalized is not None:
             if self.limits is None:
                 return None
+            if most < inf:
+                return solve_first(kept.view, impulse, tol, self.limits, most)
             found = solve_first(kept.view, impulse, tol, self.limits)
         else:
             small = kept.small
@@ -149,24 +151,32 @@ class SmallCall:
                 small = prepared(problem)
             if not small or not (self.pivots if small.pivots else self.hands_over):
                 return None
-            found = small.run(impulse, tol, self.hands_over, WARM, capped)
-        if found is None and not capped:  # the same steps need not be done again before the full solver
+            if most < inf:
+                return small.run(impulse, tol, self.hands_over, WARM, most)
+            found = small.run(impulse, tol, self.hands_over, WARM)
+        if found is None:  # the same steps need not be done again before the full solver
             kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
         return found
 
     def claim(
-        self, problem: Problem, counts: tuple[int, ...] | None, start: FloatArray | None, after: float
+        self,
+        problem: Problem,
+        counts: tuple[int, ...] | None,
+        start: FloatArray | None,
+        after: float,
+        status: Status = Status.CONVERGED,
     ) -> Claim:
         """The claim for a call with these counts, from a start (m,) or from none to a residual `after`."""
+        nothing = "the start is a solution" if status is Status.CONVERGED else NO_TIME
         if counts is None:
-            return Claim(Status.CONVERGED, 0, {}, "the start is a solution")
+            return Claim(status, 0, {}, nothing)
         if problem.generalized is not None:
-            claim = general.claim(Status.CONVERGED, counts)
+            claim = general.claim(status, counts)
             if self.name == "newton":
                 return claim
             done, ran = claim.iterations, [("newton", dict(claim.work))]
             if not any(claim.work.values()):
-                return Claim(Status.CONVERGED, done, {}, "the start is a solution")
+                return Claim(status, done, {}, nothing)
         else:
             done, ran = (_by_pivots if problem.derived.small.pivots else _in_turns)(counts)
         if self.name == "direct":
@@ -177,9 +187,9 @@ class SmallCall:
                 note = f"A is singular, rank {rank} of {problem.m}"
             elif shifts and problem.law != "linear":
                 note = "A is singular on the free rows: shifted and refined"
-            return Claim(Status.CONVERGED, done, ran[0][1], note, form="band" if symmetric else "LU")
+            return Claim(status, done, ran[0][1], note, form="band" if symmetric else "LU")
         turns = _turns(problem, ran, start, after)
-        return Claim(Status.CONVERGED, done, summed(turns), told(turns), turns=turns)
+        return Claim(status, done, summed(turns), told(turns) or nothing, turns=turns)
 
 
 Ran = list[tuple[str, dict[str, int]]]  # who, and what it did

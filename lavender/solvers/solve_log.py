@@ -14,7 +14,7 @@ from lavender.problem import Problem
 from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
 from lavender.solution import Claim, Status, Turn
 from lavender.solvers.islands import islands
-from lavender.solvers.small import told
+from lavender.solvers.small import NO_TIME, told
 from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
 
@@ -165,9 +165,7 @@ class SolveLog:
 
     def claim(self) -> Claim:
         """The claim of the whole solve."""
-        nothing = (
-            "the time limit left no time for a solver" if self.budget > 0 else "no iterations were asked for"
-        )
+        nothing = NO_TIME if self.budget > 0 else "no iterations were asked for"
         if self.best <= self.tol:
             nothing = "the start is a solution"
         message = self.message or ("" if self.failure else nothing)

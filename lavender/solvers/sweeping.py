@@ -6,10 +6,9 @@ end, so their places depend only on the numbers.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lavender._arrays import FloatArray, whole_number
 from lavender.errors import InputError
@@ -17,8 +16,12 @@ from lavender.ordering import Order, block_order
 from lavender.problem import Problem
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
+from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 STATUS = {
     RUNNING: Status.MAX_ITERATIONS,
@@ -105,6 +108,8 @@ def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: floa
 
 @cache
 def _helpers() -> ThreadPoolExecutor:
+    from concurrent.futures import ThreadPoolExecutor  # 5 ms to import, needed only here
+
     # Threads for all runs; one that is started late finds nothing left to do.
     return ThreadPoolExecutor(MOST_THREADS - 1, thread_name_prefix="lavender")
 
@@ -134,6 +139,13 @@ class Sweeping:
     order: Any = "given"
     ground: Any = None
     seed: int = 0
+
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted."""
+        return ordered(problem, self.order) + self._forming(problem)
+
+    def _forming(self, problem: Problem) -> float:
+        return forming(problem)
 
     def prepare(self, problem: Problem) -> Any:
         """The state at the first sweep; its order is found anew."""

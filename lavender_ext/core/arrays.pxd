@@ -1,5 +1,19 @@
 """Addresses of arrays that a caller has checked."""
+from cython cimport view
 from libc.stdint cimport int32_t
+from libc.stdlib cimport calloc, free
+
+import numpy as np
+
+
+cdef inline object zeros(Py_ssize_t n):
+    """(n + 1,) float64 whose pages come when they are touched: NumPy asks for huge ones, each of which may wait long."""
+    cdef view.array made = view.array(shape=(n + 1,), itemsize=sizeof(double), format="d", allocate_buffer=False)
+    made.data = <char*>calloc(n + 1, sizeof(double))
+    if made.data == NULL:
+        raise MemoryError(f"{n} numbers")
+    made.callback_free_data = free
+    return np.asarray(made)
 
 
 cdef inline void* address(object array):

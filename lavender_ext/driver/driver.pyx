@@ -71,6 +71,7 @@ cdef inline int32_t start_rows(const view_t* v, const options_t* o, room_t* r, c
     cdef double* x = begin(v, o, r)
     lay_index(n, m, r.index)
     find_elements(&n.sc, &v.p, v.a, NULL)
+    memset(x, 0, own_room(m, n.sc.small) * sizeof(double))
     x = furnish(n, v.a, NULL, x)
     n.s.form, n.s.wide = DENSE, o.wide
     n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m

@@ -195,8 +195,11 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const b
     cdef int32_t column[6]
     cdef int64_t size[PARTS]
     cdef double* part[PARTS]
-    cdef double* panel = furnish(s, NULL, r, real)
-    cdef double* x = panel + 12 * <int64_t>p.n_rows
+    cdef double* panel
+    cdef double* x
+    memset(real, 0, own_room(p.n_rows, s.sc.small) * sizeof(double))
+    panel = furnish(s, NULL, r, real)
+    x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i
     panel_of(p, r, x, panel)

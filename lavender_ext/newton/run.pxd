@@ -256,14 +256,13 @@ cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogi
 
 
 cdef inline double* furnish(newton_t* n, const csr_t* a, const rows_t* r, double* room) noexcept nogil:
-    """Elements of A or of bodies (`find_elements`) scaled, with vectors and small matrices; what is behind them.
+    """Elements of A or of bodies (`find_elements`) scaled, with vectors and small matrices, in room of zeros; what is behind.
 
     What factors is still to come: form, symmetric and what belongs to the form.
     """
     cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
     cdef int32_t j
     cdef double* x = room + scaled_real(rows)
-    memset(room, 0, own_room(rows, small) * sizeof(double))
     lay_numbers(&n.sc, rows, room)
     scale_elements(&n.sc, &n.problem.p, a, r, n.problem.w, n.problem.x)
     lay_vectors(n, x, rows)

@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender_ext.factor.symbolic import block_panels
 
-from lavender_ext.core.arrays cimport address
+from lavender_ext.core.arrays cimport address, zeros
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
@@ -155,13 +155,13 @@ cdef class Solve:
             a = &matrix.csr
         else:
             r = &data.rows
-        judge = np.empty(judge_room(&n.problem.p, n.problem.r, n.problem.g) + 1)
+        judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
         self.index = np.empty(own_index(rows) + 1, np.int32)
         self.data, self.held = data, [matrix, judge]
         lay_judge(n, <double*>address(judge))
         lay_index(n, rows, <int32_t*>address(self.index))
         find_elements(&n.sc, &n.problem.p, a, r)
-        self.real = np.empty(own_room(rows, n.sc.small) + 1)
+        self.real = zeros(own_room(rows, n.sc.small))
         furnish(n, a, r, <double*>address(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
@@ -250,7 +250,7 @@ cdef class Solve:
             super_, places = &held.f, &spot[0]
             self.held.append(held)
         factor_room(&a, s, lu, super_ != NULL, size)
-        values = [np.zeros(size[i] + 1) for i in range(PARTS)]
+        values = [zeros(size[i]) for i in range(PARTS)]
         for i in range(PARTS):
             x[i] = <double*>address(values[i])
         self.held += [panel, layout, own, values]

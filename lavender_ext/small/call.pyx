@@ -27,7 +27,7 @@ from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
-from lavender_ext.small.friction cimport SHORT, ask_t, part_t, solve_part, work_of
+from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.measure import same_bits
 from lavender_ext.local import gauss_seidel
@@ -41,6 +41,7 @@ cdef enum:
     SWEEPS = 2                  # that guess the free rows
     ROUNDS = 32                 # of exchanges
     PATH = 8                    # pivots of Lemke's for each row
+    ROUND_ROW = 50              # ns of a round for each row, beside its factor
     FEW = 12                    # rows of an island that has all of its sweeps before its factors
     LISTEN = 5000000            # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
@@ -66,13 +67,13 @@ cdef class Small:
     def __init__(self, Data data, start, Data matrix):
         self.data, self.start, self.matrix = data, start, matrix
 
-    def run(self, impulse, double tol, bint follows, double warm, bint capped=False):
+    def run(self, impulse, double tol, bint follows, double warm, double most=INFINITY):
         """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
 
         follows: another method comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
         nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
         with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
-        None where `impulse` is the solution. capped: no more factors than `most_factored` counts.
+        None where `impulse` is the solution. most: counted cost [ns] where what was found by then is the result.
         """
         cdef Judged found
         cdef double before = self.data.start_relative
@@ -89,14 +90,14 @@ cdef class Small:
             if not before <= (warm if self.pivots else 1.0):
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
-        counts = self.solve(own, tol, follows, capped)
+        counts = self.solve(own, tol, follows, &most)
         if counts is None:
             return None
         found = Judged(self.data, own)
-        return (found, counts) if self.pivots or found.relative <= tol else None
+        return (found, counts) if self.pivots or found.relative <= tol or not most > 0.0 else None
 
-    cdef solve(self, own, double tol, bint follow, bint capped):
-        """`own` (m,) N s in place; counts, or None."""
+    cdef solve(self, own, double tol, bint follow, double* most):
+        """`own` (m,) N s in place; counts, or None. What it cost is taken off `most`, which then ends it at 0 or below."""
 
 
 cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
@@ -104,8 +105,11 @@ cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
     return t.relative <= tol and (is_end(t) or (enough and t.solved and not t.linear))
 
 
-cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough) noexcept nogil:
-    """Into `best`; did it end below tol? Passes end where one does not halve the residual, or is stuck."""
+cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough, double most) noexcept nogil:
+    """Into `best`; did it end below tol? Passes end where one does not halve the residual, or is stuck.
+
+    No more rounds than `most`, which ends it.
+    """
     cdef int32_t code
     direct_begin(t, start)
     if t.linear:
@@ -115,12 +119,12 @@ cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough
         if code == SOLVED:
             code = direct_linear(t)
     else:
-        code = direct_first(t, SWEEPS, ROUNDS)
+        code = direct_first(t, SWEEPS, ROUNDS if most > ROUNDS else <int32_t>max(most, 0.0))
     if t.symmetric and (code == SMALL or (t.linear and not is_end(t))):
         direct_begin_passes(t, 0)
         code = HALVED
-        while code == HALVED:
-            code = direct_pass(t, ROUNDS)
+        while code == HALVED and t.s.n_rounds < most:
+            code = direct_pass(t, ROUNDS if most - t.s.n_rounds > ROUNDS else <int32_t>(most - t.s.n_rounds))
             if not t.relative < INFINITY:
                 return False
     return met(t, tol, enough)
@@ -143,7 +147,7 @@ cdef class Bounded(Small):
         Small.__init__(self, data, start, matrix)
         self.band, self.linear, self.symmetric, self.pivots = band, linear, symmetric, True
 
-    cdef solve(self, own, double tol, bint follow, bint capped):
+    cdef solve(self, own, double tol, bint follow, double* most):
         cdef double[::1] start = own
         cdef view_t v = self.data.view()
         cdef int64_t n = direct_real(&v, self.band)
@@ -151,36 +155,42 @@ cdef class Bounded(Small):
         cdef double* real = <double*>room.at
         cdef direct_t t
         cdef int32_t path = 0
+        cdef double each = ROUND_ROW * self.data.blocks.n_rows + 0.1 * self.data.blocks.n_rows * (self.band + 1.0) ** 2
         cdef bint ended
         t.e0, t.v0, t.least = self.data.start_energy, self.data.start_velocity, 1e-13
         t.linear, t.symmetric = self.linear, self.symmetric
         with nogil:
             direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, real,
                        <int32_t*>(real + n))
-            ended = pivot(&t, &start[0], tol, follow)
-        if not ended:
+            ended = pivot(&t, &start[0], tol, follow, most[0] / each)
+        most[0] -= t.s.n_rounds * each
+        if not ended and most[0] > 0.0:
             if not follow or t.linear or t.solved:
                 return None
-            path = self.followed(&t, own, tol)
-            if path < 0:
-                return None
+            path = self.followed(&t, own, tol, most)
+        if not ended and (path < 0 or not t.relative <= tol) and (most[0] > 0.0 or not t.relative < INFINITY):
+            return None
         memcpy(&start[0], t.best, t.s.n * sizeof(double))
-        return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, path
+        return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, max(path, 0)
 
-    cdef int followed(self, direct_t* t, own, double tol) except -2:
+    cdef int followed(self, direct_t* t, own, double tol, double* most) except -2:
         """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
 
         Pivots of the paths, -1 where they do not end below tol.
         """
         cdef lemke_t l
+        cdef double each = 2.0 * <double>t.s.n ** 2
+        cdef int32_t last = PATH * t.s.n if most[0] > PATH * t.s.n * each else <int32_t>(most[0] / each)
         cdef int64_t n = lemke_real(t.s.p)
         cdef Room room = room_for(n * sizeof(double) + lemke_index(t.s.p) * sizeof(int32_t))
         cdef double* real = <double*>room.at
         with nogil:
             lemke_lay(&l, t, real, <int32_t*>(real + n))
             lemke_begin(&l)
-            while lemke_run(&l, PATH * t.s.n - l.pivots) == RAY:
+            while lemke_run(&l, last - l.pivots) == RAY:
                 pass
+        if last < PATH * t.s.n:
+            most[0] -= l.pivots * each
         return l.pivots if t.relative <= tol else -1
 
 
@@ -370,7 +380,6 @@ cdef class Friction(Small):
     """
 
     cdef readonly int count
-    cdef readonly double most_factored
     cdef object block, size, at, prepared
     cdef int split, most
 
@@ -379,7 +388,6 @@ cdef class Friction(Small):
         self.split, self.most, self.count = split, most, count
         if matrix.blocks.law == CONE:
             self.at, self.prepared = gauss_seidel.prepare(matrix)
-        self.most_factored = SHORT * <double>data.blocks.n_rows ** 3
         if count > 1:
             ptr = np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)
             rows, joint = np.diff(ptr), np.arange(len(label)) < (matrix.rows.n_joints if matrix.factored else 0)
@@ -389,19 +397,19 @@ cdef class Friction(Small):
             self.block = np.argsort(label, kind="stable").astype(np.int32)
             size = [np.bincount(label, of, count) for of in (rows, 1 + 0 * rows, entries, joint * rows, joint)]
             self.size = np.array(size, np.int32).T.copy()
-            self.most_factored = SHORT * float(size[0] @ size[0]**2)
 
-    cdef solve(self, own, double tol, bint follow, bint capped):
-        cdef double most = self.most_factored if capped else INFINITY
+    cdef solve(self, own, double tol, bint follow, double* most):
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
-                             self.most, has_wide(), 0, 0, 0, 0.0, most, 0, 0)
+                             self.most, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
         cdef room_t r = room_t(0, 0, NULL, NULL)
         try:
             good = self.whole(own, &o, &r) if self.count == 1 else self.islands(own, &o, &r)
         finally:
             free(r.index)
             free(r.real)
-        return (o.longest, o.swept, o.undone, o.factorisations, o.driven, self.count) if good else None
+        most[0] = o.left
+        done = o.longest, o.swept, o.undone, o.factorisations, o.driven, self.count
+        return done if good or (self.count == 1 and not o.left > 0.0) else None
 
     cdef bint whole(self, double[::1] own, ask_t* o, room_t* r) except -1:
         cdef part_t s

@@ -62,7 +62,6 @@ cdef class CheckedSweeps:
         self.watch = Watch(data, PATIENCE, metric if formed else None)
         self.over = sweeps_of(data, np.arange(data.blocks.n_blocks, dtype=np.int32), split, 0, np.zeros(1, np.uint64), exact)
         self.space = allocate(self.over, MEMORY)
-        self.space.fill(0.0)            # its pages are there before the first sweep
 
     cdef int sweep(self, lam, int n, double tol) except -1:
         """n of them, fewer where their watch ends them, whose checks cost as much as the first sweeps; none for tol = 0."""

@@ -26,6 +26,10 @@ cdef enum:
     AGAIN = 8
     STEPS = 120                 # and in all
     HOPED = 4                   # times the rounds left, that what the last one gained may promise an end in
+    SWEPT_ROW = 15              # ns of a sweep with its mixing for each row, beside one for each entry of A,
+    SWEPT_BODIES = 32           # and as many for each row over bodies
+    FACTOR_ROW = 150            # ns of a factorisation and the steps with it for each row,
+    CUBED = 10                  # and one for so many of all rows cubed
 
 
 cdef struct part_t:
@@ -48,8 +52,8 @@ cdef struct ask_t:
     int64_t swept               # what was done in all
     int64_t undone
     int64_t factorisations
-    double factored             # multiply-adds of them,
-    double most_factored        # and at most
+    double factored             # multiply-adds of them
+    double left                 # ns that may still be spent, as counted below; inf without a limit
     int32_t driven              # parts that asked for factors
     int32_t longest             # sweeps and factorisations of one part
 
@@ -70,6 +74,8 @@ cdef struct turns_t:            # of one part
     room_t room
     said_t said
     int32_t how
+    double sweep                # ns of one sweep and
+    double factor               # of one factorisation with its steps, counted: no clock is read here
 
 
 cdef inline int64_t work_of(int64_t m, int64_t n_bodies) noexcept nogil:
@@ -97,6 +103,11 @@ cdef inline void lay_turns(turns_t* t, double* work, int32_t* order, uint64_t* r
     t.sweeps.exact, t.sweeps.start, t.sweeps.g = t.s.at != NULL, t.s.at, t.s.prepared
 
 
+cdef inline double spent(const turns_t* t) noexcept nogil:
+    """ns of this part so far."""
+    return t.c.turn * t.sweep + t.said.factorisations * t.factor
+
+
 cdef inline double found_at(turns_t* t, const double* lam) noexcept nogil:
     cdef const view_t* v = &t.s.v
     cdef score_t found = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
@@ -122,7 +133,7 @@ cdef inline double sweep_on(turns_t* t, double now, int32_t most, bint hoping) n
     """
     cdef double before, tol = t.o.tol
     cdef int32_t step = FIRST
-    while now > tol and t.c.turn < most:
+    while now > tol and t.c.turn < most and spent(t) < t.o.left:
         before = now
         lav_anderson(&t.c, t.swept, t.c.turn == 0, step)
         now = found_at(t, t.swept)
@@ -150,7 +161,8 @@ cdef inline bint begin_newton(turns_t* t) noexcept nogil:
 
 cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
     """So many factorisations, or its end; the relative residual of `answer`."""
-    cdef int32_t last = t.said.factorisations + steps
+    cdef double fit = (t.o.left - spent(t)) / t.factor
+    cdef int32_t last = t.said.factorisations + (steps if fit > steps else <int32_t>max(fit, 0.0))
     while t.said.factorisations < last and (t.how == MORE or t.how == CERTIFICATE):
         t.how = lav_step(&t.s.v, &t.options, &t.room, last - t.said.factorisations, t.s.answer, &t.said)
     return found_at(t, t.s.answer)
@@ -158,11 +170,11 @@ cdef inline double step_newton(turns_t* t, int32_t steps) noexcept nogil:
 
 cdef inline double factor_in_turns(turns_t* t) noexcept nogil:
     """From where sweeps gave way; no more, once there are as many factors as there may be."""
-    cdef double now, cubed = <double>t.s.v.p.n_rows ** 3
+    cdef double now
     if not begin_newton(t):
         return 1.0 / 0.0
     now = step_newton(t, SHORT)
-    if now > t.o.tol and t.o.factored + t.said.factorisations * cubed < t.o.most_factored:
+    if now > t.o.tol and spent(t) < t.o.left:
         now = sweep_on(t, found_at(t, t.swept), AGAIN * t.o.most, t.s.v.p.law == CONE)
         if now > t.o.tol:
             return step_newton(t, STEPS)
@@ -194,10 +206,12 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
         now = found_at(&t, t.swept)
     elif now < 0.0:
         now = relative_of(&nothing, t.w, p.n_rows, t.e0, t.v0)
+    t.sweep = SWEPT_ROW * p.n_rows + (s.v.a.indptr[p.n_rows] if s.v.a != NULL else SWEPT_BODIES * p.n_rows)
+    t.factor = FACTOR_ROW * p.n_rows + <double>p.n_rows ** 3 / CUBED
     now = sweep_on(&t, now, o.first, True)
     if now <= o.tol or now < 1.0:
         memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
-    if now > o.tol:
+    if now > o.tol and spent(&t) < o.left:
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
         now = t.e0 / own if t.e0 / own < t.v0 / fast else t.v0 / fast
@@ -209,4 +223,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     o.factored += t.said.factorisations * (<double>p.n_rows * p.n_rows * p.n_rows)
     if t.c.turn + t.said.factorisations > o.longest:
         o.longest = t.c.turn + t.said.factorisations
-    return now <= o.tol and o.factored <= o.most_factored
+    o.left -= spent(&t)
+    if now > o.tol and not o.left > 0.0 and not found_at(&t, s.answer) <= found_at(&t, t.swept):
+        memcpy(s.answer, t.swept, p.n_rows * sizeof(double))
+    return now <= o.tol

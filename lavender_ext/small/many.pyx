@@ -20,7 +20,7 @@ from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport DONE, descend_all
+from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all
 from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.score cimport relative, score_t
@@ -60,7 +60,9 @@ cdef struct job_t:
     made_t made                 # of the data, or in this call; NULL between
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
     int32_t cold                # 1: from doing nothing, else from lam as it is
+    double most                 # ns that it may cost as counted, then what it has come to is the result; inf: to the end
     bint solved
+    bint spent                  # what it might cost is
     int32_t counts[4]           # steps, factorisations, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
@@ -90,14 +92,19 @@ cdef inline double others_cost(const job_t* j, const limits_t* l, double tol, do
     return min(least, least_exchanges)
 
 
-cdef inline bint is_cheap(const job_t* j, const limits_t* l, double tol, double largest, double* w) noexcept nogil:
-    cdef double flops = j.g.n * (largest * largest) / 6.0, count = l.bounded
+cdef inline bint is_cheap(job_t* j, const limits_t* l, double tol, double largest, double* w, int32_t* steps) noexcept nogil:
+    """Is it? No more steps then than `most` is for, counted as if each were of the costliest island."""
+    cdef double flops = j.g.n * (largest * largest) / 6.0, count = l.bounded, each, fit
     cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
     if has_friction(&j.p):
         count = l.cone
         if j.p.law == COULOMB:
             count, flops = l.coulomb, 2.0 * flops
-    cdef double cost = l.entry * l.read * sweep + count * (l.step + l.entry * sweep + l.work * flops)
+    each = l.step + l.entry * sweep + l.work * flops
+    fit = (j.most - l.entry * l.read * sweep) / each
+    if fit < steps[0]:
+        j.spent, steps[0] = True, <int32_t>max(fit, 0.0)
+    cdef double cost = l.entry * l.read * sweep + count * each
     return cost <= l.most and (j.p.n_rows <= l.rows or cost <= others_cost(j, l, tol, sweep, w))
 
 
@@ -129,7 +136,7 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
-    cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n)
+    cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
         return
     if not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
@@ -137,7 +144,10 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if j.begin[0] < 0.0:
         begin(j, room.real)
     settle(&f, &j.p, &j.g, per, room.index, &need)
-    if need.crowded or need.values > limits.values or not is_cheap(j, limits, tol, need.wide, room.real):
+    if f.n_islands <= MOST // STEPS:
+        steps = STEPS * f.n_islands
+    if need.crowded or need.values > limits.values or not is_cheap(j, limits, tol, need.wide, room.real, &steps):
+        j.spent = False
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -145,11 +155,12 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if j.cold:
         do_nothing(&j.p, j.lam, j.both)
     if j.made.n_empty and not settle_empty_rows(j, tol):
+        j.spent = False
         return
-    if f.n_islands <= MOST // STEPS:
-        steps = STEPS * f.n_islands
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    if descend_all(&f, j.lam) != DONE:
+    code = descend_all(&f, j.lam)
+    j.spent = j.spent and code == SPENT
+    if code != DONE and not j.spent:
         return
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if not has_room(room, 0, <ssize_t>j.g.n + m):
@@ -183,7 +194,7 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
         j.made = p.made
     j.begin[0], j.begin[1], j.begin[2] = p.start_energy, p.start_velocity, p.start_relative
     j.lam, j.both = lam, both
-    j.solved, j.cold = False, start is None
+    j.solved, j.spent, j.cold, j.most = False, False, start is None, INFINITY
     if not j.cold:
         given = start
         if given.shape[0] != j.p.n_rows:
@@ -211,11 +222,12 @@ cdef class Limits:
         self.at = (<const limits_t*>&numbers[0])[0]
 
 
-def solve_first(Data p, start, double tol, Limits limits):
+def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
 
     What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, an empty row cannot be
-    met or it costs more than the limits (`limits_t`) let in. d, Y and the error of doing nothing stay with the data.
+    met or it costs more than the limits (`limits_t`) let in; most: counted cost [ns] where what was found by then is the
+    result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL)
@@ -225,6 +237,7 @@ def solve_first(Data p, start, double tol, Limits limits):
     impulse, results = np.empty(m), np.empty(2 * m + 1)
     lam, both = impulse, results
     take(&j, p, start, &lam[0], &both[0])
+    j.most = most
     with nogil:
         solve_job(&j, &room, &limits.at, tol)
         free(room.index)
@@ -232,7 +245,7 @@ def solve_first(Data p, start, double tol, Limits limits):
     if not known and j.made.numbers != NULL:
         p.adopt(&j.made)
     remember(&j, p)
-    return result(&j, p, impulse, results) if j.solved else None
+    return result(&j, p, impulse, results) if j.solved or j.spent else None
 
 
 cdef class Batch:

@@ -135,8 +135,8 @@ def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
     problem = random_lcp(3, 120)
     solution = lv.solve(problem, "lemke", time_limit=1e-5)
     assert solution.status is lv.Status.TIME_LIMIT
-    assert "dictionary" in solution.message
-    assert solution.work == {"pivots": 0}
+    assert "takes longer" in solution.message
+    assert not solution.work
     assert lv.solve(problem, "lemke", time_limit=60.0).status is lv.Status.CONVERGED
 
 

@@ -1,6 +1,7 @@
 """newton: its linear algebra against dense NumPy, its answers against enumeration and closed forms."""
 
 from dataclasses import replace
+from pathlib import Path
 from unittest import mock
 
 import numpy as np
@@ -697,3 +698,20 @@ def test_a_turn_after_the_last_of_all_steps_is_an_end(monkeypatch):
         if claim.status is not lv.Status.MAX_ITERATIONS:
             break
     assert claim.status is lv.Status.STALLED
+
+
+@pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="the kernel of Linux alone tells")
+def test_large_memory_asks_for_no_huge_pages():
+    """Each of them may wait for the kernel to make room: repeated solves took three times the first."""
+    problem = suite.granular(n=10, friction="coulomb").problem
+    lv.residual(problem, problem.start())
+    solve = Solve(problem.metric)
+    at, flags = solve.scale.ctypes.data, None
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        word = line.split()[0]
+        if "-" in word:
+            low, high = (int(x, 16) for x in word.split("-"))
+            inside = low <= at < high
+        elif inside and word == "VmFlags:":
+            flags = line.split()
+    assert flags is not None and "hg" not in flags

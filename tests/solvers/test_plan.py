@@ -14,10 +14,10 @@ from lavender.cli import main
 from lavender.deadline import Deadline
 from lavender.problem import LAWS, OPERATORS
 from lavender.residuals import reference
-from lavender.solvers.auto import Auto, solve
+from lavender.solvers.auto import solve
 from lavender.solvers.certify import certify
 from lavender.solvers.costs import METHODS, TABLE, Costs, candidates
-from lavender.solvers.methods import Sweeps, make
+from lavender.solvers.methods import Sweeps, in_short_time, make
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.structure import Structure
 from lavender.suite.build import Bodies, Contacts, contact_problem
@@ -169,16 +169,15 @@ def test_no_more_than_four_are_asked(name):
 
 @pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
 def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
-    """With the least of time sweeps, set up before its clock starts, have all of it."""
+    """With the least of time sweeps have all of it."""
     problem = suite.case(name).problem
     reference(problem)
-    state = Auto().prepare(problem)
     monkeypatch.setattr(Costs, "least", lambda self, asked: self.of(asked) if asked == "anderson" else 1 / 0)
-    Auto().ready(state, 1e-4)
+    sweeps = in_short_time(Costs(problem), Deadline(1e-4))
     monkeypatch.setattr(Sweeps, "set_up", None)
     log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
     log.offer(problem.start())
-    solve(log, None, state.sweeps)
+    solve(log, None, sweeps)
     assert log.end is not None
     log.end()
     assert log.iterations > 0
@@ -193,11 +192,10 @@ def test_sweeps_that_cost_more_than_counted_end_in_time(pace, least, monkeypatch
     """
     problem = suite.case("granularF(n=4)").problem
     reference(problem)
-    state, now = Auto().prepare(problem), [0.0]
-    Auto().ready(state, 1e-3)
-    state.sweeps.least = least * 1e6 / state.sweeps.costs.sure  # ns
+    sweeps, now = in_short_time(Costs(problem), Deadline(1e-3)), [0.0]
+    sweeps.least = least * 1e6 / sweeps.costs.sure  # ns
     monkeypatch.setattr("lavender.deadline.perf_counter", lambda: now[0])
-    original, each = checked_sweeps.run, 1e-9 * pace * state.sweeps.cost.each
+    original, each = checked_sweeps.run, 1e-9 * pace * sweeps.cost.each
 
     def run(data, watch, impulse, n, *more):
         now[0] += n * each
@@ -206,7 +204,7 @@ def test_sweeps_that_cost_more_than_counted_end_in_time(pace, least, monkeypatch
     monkeypatch.setattr(checked_sweeps, "run", run)
     log = SolveLog(problem, 1e-300, 10**6, deadline=Deadline(1e-3))
     log.offer(problem.start())
-    assert not state.sweeps.run_first(log)
+    assert not sweeps.run_first(log)
     log.end()
     assert 0.8e-3 <= now[0] <= 1e-3 + 0.6 * each
     assert log.turns[-1].after == lv.residual(problem, log.impulse).relative
@@ -236,27 +234,9 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
 
 
 @pytest.mark.parametrize(("limit", "swept"), [(1e-4, True), (10.0, False)])
-def test_sweeps_are_set_up_before_the_clock_where_little_else_ends_in_time(limit, swept):
+def test_sweeps_come_first_where_little_else_ends_in_time(limit, swept):
     for problem in (random_general(5, contacts=0), suite.stack(n=200).problem)[0 if swept else 1 :]:
-        state = Auto().prepare(problem)
-        Auto().ready(state, limit)
-        assert (state.sweeps is not None) == swept
-
-
-def test_velocities_are_analysed_before_the_clock_where_they_may_follow_sweeps():
-    problem = random_general(5, contacts=60)
-    for limit, analysed in ((1e-7, False), (10.0, True)):
-        state = Auto().prepare(problem)
-        Auto().ready(state, limit)
-        assert ("kernel" in vars(state.structure)) == analysed
-
-
-def test_the_compiled_call_is_set_up_before_the_clock():
-    problem = suite.case("pyramid(k=3)").problem
-    reference(problem)
-    assert problem.derived.small is None
-    Auto().ready(Auto().prepare(problem), 1.0)
-    assert problem.derived.small
+        assert (in_short_time(Costs(problem), Deadline(limit)) is not None) == swept
 
 
 @pytest.mark.parametrize("form", OPERATORS[:2])

@@ -24,7 +24,6 @@ CLOCK = 64
 WATCHED = 4.0
 TIME_SHARE = 0.5
 LOOKED_UP = 20.0
-LATE = 0.05  # s that a step may end after the limit
 FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
 ROOM = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
@@ -76,7 +75,7 @@ def run(
     if time_limit is not None:
         steps = max(1, int(min(TIME_SHARE * time_limit / slow, clock)))
     while counts[0] < max_iter:
-        if deadline.passed(min(step, 1e6) - LATE):
+        if deadline.passed(min(step, 1e6)):
             status = Status.TIME_LIMIT
             break
         end, done = kernel.run(impulse, closer * tol, min(steps, max_iter - int(counts[0])), again)

@@ -48,7 +48,9 @@ class System:
         return self.pace * self.cost
 
     def took(self, seconds: float) -> None:
-        """So long did the last factor take."""
+        """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
+        if self.cost > 0.0:
+            self.pace = seconds / self.cost
 
 
 class VelocitySystem(System):
@@ -109,11 +111,6 @@ class MatrixSystem(System):
         if not self.dense:
             self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
         return self.pace * self.cost
-
-    def took(self, seconds: float) -> None:
-        """The next one is refused by that pace."""
-        if self.cost > 0.0:
-            self.pace = seconds / self.cost
 
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:

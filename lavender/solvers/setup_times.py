@@ -1,0 +1,96 @@
+"""What set-ups take [s], counted from a problem's size before any of it is done: asked under a time limit alone.
+
+A set-up cannot be stopped, so one that does not fit in the time left is not begun. Rates are of one core of 2023, and
+about half as much again as measured on quiet problems of the suite and of dense matrices.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from lavender.problem import Problem
+from lavender.registry import SMALL_ROWS
+from lavender_ext.core import assemble
+
+__all__ = [
+    "entries_of",
+    "factored",
+    "forming",
+    "loading",
+    "ordered",
+    "over_bodies",
+    "over_rows",
+    "over_velocities",
+    "sweeping",
+]
+
+START = 6e-5  # s, of each
+# s for each entry of A: formed of bodies, or of J and M, with as many products for each as a row of Y has entries;
+# compared with its mirror image; laid out for a factor by Python.
+FORMED, PRODUCT, COMPARED, LAID_OUT = 1e-8, 2e-9, 1.2e-8, 6e-8
+# s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
+BODIES, VELOCITIES, ORDERED = 4e-8, 4.5e-8, 1e-7
+SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
+LOADING = 0.3  # s of a part of SciPy
+DENSE, SPARSE, SPARSE_ROWS = (
+    1.5e-10,
+    1e-7,
+    1000.0,
+)  # as the first factors of `direct` are refused by (`pivoting.py`)
+
+
+def entries_of(problem: Problem) -> float:
+    """Entries of A, at most where it is not formed."""
+    if problem.matrix is not None or "_compressed" in problem.__dict__:
+        return float(len(problem._compressed[1]))
+    if problem.rows is not None:
+        return min(float(assemble.bound(problem.data)[0]), float(problem.m) ** 2)
+    return min(float(problem.metric.entries_of_a), float(problem.m) ** 2)
+
+
+def forming(problem: Problem) -> float:
+    """A, where it is not known yet."""
+    if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:
+        return 0.0
+    in_row = 0.0 if problem.rows is not None else problem.metric.work / (2.0 * problem.m)
+    return START + (FORMED + PRODUCT * in_row) * entries_of(problem)
+
+
+def loading(*modules: str) -> float:
+    """Parts of SciPy that this process has not loaded yet."""
+    return LOADING * sum(module not in sys.modules for module in modules)
+
+
+def over_rows(problem: Problem) -> float:
+    """A, whether it is symmetric, and a matrix that a solver makes of it."""
+    entries = entries_of(problem)
+    compared = COMPARED * entries if problem.matrix is not None and "_scan" not in problem.__dict__ else 0.0
+    loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
+    return START + forming(problem) + compared + LAID_OUT * entries + loaded
+
+
+def factored(problem: Problem) -> float:
+    """The same with its first factor, of all rows."""
+    m = float(problem.m)
+    sparse = SPARSE * entries_of(problem) * (1.0 + m / SPARSE_ROWS)
+    return over_rows(problem) + min(DENSE * m**3 / 3.0, sparse)
+
+
+def over_bodies(problem: Problem) -> float:
+    """An elimination of bodies, and J scaled for it."""
+    return START + BODIES * problem.metric.work
+
+
+def over_velocities(problem: Problem) -> float:
+    """An elimination of generalised velocities."""
+    return START + VELOCITIES * problem.metric.work
+
+
+def sweeping(problem: Problem) -> float:
+    """Sweeps over the form that is given, and the first of them."""
+    return START + SWEPT * problem.metric.work
+
+
+def ordered(problem: Problem, order: object) -> float:
+    """An order of blocks, other than the one given."""
+    return 0.0 if isinstance(order, str) and order == "given" else START + ORDERED * problem.metric.work
