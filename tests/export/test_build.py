@@ -12,7 +12,7 @@ import pytest
 import random_problems as rp
 from clib import run
 from click.testing import CliRunner
-from test_same_bits import kinds_of
+from test_same_bits import kinds_of, of_matrix
 from tower import self_test_problem
 
 import lavender as lv
@@ -179,7 +179,7 @@ def write_vectors(out):
         (rp.random_contact_problem(5, "cone"), "nncg", {"restart": "against"}),
         (lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), [1.0, 0.5]), "direct", {}),
         (rp.random_contact_problem(6), "auto", {}), (rp.random_contact_problem(7), "admm", {}),
-        *((given, "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
+        *((of_matrix(given), "nncg", {}) for given in kinds_of("cone", mu=0.0) if given.rows is None),
         (rp.random_lcp(3, m=8), "lemke", {}), (rp.random_lcp(3, m=8), "newton", {}),
     ]  # fmt: skip
     packed = [vectors.pack(problem, solver, 1e-6, 500, options)[0] for problem, solver, options in given]

@@ -150,7 +150,7 @@ def test_record_then_report_from_the_command_line(tmp_path):
         "auto,newton",
     ]
     for again in range(2):  # the second time nothing is recorded anew
-        shown = CliRunner().invoke(cli, [*words, "--no-figures", "--out", str(page)])
+        shown = CliRunner().invoke(cli, [*words, "--no-figures", "--tables", "--out", str(page)])
         assert shown.exit_code == 0, shown.output
         assert ("3 problems" in shown.output) == (again == 0)
         assert "Newton (inside the engine)" in shown.output
