@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.auto.curves import LEVELS, Curve
 from benchmarks.auto.regret import SHIFT
 from lavender import registry
+from lavender.deadline import NEVER
 from lavender.solution import Claim, Status
 from lavender.solvers.costs import METHODS, Costs, candidates
 from lavender.solvers.methods import FIRST, Candidate
@@ -94,7 +95,7 @@ def replayed(
     rates : as in `rates.json`, which is read if None
     """
     log = SimpleNamespace(
-        problem=structure.problem, deadline=math.inf, left=2**31, best=1.0, seconds=CALL + COUNTED, solved=False,
+        problem=structure.problem, deadline=NEVER, left=2**31, best=1.0, seconds=CALL + COUNTED, solved=False,
         ends_late=lambda cost: False, note=lambda *what: None,
     )  # fmt: skip
     costs = Costs(structure.problem, level, rates, structure)
