@@ -147,7 +147,9 @@ def _slack(problem: Problem, y: FloatArray, rows: Any) -> tuple[FloatArray, Floa
         x = problem.generalized.solve(r)  # type: ignore[union-attr]
     else:
         x = problem.rows.inverse_mass_matrix() @ r
-    off, soft = length * math.sqrt(max(0.0, float(r @ x))), problem.compliance * y  # type: ignore[operator]
+    # J x as well: an M^-1 of bodies that is not definite, by rounding, makes r.x no norm.
+    off = np.maximum(length * math.sqrt(max(0.0, float(r @ x))), np.abs(problem.jacobian @ x))
+    soft = problem.compliance * y  # type: ignore[operator]
     return soft - off, soft + off, 0.0 * size if np.any(soft) else size
 
 

@@ -98,7 +98,7 @@ class Problem:
         self.cones = {key: np.array(value) for key, value in spec["cones"].items()}
         self.cones.setdefault("rolling", np.zeros(len(self.cones["kind"])))
         self.law = spec["friction"]
-        self.half = None  # of J and M, or of bodies: J M^-1/2 (m, any)
+        self.operator = "general" if general else "rows" if "rows" in spec else "matrix"
         self.m = len(self.b)
         self.stretch = self._stretch()
         self.roundings = self.m + 20
@@ -186,11 +186,7 @@ class Problem:
             minv[i, 3:, 3:] = np.array(r["inv_inertia"][i], L)
         minv_size = np.abs(minv)
         soft = self.soft = np.array(spec.get("compliance", np.zeros(m)), L)
-        root = np.zeros((n, 6, 6), L)
-        for i in range(n):
-            value, vector = np.linalg.eigh(minv[i].astype(float))
-            root[i] = vector * np.sqrt(np.maximum(value, 0.0))
-        self.half = self.stretch[:, None] * np.einsum("mni,nij->mnj", jac, root).reshape(m, 6 * n)
+        self.jac_minv = self.stretch[:, None] * jac.reshape(m, 6 * n), minv
         self.jac = jac.reshape(m, 6 * n)
         half = np.einsum("mni,nij->mnj", jac, minv)
         half_size = np.einsum("mni,nij->mnj", size, minv_size)
@@ -448,10 +444,16 @@ class Problem:
         """(m,) where rounding of the data by `share` explains A^T y: of A by its rows, of J as a whole; never of R."""
         length = np.sqrt(self.d)
         size = length @ np.abs(y)
-        if self.half is None:
+        if self.operator == "matrix":
             return np.abs(z) <= share * length * size
-        r = self.half.T @ y
-        return (self.soft * y == 0) & (np.sqrt(r @ r) <= share * size)
+        if self.operator == "general":
+            square = np.sum((self.half.T @ y) ** 2)
+        else:
+            jac, minv = self.jac_minv
+            r = (jac.T @ y).reshape(-1, 6)
+            square = np.einsum("ni,nij,nj->", r, minv, r)
+        off = np.abs(z - self.soft * y)
+        return (self.soft * y == 0) & (square <= (share * size) ** 2) & (off <= share * length * size)
 
     def refutes(self, y):
         """Why y (m,) does not prove that there is no solution, or None where it does.
