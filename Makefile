@@ -4,7 +4,7 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels test quick lint format types docs verdict wasm fingerprint ci release clean
+.PHONY: help setup kernels test quick lint format types coverage docs verdict wasm fingerprint ci release clean
 
 help:  ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -32,6 +32,15 @@ format:  ## rewrite Python files in the format that CI expects
 
 types:  ## mypy
 	$(BIN)mypy
+
+coverage:  ## which lines of the Python files the tests reach, in build/coverage/index.html
+	test -x $(PYTHON) || python3 -m venv .venv
+	$(PYTHON) -m pip install -q -e ".[test]" "coverage>=7.10"
+	$(PYTHON) -m coverage erase
+	$(PYTHON) -m coverage run -m pytest -q -n auto --dist worksteal
+	$(PYTHON) -m coverage combine -q
+	$(PYTHON) -m coverage html -q -d build/coverage
+	$(PYTHON) -m coverage report | tail -n 1
 
 docs:  ## the documentation, in site/
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs site

@@ -102,7 +102,7 @@ def family(**twins: Mapping[str, Any]) -> Callable[[Callable[P, Draft]], Callabl
                 draft = function(**values)  # type: ignore[call-arg]
             except MemoryError as error:
                 raise InputError(
-                    f"{text}: there is not enough memory ({error or 'none left'}); give smaller parameters"
+                    f"{text}: there is not enough memory ({str(error) or 'none left'}); give smaller parameters"
                 ) from None
             return Case(
                 name=text,
