@@ -81,7 +81,9 @@ def main(args: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except MemoryError as error:
-        click.echo(f"lavender: not enough memory ({str(error) or 'none left'}): give a smaller problem", err=True)
+        click.echo(
+            f"lavender: not enough memory ({str(error) or 'none left'}): give a smaller problem", err=True
+        )
         code = EXIT_BAD_INPUT
     except OSError as error:  # a full disk behind stdout, for one
         click.echo(f"lavender: {error}", err=True)
