@@ -8,7 +8,6 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 if TYPE_CHECKING:
-    from lavender.motion.reference import Kept
     from lavender_ext.core.problem import Data
     from lavender_ext.judge.measure import Judged
 
@@ -44,7 +43,7 @@ class Derived:
         self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
         self.vain: tuple[str, float, bytes] | None = None  # whose one compiled call did not end, from where
-        self.motion: Kept | None = None  # the reference that motion errors are told from, and its operator
+        self.motion: Any = None  # `Kept` of lavender.motion: the reference of motion errors, its operator
 
 
 _process = object()  # another one in a fork's child, where no thread is left to give a lock back

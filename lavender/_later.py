@@ -1,4 +1,6 @@
-"""Parts of SciPy that are loaded when something of them is first used: they would be half of `import lavender`.
+"""Modules that are loaded when something of them is first used.
+
+Parts of SciPy would be half of `import lavender`.
 
 `from lavender._later import sparse as sp` stands where one would write `import scipy.sparse as sp`. What is likely to
 be used while the clock of a solve runs is loaded before, by `load`.
@@ -9,7 +11,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["issparse", "lapack", "load", "sparse"]
+__all__ = ["above", "issparse", "lapack", "load", "sparse"]
 
 
 class _Later:
@@ -34,6 +36,11 @@ if TYPE_CHECKING:
     from scipy.linalg import lapack
 else:
     sparse, lapack = _Later("scipy.sparse"), _Later("scipy.linalg.lapack")
+
+
+def above(name: str) -> Any:
+    """A module of a floor above, by which a method of this one is a short way to a function there."""
+    return _Later(name)
 
 
 def load(*more: str) -> None:

@@ -6,17 +6,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray, read_only, table_of
+from lavender._later import above
 from lavender.errors import InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
-
-if TYPE_CHECKING:
-    from lavender.motion import MotionError
 
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn", "counted"]
 
@@ -229,11 +227,9 @@ class Solution:
             self, impulse=impulse, residual=found, certificate=None if proof is None else read_only(s * proof)
         )
 
-    def motion_error(self, reference: Any = None) -> MotionError:
+    def motion_error(self, reference: Any = None) -> Any:
         """How wrong the motion is, in units, with a bound: see `lavender.motion_error`."""
-        from lavender.motion import motion_error
-
-        return motion_error(self.residual._problem, self.impulse, reference)
+        return above("lavender.motion").motion_error(self.residual._problem, self.impulse, reference)
 
     def raise_for_status(self) -> Solution:
         """Return self when the judge accepts the result (within tol, or at the floor of float64).

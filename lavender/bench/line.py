@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lavender import registry
 from lavender.bench.record import Record, level_name
-
-if TYPE_CHECKING:
-    from lavender.bench.running.timing import Task
 
 __all__ = ["asked_of", "code_of", "needs_more"]
 
@@ -26,7 +23,7 @@ def needs_more(solver: str, iterations: int) -> bool:
     return spec is not None and iterations > spec.max_iter
 
 
-def asked_of(what: Task | Record, iterations: int) -> dict[str, Any]:
+def asked_of(what: Any, iterations: int) -> dict[str, Any]:
     """What the line of a measurement passes to `lv.solve` beside problem, name and start: timed, and printed.
 
     Parameters

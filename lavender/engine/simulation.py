@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from lavender import io
 from lavender._arrays import read_only, whole_number
+from lavender._later import above
 from lavender.engine.check import same_scene, well_formed, whole_state
 from lavender.engine.film import Film, header_of
 from lavender.engine.layout import HEAD
@@ -20,9 +21,6 @@ from lavender.io.stored import folder_for_steps
 from lavender.problem import Problem
 from lavender.scene import Scene
 from lavender_ext.engine.arrays import NEED_ROOM, lengths
-
-if TYPE_CHECKING:
-    from lavender.web.view import Viewer
 
 __all__ = ["SOLVER_FIELDS", "Simulation"]
 
@@ -220,7 +218,7 @@ class Simulation(Stepping):
         """
         return save_picture(self.film(steps), path, **more)
 
-    def view(self, *, port: int = 0, browser: bool = True) -> Viewer:
+    def view(self, *, port: int = 0, browser: bool = True) -> Any:
         """Show this simulation in a page on this machine: every step from now on, live, and all of them again.
 
         Parameters
@@ -250,11 +248,11 @@ class Simulation(Stepping):
         >>> len(viewer.film)
         11
         """
-        from lavender.web.view import Viewer  # above this room: only when it is asked for
-
         film = self.start_film()
         try:
-            return Viewer(film, port=port, browser=browser, end=lambda: self.end_film(film))
+            return above("lavender.web.view").Viewer(
+                film, port=port, browser=browser, end=lambda: self.end_film(film)
+            )
         except BaseException:
             self.end_film(film)
             raise

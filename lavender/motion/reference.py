@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,6 @@ from lavender.problem import Problem
 from lavender.residuals import Residual, residual
 from lavender.solution import Solution, uninterrupted
 from lavender.solve import solve
-
-if TYPE_CHECKING:
-    from lavender.motion.several import Motions
 
 __all__ = ["Reference", "adopt", "reference"]
 
@@ -56,7 +53,7 @@ class Kept:
     operator: operators.Operator
     refusal: str
     reference: Reference | None = None
-    motions: Motions | None = None
+    motions: Any = None  # `Motions` of a search, or None
 
 
 def kept(problem: Problem) -> Kept:

@@ -10,6 +10,7 @@ import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
 from lavender._derived import once
+from lavender._later import above
 from lavender._later import sparse as sp
 from lavender.cones import ROW, Cones
 from lavender.errors import InputError
@@ -263,6 +264,4 @@ class Problem(Builders):
 
     def save(self, path: str | PathLike[str], **more: Any) -> None:
         """Write the problem to a file; `lavender.io.save`, whose options `more` are."""
-        from lavender.io import save
-
-        save(self, path, **more)
+        above("lavender.io").save(self, path, **more)
