@@ -16,7 +16,8 @@ where a contact is open under the cone law (Coulomb: w_n >= 0). With x~ an appro
 inequality holds over the zero's box, it is a solution. Rows that depend on others exactly (equal rank of J and of [J b],
 in whole numbers) keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
 Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as exactly,
-on rows that have; else it is named as on the border of two cases.
+on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns); else it is named
+as on the border of two cases.
 
 Needs python-flint (extra `proof`).
 """
@@ -44,6 +45,7 @@ __all__ = ["Enclosure", "prove"]
 
 BITS = (128, 256)  # of the balls: what the first leave undecided the second try
 UNIT = 2.0**-53
+RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
 ROUNDS = 30  # changes of cases, as in an active-set method
 EXTENT = 10  # enlargements of X
@@ -238,9 +240,17 @@ class _Balls:
         self.number, self.matrix = flint.arb, flint.arb_mat
 
 
+class _Rationals:
+    def __init__(self, flint: Any) -> None:
+        self.matrix, self._flint = flint.fmpq_mat, flint
+
+    def number(self, x: float) -> Any:
+        return self._flint.fmpq(*x.as_integer_ratio())
+
+
 def _matrix(kind: Any, a: Any) -> Any:
     dense = a.toarray()
-    return kind.matrix(*dense.shape, dense.ravel().tolist())
+    return kind.matrix(*dense.shape, [kind.number(x) for x in dense.ravel().tolist()])
 
 
 def _times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
@@ -312,8 +322,19 @@ class _Search:
                     lam, w = self._solve()
                 except _Recase:
                     continue
-                if not self._changed(lam, w):
+                borders = self._changed(lam, w)
+                if borders and self.exact:
+                    exact, w_exact = self._solve(_Rationals(self.flint))
+                    borders = self._changed(exact, w_exact)
+                if borders == []:
                     return self._told(lam, w)
+                if borders:
+                    names = tuple(dict.fromkeys(self._name(block) for block in borders))
+                    raise _Undecided(
+                        f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: on the border of two cases, "
+                        f"closer than {self.flint.ctx.prec} bits tell",
+                        names,
+                    )
             raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
         except _Undecided as undecided:
             return Enclosure(False, math.inf, math.inf, False, str(undecided), None, undecided.borders)
@@ -337,9 +358,10 @@ class _Search:
                 unknown += [block.first, *(r for part in block.parts for r in part.rows)]
         return np.array(sorted(unknown), np.int64), fixed
 
-    def _solve(self) -> tuple[list[Any], list[Any]]:
-        """Balls that hold a zero of the equations: impulses and slack of all rows."""
-        kind = _Balls(self.flint)
+    def _solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
+        """Balls that hold a zero of the equations, or the zero in rationals: impulses and slack of all rows."""
+        kind = _Balls(self.flint) if kind is None else kind
+        self.number = kind.number
         unknown, fixed = self._unknown()
         free = self._independent(unknown, fixed)
         self.family = np.setdiff1d(unknown, free)
@@ -347,8 +369,16 @@ class _Search:
             fixed[r] = float(self.given[r])
         lam = [kind.number(x) for x in fixed]
         base = self.operator.slack(kind, lam)
-        for which in self._islands(free):
-            self._island(kind, which, lam, base)
+        islands = self._islands(free)
+        slides = any(part.slides for block in self.blocks if block.loaded for part in block.parts or ())
+        self.exact = not slides and max(map(len, islands), default=0) <= RATIONAL
+        for which in islands:
+            if isinstance(kind, _Rationals):
+                right = kind.matrix(len(which), 1, [-base[r] for r in which.tolist()])
+                for r, x in zip(which.tolist(), self.operator.block(kind, which).solve(right).entries(), strict=True):
+                    lam[r] = x
+            else:
+                self._island(kind, which, lam, base)
         return lam, self.operator.slack(kind, lam)
 
     def _islands(self, free: IntArray) -> list[IntArray]:
@@ -527,18 +557,17 @@ class _Search:
 
     # -- inequalities ---------------------------------------------------------------------------
 
-    def _changed(self, lam: list[Any], w: list[Any]) -> bool:
-        """Change the cases that are certainly wrong; what cannot be told is on a border."""
+    def _changed(self, lam: list[Any], w: list[Any]) -> list[_Block] | None:
+        """Change the cases that are certainly wrong: None; else the blocks whose inequalities cannot be told."""
         changed, border = False, []
-        cones = self.problem.cones
+        cones, number = self.problem.cones, self.number
         for block in self.blocks:
             r = block.first
             if block.parts is None:
                 low, high = float(cones.lower[r]), float(cones.upper[r])
                 if block.loaded:
-                    below, above = _sign(lam[r] - low) if math.isfinite(low) else 1, (
-                        _sign(high - lam[r]) if math.isfinite(high) else 1
-                    )
+                    below = _sign(lam[r] - number(low)) if math.isfinite(low) else 1
+                    above = _sign(number(high) - lam[r]) if math.isfinite(high) else 1
                     if below < 0 or above < 0:
                         block.loaded, block.at, changed = False, low if below < 0 else high, True
                     elif not below or not above:
@@ -551,12 +580,15 @@ class _Search:
                         border.append(block)
                 continue
             speeds = [
-                sum(((c * w[k]) * (c * w[k]) for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
+                sum((_squared(number(c) * w[k]) for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
                 for p in block.parts
             ]
             if not block.loaded:
-                over = w[r] - sum((s.sqrt() for s in speeds), 0 * w[r]) if self.cone else w[r]
-                sign = _sign(over)
+                sign = _sign(w[r])
+                if self.cone and sign > 0:  # w_n >= sum s; one root of the sum of squares where there is one part
+                    sign = _sign(w[r] * w[r] - speeds[0]) if len(speeds) == 1 else _sign(
+                        w[r] - sum((s.sqrt() for s in speeds), 0 * w[r])
+                    )
                 if sign < 0:
                     block.loaded = changed = True
                 elif not sign and (self.cone and block.parts or r not in self.still):
@@ -570,21 +602,14 @@ class _Search:
                 if part.slides:
                     continue  # |lambda / c| = lambda_n by (1), against w by its sign
                 y = sum(
-                    (lam[k] / c * (lam[k] / c) for k, c in zip(part.rows, part.reach, strict=True)), 0 * lam[r]
+                    (_squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)), 0 * lam[r]
                 )
                 sign = _sign(lam[r] * lam[r] - y)
                 if sign < 0:
                     part.slides = changed = True
                 elif not sign:
                     border.append(block)
-        if border and not changed:
-            names = tuple(dict.fromkeys(self._name(block) for block in border))
-            raise _Undecided(
-                f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: on the border of two cases, closer than "
-                f"{self.flint.ctx.prec} bits tell",
-                names,
-            )
-        return changed
+        return None if changed else border
 
     def _told(self, lam: list[Any], w: list[Any]) -> Enclosure:
         kind = _Balls(self.flint)
@@ -606,6 +631,10 @@ class _Search:
 
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
+
+
+def _squared(x: Any) -> Any:
+    return x * x
 
 
 def _sign(x: Any) -> int:
