@@ -1,23 +1,24 @@
 """Proofs that an exact solution stands beside an answer: how far away at most, in balls of interval arithmetic.
 
-On the case of each block (a row inside its bounds or at one of them; a contact open or loaded, each part of its friction
-sticking or sliding) the conditions are equations in the impulses x that are not fixed by the case,
+On the case of each block (a row inside its bounds or at one of them; a contact open or loaded, each part of its
+friction sticking or sliding) the conditions are equations in the impulses that are not fixed by the case,
 
     free, loaded, sticks     w_i = A_i lambda - b_i = 0
     loaded, cone law         w_n = sum_g s_g,    s_g = |c w_g| over the sliding parts g, c the reach of its rows
     slides                   lambda_i s_g + c_i^2 w_i lambda_n = 0                                        (1)
 
-and inequalities in the rest: lambda within its bounds, w >= 0 at a lower one, |lambda_g / c| <= lambda_n, w_n >= sum |c w_g|
-where a contact is open under the cone law (Coulomb: w_n >= 0). With x~ an approximate zero, Y ~ F'(x~)^-1 and a box X around x~,
+and inequalities in the rest: lambda within its bounds, w >= 0 at a lower one, |lambda_g / c| <= lambda_n, and where a
+contact is open w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a
+box X around x~,
 
     K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
 
-(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), in ball arithmetic on the problem's float64 numbers as exact ones; where each
-inequality holds over the zero's box, it is a solution. Rows that depend on others exactly (equal rank of J and of [J b],
-in whole numbers) keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
-Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as exactly,
-on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns); else it is named
-as on the border of two cases.
+(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), in ball arithmetic on the problem's float64 numbers as exact ones; where
+each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target included,
+keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
+Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
+exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
+else it is named as on the border of two cases.
 
 Needs python-flint (extra `proof`).
 """
@@ -32,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, read_only
+from lavender._arrays import FloatArray, read_only
 from lavender._later import lapack
 from lavender._later import sparse as sp
 from lavender.cones import ROW
@@ -56,7 +57,9 @@ class Enclosure:
     """An exact solution of the problem's own numbers, and how far from an answer it is. `str()` is a line."""
 
     proven: bool
-    impulse_radius: float  # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
+    impulse_radius: (
+        float  # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
+    )
     velocity_radius: float  # m/s: largest |w_i - w_i*| of a row
     unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `lavender.motion.uniqueness`
     reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
@@ -166,7 +169,7 @@ class _Operator:
     """A of float64 numbers that are taken as exact: its rows times impulses, and blocks of it, in numbers of a kind."""
 
     def __init__(self, problem: Problem) -> None:
-        self.problem = problem
+        self.problem: Any = problem
         self.rows = problem.csr if problem.matrix is not None else problem.jacobian
         if problem.matrix is None and problem.rows is not None:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
@@ -198,7 +201,7 @@ class _Operator:
             return _matrix(kind, self.inverse) * right
         return _matrix(kind, generalized.mass).solve(right)
 
-    def block(self, kind: Any, which: IntArray) -> Any:
+    def block(self, kind: Any, which: Any) -> Any:
         """A of these rows and columns."""
         if self.columns is None:
             return _matrix(kind, self.rows[which][:, which])
@@ -274,14 +277,14 @@ class _Search:
         self.flint, self.problem, self.given = flint, problem, given
         self.operator, self.cone = _Operator(problem), problem.law == "cone"
         self.blocks = self._cases()
-        self.family: IntArray = np.zeros(0, np.int32)
-        self.still: IntArray = np.zeros(0, np.int32)  # rows of blocks that touch: w = 0, by rows it depends on
+        self.family: Any = np.zeros(0, np.int64)
+        self.still: Any = np.zeros(0, np.int32)  # rows of blocks that touch: w = 0, by rows it depends on
 
     # -- cases ----------------------------------------------------------------------------------
 
     def _cases(self) -> list[_Block]:
         """From the point that one update would project: inside a bound or beyond it."""
-        problem, cones = self.problem, self.problem.cones
+        cones = self.problem.cones
         lam, w, d = self.given, self.problem.slack(self.given), self.problem.d
         parts: dict[int, list[_Part]] = {}
         for i, rows in cones.parts():
@@ -311,13 +314,16 @@ class _Search:
     def run(self) -> Enclosure:
         try:
             tried: set[tuple[Any, ...]] = set()
+            before: tuple[Any, ...] = ()
             for _ in range(ROUNDS):
-                key = tuple(
-                    (b.loaded, b.at, tuple(p.slides for p in b.parts or ())) for b in self.blocks
-                )
+                key = tuple((b.loaded, b.at, tuple(p.slides for p in b.parts or ())) for b in self.blocks)
                 if key in tried:
-                    raise _Undecided("the cases of some blocks change in turns; a more accurate answer is needed")
+                    turned = [
+                        b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
+                    ]
+                    raise self._undecided(turned, "between two cases, which change in turns")
                 tried.add(key)
+                before = key
                 try:
                     lam, w = self._solve()
                 except _Recase:
@@ -329,22 +335,20 @@ class _Search:
                 if borders == []:
                     return self._told(lam, w)
                 if borders:
-                    names = tuple(dict.fromkeys(self._name(block) for block in borders))
-                    raise _Undecided(
-                        f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: on the border of two cases, "
-                        f"closer than {self.flint.ctx.prec} bits tell",
-                        names,
+                    raise self._undecided(
+                        borders, f"on the border of two cases, closer than {self.flint.ctx.prec} bits tell"
                     )
             raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
         except _Undecided as undecided:
             return Enclosure(False, math.inf, math.inf, False, str(undecided), None, undecided.borders)
 
-    def _name(self, block: _Block) -> str:
-        return self.problem.row_name(block.first)
+    def _undecided(self, blocks: list[_Block], words: str) -> _Undecided:
+        names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))
+        return _Undecided(f"{_listed(names)}: {words}", names)
 
     # -- equations ------------------------------------------------------------------------------
 
-    def _unknown(self) -> tuple[IntArray, list[Any]]:
+    def _unknown(self) -> tuple[Any, list[Any]]:
         """Rows that the case does not fix, and the impulses of all (floats where fixed)."""
         fixed = [0.0] * self.problem.m
         unknown = []
@@ -375,13 +379,15 @@ class _Search:
         for which in islands:
             if isinstance(kind, _Rationals):
                 right = kind.matrix(len(which), 1, [-base[r] for r in which.tolist()])
-                for r, x in zip(which.tolist(), self.operator.block(kind, which).solve(right).entries(), strict=True):
+                for r, x in zip(
+                    which.tolist(), self.operator.block(kind, which).solve(right).entries(), strict=True
+                ):
                     lam[r] = x
             else:
                 self._island(kind, which, lam, base)
         return lam, self.operator.slack(kind, lam)
 
-    def _islands(self, free: IntArray) -> list[IntArray]:
+    def _islands(self, free: Any) -> list[Any]:
         if not len(free):
             return []
         graph = abs(self.problem.csr[free][:, free])
@@ -391,7 +397,7 @@ class _Search:
         n, label = sp.csgraph.connected_components(graph, directed=False)
         return [free[label == k] for k in range(n)]
 
-    def _independent(self, unknown: IntArray, fixed: list[float]) -> IntArray:
+    def _independent(self, unknown: Any, fixed: list[float]) -> Any:
         """A largest set of rows with w = 0 whose J is independent; the others must depend on it exactly, b too."""
         still = set(unknown.tolist())
         for block in self.blocks:
@@ -420,7 +426,7 @@ class _Search:
         self.still = np.setdiff1d(touching, np.concatenate([kept, contradict]))
         return np.setdiff1d(unknown, np.setdiff1d(rows, kept))
 
-    def _open(self, rows: IntArray) -> None:
+    def _open(self, rows: Any) -> None:
         """Rows that cannot all have w = 0, by exact numbers: one that is bounded by itself carries nothing instead."""
         opened = False
         for block in self.blocks:
@@ -430,12 +436,12 @@ class _Search:
             raise _Recase
         names = tuple(self.problem.row_name(int(r)) for r in rows)
         raise _Undecided(
-            f"{', '.join(names[:4])}{' and others' if len(names) > 4 else ''}: depend on other rows to rounding and contradict "
-            "them in the last bits; which carry load hangs on these (a compliance on them decides it)",
+            f"{_listed(names)}: depend on other rows to rounding and contradict them in the last bits; which carry "
+            "load hangs on these (a compliance on them decides it)",
             names,
         )
 
-    def _island(self, kind: Any, which: IntArray, lam: list[Any], base: list[Any]) -> None:
+    def _island(self, kind: Any, which: Any, lam: list[Any], base: list[Any]) -> None:
         """Enclose the impulses of `which`, by (2), into `lam`."""
         n = len(which)
         if n > LARGEST:
@@ -445,7 +451,9 @@ class _Search:
         parts = [
             (block.first, part)
             for block in self.blocks
-            if block.parts and block.loaded and (block.first in place or any(r in place for p in block.parts for r in p.rows))
+            if block.parts
+            and block.loaded
+            and (block.first in place or any(r in place for p in block.parts for r in p.rows))
             for part in block.parts
             if part.slides
         ]
@@ -477,9 +485,7 @@ class _Search:
                     number(c) * number(c) * w[k, 0] / s for k, c in zip(at, part.reach, strict=True)
                 ]  # ds = share . dw
                 normal = x[place[first], 0] if first in place else lam[first]
-                ds = [
-                    sum((share[q] * a[k, j] for q, k in enumerate(at)), number(0.0)) for j in range(n)
-                ]
+                ds = [sum((share[q] * a[k, j] for q, k in enumerate(at)), number(0.0)) for j in range(n)]
                 for k, c in zip(at, part.reach, strict=True):
                     c2 = number(c) * number(c)
                     for j in range(n):
@@ -503,7 +509,10 @@ class _Search:
             move = (inverse * value).mid()
             x = (x - move).mid()
             size = max(abs(float(q)) for q in x.entries())
-            if max(abs(float(q)) for q in move.entries()) <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size and step > 1:
+            if (
+                max(abs(float(q)) for q in move.entries()) <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size
+                and step > 1
+            ):
                 break
         value, speeds = f(x)
         still = [part for (_, part), (_, s) in zip(parts, speeds, strict=True) if not s > 0]
@@ -512,8 +521,10 @@ class _Search:
         if still:
             raise _Recase
         newton = inverse * value
-        radius = [2.0 * float(abs(q).upper()) for q in newton.entries()]
-        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * max(abs(float(q)) for q in x.entries())
+        radius = [2.0 * _up(q) for q in newton.entries()]
+        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * max(
+            abs(float(q)) for q in x.entries()
+        )
         unit = matrix(n, n, [float(i == j) for i in range(n) for j in range(n)])
         wide = [max(q, 1e-6 * least) for q in radius]
         for _ in range(EXTENT):
@@ -522,7 +533,7 @@ class _Search:
             value, speeds = f(box)
             if all(s > 0 for _, s in speeds):
                 away = (unit - inverse * slope(box, speeds)) * ball - newton
-                reach = [float(abs(q).upper()) * (1.0 + 1e-15) for q in away.entries()]
+                reach = [_up(q) for q in away.entries()]
                 if all(q < p for q, p in zip(reach, wide, strict=True)):
                     for r in which.tolist():
                         lam[r] = x[place[r], 0] + number(0.0, reach[place[r]])
@@ -533,8 +544,8 @@ class _Search:
             if not all(math.isfinite(q) for q in wide):
                 break
         raise _Undecided(
-            f"no box around the {n} impulses of {self.problem.row_name(int(which[0]))} and what it is coupled with proves a "
-            "zero: the equations are singular to rounding, or the answer is too far from a solution"
+            f"no box around the {n} impulses of {self.problem.row_name(int(which[0]))} and what it is coupled with "
+            "proves a zero: the equations are singular to rounding, or the answer is too far from a solution"
         )
 
     def _inverse(self, slope: Any) -> Any:
@@ -571,7 +582,12 @@ class _Search:
                     if below < 0 or above < 0:
                         block.loaded, block.at, changed = False, low if below < 0 else high, True
                     elif not below or not above:
-                        block.loaded, block.at, block.touches, changed = False, high if below else low, True, True
+                        block.loaded, block.at, block.touches, changed = (
+                            False,
+                            high if below else low,
+                            True,
+                            True,
+                        )
                 elif low < high:
                     sign = _sign(w[r]) * (1 if block.at == low else -1)
                     if sign < 0:
@@ -585,13 +601,17 @@ class _Search:
             ]
             if not block.loaded:
                 sign = _sign(w[r])
-                if self.cone and sign > 0:  # w_n >= sum s; one root of the sum of squares where there is one part
-                    sign = _sign(w[r] * w[r] - speeds[0]) if len(speeds) == 1 else _sign(
-                        w[r] - sum((s.sqrt() for s in speeds), 0 * w[r])
+                if (
+                    self.cone and sign > 0
+                ):  # w_n >= sum s; one root of the sum of squares where there is one part
+                    sign = (
+                        _sign(w[r] * w[r] - speeds[0])
+                        if len(speeds) == 1
+                        else _sign(w[r] - sum((s.sqrt() for s in speeds), 0 * w[r]))
                     )
                 if sign < 0:
                     block.loaded = changed = True
-                elif not sign and (self.cone and block.parts or r not in self.still):
+                elif not sign and ((self.cone and block.parts) or r not in self.still):
                     border.append(block)
                 continue
             sign = _sign(lam[r])
@@ -602,7 +622,8 @@ class _Search:
                 if part.slides:
                     continue  # |lambda / c| = lambda_n by (1), against w by its sign
                 y = sum(
-                    (_squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)), 0 * lam[r]
+                    (_squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)),
+                    0 * lam[r],
                 )
                 sign = _sign(lam[r] * lam[r] - y)
                 if sign < 0:
@@ -614,23 +635,29 @@ class _Search:
     def _told(self, lam: list[Any], w: list[Any]) -> Enclosure:
         kind = _Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
-        off = max((float(abs(x - g).upper()) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
-        speed = max((float(abs(x - y).upper()) for x, y in zip(w, own, strict=True)), default=0.0)
-        up = 1.0 + 2.0**-50  # a float of an upper end may be rounded down
+        off = max((_up(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
+        speed = max((_up(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
         reason = ""
         if len(self.family):
-            names = ", ".join(self.problem.row_name(int(r)) for r in self.family[:3])
-            reason = f"the impulses of {names}{' ...' if len(self.family) > 3 else ''} are one of a family"
+            names = tuple(self.problem.row_name(int(r)) for r in self.family)
+            reason = f"the impulses of {_listed(names)} are one of a family"
         unique = self.problem.law != "coulomb" and self.problem.is_semidefinite
         if self.problem.law == "coulomb":
-            unique = uniqueness(self.problem).proved
-        return Enclosure(
-            True, off * up, speed * up, unique, reason, read_only(np.array([float(x.mid()) for x in lam]))
-        )
+            unique = uniqueness(self.problem.disk).proved
+        return Enclosure(True, off, speed, unique, reason, read_only(np.array([float(x.mid()) for x in lam])))
 
 
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")
+
+
+def _up(x: Any) -> float:
+    """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
+    return float(abs(x).upper()) * (1.0 + 2.0**-50)
 
 
 def _squared(x: Any) -> Any:
@@ -642,7 +669,7 @@ def _sign(x: Any) -> int:
     return 1 if x >= 0 else -1 if x < 0 else 0
 
 
-def _pivots(j: FloatArray) -> tuple[IntArray, int]:
+def _pivots(j: FloatArray) -> tuple[Any, int]:
     """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
     size = np.maximum(np.sqrt((j * j).sum(axis=1)), np.finfo(float).tiny)
     unit = j / size[:, None]
@@ -653,7 +680,7 @@ def _pivots(j: FloatArray) -> tuple[IntArray, int]:
 PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
 
 
-def _dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[IntArray, IntArray]:
+def _dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
     """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
 
     Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
