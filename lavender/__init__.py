@@ -6,7 +6,8 @@
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
 Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
-Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the data), `motion_error`, `redundancy`
+Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
+           data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
 
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.plan import Plan, explain
+    from lavender.proof import Enclosure, prove
     from lavender.scene import Scene
     from lavender.suspicions import Suspicion, diagnose
 
@@ -72,6 +74,7 @@ _LATER = {
     "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
+    "Enclosure": "lavender.proof",
     "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
     "explain": "lavender.plan",
@@ -81,6 +84,7 @@ _LATER = {
     "motion_error": "lavender.motion",
     "motions": "lavender.motion",
     "phenomena": "lavender.phenomena",
+    "prove": "lavender.proof",
     "report": "lavender.report",
     "scene": "lavender.scene",
     "solve_many": "lavender.many",
@@ -100,6 +104,7 @@ __all__ = [
     "Claim",
     "Cones",
     "CrossCheck",
+    "Enclosure",
     "Generalized",
     "InUse",
     "InputError",
@@ -138,6 +143,7 @@ __all__ = [
     "motions",
     "phenomena",
     "prepare",
+    "prove",
     "redundancy",
     "register",
     "report",

@@ -280,6 +280,7 @@ def test_every_import_is_declared():
         "siconos",
         "warp",
     }  # peers, used where they are installed
+    known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
     found = set()

@@ -1,0 +1,45 @@
+"""`lavender prove`."""
+
+from __future__ import annotations
+
+import click
+
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread
+from lavender.errors import InputError, LavenderError
+
+__all__ = ["prove"]
+
+
+@click.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option(
+    "--solver", default="auto", show_default=True, help="Whose answer is held to the exact solution."
+)
+@click.option("--tol", type=float, default=1e-12, show_default=True, help="Relative residual asked of it.")
+def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
+    """Solve problems (files, folders or cases of the suite) and prove an exact solution near each answer.
+
+    Needs the extra `proof`. Each line says how far the exact solution is at most, or what could not be decided.
+
+    Exit code 1: an answer without a proof, or a file in a folder that cannot be read. Exit code 2: a named file cannot
+    be read.
+    """
+    from lavender.bench.cases import resolve
+    from lavender.proof import prove as enclose
+    from lavender.solve import solve
+
+    one_thread()
+    unmet = missing = False
+    for item in resolve(list(files)):
+        try:
+            found = enclose(item.problem, solve(item.problem, solver, tol=tol))
+            click.echo(f"{item.name}: {found}")
+            unmet |= not found.proven
+        except LavenderError as error:
+            click.echo(f"{item.name}: {error}", err=True)
+            missing |= isinstance(error, InputError) and item.named
+            unmet = True
+        finally:
+            item.forget()
+    if missing or unmet:
+        raise click.exceptions.Exit(EXIT_BAD_INPUT if missing else EXIT_UNMET)
