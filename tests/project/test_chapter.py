@@ -115,6 +115,8 @@ def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
 def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
     shown = re.findall(r"generated/figures/(\w+)/(\w+)\.svg", PAGE)
     assert len(shown) > 12
+    # no file of one example is overwritten by another's
+    assert len({panel for _, panel in shown}) == len(shown)
     for name, panel in shown:
         assert panel in example(name).PANELS
         assert f"`python examples/{name}.py {panel}.png`" in PAGE
