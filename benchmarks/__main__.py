@@ -22,6 +22,7 @@ NAMES = (
     "kernels",
     "motions",
     "newton",
+    "original",
     "page",
     "peers",
     "planted",

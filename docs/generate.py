@@ -24,8 +24,11 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
 
+sys.path.append(str(Path(__file__).resolve().parent.parent / "examples"))  # where examples find `panels`
+
 import docstrings
 import matplotlib
+from panels import save
 
 import lavender as lv
 import lavender_ext
@@ -459,7 +462,7 @@ def panels(site, name, module, text):
     """The figure of an example in markdown, panel by panel where it has any."""
     files = [f"figures/{name}/{panel}.svg" for panel in getattr(module, "PANELS", ())]
     for file in files:
-        module.figure(module.numbers(), str(site.path(file)))
+        save(module.PANELS, module.numbers(), str(site.path(file)))
     return [image(file, text) for file in files or [f"figures/example-{name}.svg"]]
 
 

@@ -7,13 +7,13 @@ relative residual, which kind of row its energy belongs to, and the worst row by
 
     python examples/all_rows.py [FIGURE.png]
 
-A file named after a panel holds it alone: judged.png, normals.png, bridge.png, pile.png.
+A file named after a panel holds it alone: relative.png, normals.png, bridge.png, pile.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -45,12 +45,7 @@ def numbers():
     return {name: run(name) for name in SCENES}
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
-def draw_judged(axes, found):
+def draw_relative(axes, found):
     """What the judge of all rows says."""
     for i, (name, by) in enumerate(found.items()):
         axes.semilogy(np.arange(1, STEPS + 1), by["relative"], f"C{i}", label=name)
@@ -88,19 +83,7 @@ def draw_pile(axes, found):
     shares(axes, "pile", found["pile"])
 
 
-PANELS = {"judged": draw_judged, "normals": draw_normals, "bridge": draw_bridge, "pile": draw_pile}
-
-
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
+PANELS = {"relative": draw_relative, "normals": draw_normals, "bridge": draw_bridge, "pile": draw_pile}
 
 
 def main(path="all_rows.png"):
@@ -122,7 +105,7 @@ def main(path="all_rows.png"):
         f"of doing nothing is left in the median, {100 * found['bridge']['shares'][touching, 0].min():.1f} % of it "
         f"or more in hinges"
     )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

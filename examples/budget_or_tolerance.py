@@ -11,9 +11,9 @@ A file named after a panel holds it alone: cost.png, error.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 from lavender.bench import carry
@@ -60,11 +60,6 @@ def numbers():
     }
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 def draw_cost(axes, found):
     """Sweeps of every step."""
     for name, style in (("tolerance", "o"), ("fixed", "x")):
@@ -85,18 +80,6 @@ def draw_error(axes, found):
 PANELS = {"cost": draw_cost, "error": draw_error}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="budget_or_tolerance.png"):
     """Print the distributions, save the figure."""
     found = numbers()
@@ -110,7 +93,7 @@ def main(path="budget_or_tolerance.png"):
             f"{name:<10} {sweeps.mean():>13.1f} {np.median(sweeps):>8.0f} {sweeps.max():>6} "
             f"{np.median(residuals):>18.1e} {np.quantile(residuals, 0.95):>9.1e} {residuals.max():>9.1e}"
         )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

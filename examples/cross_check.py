@@ -18,7 +18,8 @@ A file named after a panel holds it alone: lcp.png, boxed.png.
 """
 
 import sys
-from pathlib import Path
+
+from panels import save
 
 import lavender as lv
 from lavender import registry, suite
@@ -72,24 +73,12 @@ def draw_boxed(axes, found):
 PANELS = {"lcp": draw_lcp, "boxed": draw_boxed}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="cross_check.png"):
     """Print both tables, save the figure."""
     found = numbers()
     for table in found.values():
         print(f"{table}\n{len(table.agreed)} of {len(table)} agree with {table.reference}\n")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

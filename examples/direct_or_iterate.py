@@ -22,9 +22,9 @@ A file named after a panel holds it alone: sweeps.png, rows.png, cost.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 from scipy import sparse
 
 import lavender as lv
@@ -97,11 +97,6 @@ def numbers():
     return {"systems": out, "after": after, "cost": {k * k: cost(k) for k in SIDES}}
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 def draw_sweeps(axes, found):
     """Residual against sweeps at each condition number."""
     for i, row in enumerate(found["systems"].values()):
@@ -141,18 +136,6 @@ def draw_cost(axes, found):
 PANELS = {"sweeps": draw_sweeps, "rows": draw_rows, "cost": draw_cost}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="direct_or_iterate.png"):
     """Print the tables, save the figure."""
     found = numbers()
@@ -182,7 +165,7 @@ def main(path="direct_or_iterate.png"):
         print(f"{n:>6}" + "".join(f"{by[name]:>14.2e}" for name in names))
     most = found["cost"][max(found["cost"])]
     print(f"on the largest lattice sweeps cost {most['gauss_seidel'] / most['banded']:.1f} times the band")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -26,15 +26,15 @@ the run the stack on 4 sweeps leans.
 
     python examples/engine_sweeps.py [FIGURE.png]
 
-A file named after a panel holds it alone: published.png, judged.png, residual.png, violation.png, rows.png, depth.png,
-stand.png, tail.png.
+A file named after a panel holds it alone: published.png, judged.png, residual.png, violation.png, by_budget.png,
+depth.png, stand.png, tail.png.
 """
 
 import functools
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -148,11 +148,6 @@ def numbers():
     }
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 def against_budget(axes):
     """Ticks at the budgets."""
     axes.set_xscale("log")
@@ -206,7 +201,7 @@ def draw_violation(axes, found):
     in_the_run(axes, found, 1, title="the run: approach velocity that is left", ylabel="[m/s]")
 
 
-def draw_rows(axes, found):
+def draw_by_budget(axes, found):
     """The run: what the judge says."""
     in_the_run(axes, found, 2, title="the run: all rows, by the judge", ylabel="relative residual [-]")
 
@@ -242,23 +237,11 @@ PANELS = {
     "judged": draw_judged,
     "residual": draw_residual,
     "violation": draw_violation,
-    "rows": draw_rows,
+    "by_budget": draw_by_budget,
     "depth": draw_depth,
     "stand": draw_stand,
     "tail": draw_tail,
 }
-
-
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
 
 
 def main(path="engine_sweeps.png"):
@@ -308,7 +291,7 @@ def main(path="engine_sweeps.png"):
             for n, t in zip(BUDGETS, found["standing"][warm], strict=True)
         )
         print(f"{'warm' if warm else 'cold'} stacks stand for, of {LONG:.0f} s:  {times}")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -13,9 +13,9 @@ A file named after a panel holds it alone: start.png, matches.png, judged.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import save
 
 import lavender as lv
 
@@ -94,18 +94,6 @@ def draw_judged(axes, found):
 PANELS = {"start": draw_start, "matches": draw_matches, "judged": draw_judged}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="engine_warm_start.png"):
     """Print medians before and after the switch, save the figure."""
     found = numbers()
@@ -133,7 +121,7 @@ def main(path="engine_warm_start.png"):
         f"at the switch the start goes from {begins[0]:.1e} to {begins[1]:.1e} N s, {begins[1] / begins[0]:.0f} times, "
         f"and matches from {matches[0]:.0f} to {matches[1]:.0f}"
     )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -16,9 +16,9 @@ A file named after a panel holds it alone: friction.png, motion.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -65,11 +65,6 @@ def numbers():
     }
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 WAYS = (("no friction", "o:"), ("glued", "s--"), ("bounded", "D-"), ("Coulomb", "x"))
 
 
@@ -107,18 +102,6 @@ def draw_motion(axes, found):
 PANELS = {"friction": draw_friction, "motion": draw_motion}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="friction_bounds.png"):
     """Print the table, save the figure."""
     found = numbers()
@@ -137,7 +120,7 @@ def main(path="friction_bounds.png"):
     )
     gap = max(np.abs(found["rounds"][-1] - found[name]).max() for name in ("osqp", "pgs"))
     print(f"direct, OSQP and projected Gauss-Seidel agree on the bounded QP within {gap:.1e} N s")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -6,18 +6,18 @@ row what the upper one pushed in the sweep before, so that the impulse grows to 
     A = [[1, -1], [-1, 1 + 1/R]],   (L + D)^-1 U has the one eigenvalue R/(1 + R) beside 0
 
 so that n sweeps leave (R/(1 + R))^n of all. In a scene each face has four corners with friction, and sweeps have to
-share the load among them first: what the judge sees rises before it falls. R/(1 + R) is a rate, which is come near to
-after some sweeps, and not what n sweeps leave.
+share the load among them first: what the judge sees rises before it falls, then by little less than R/(1 + R) a sweep
+allows, and slower in the end, when friction is what is left. So the formula is a rate, and not what n sweeps leave.
 
     python examples/heavy_on_light.py [FIGURE.png]
 
-A file named after a panel holds it alone: sweeps.png, rate.png.
+A file named after a panel holds it alone: left.png, rate.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -50,12 +50,7 @@ def numbers():
     return {"one row a face": history(two_rows()), "four corners and friction": history(scene())}
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
-def draw_sweeps(axes, found):
+def draw_left(axes, found):
     """What is left after each sweep."""
     for name, left in found.items():
         axes.semilogy(left, label=name.replace(" and", "\nand"))
@@ -75,19 +70,7 @@ def draw_rate(axes, found):
     beside(axes)
 
 
-PANELS = {"sweeps": draw_sweeps, "rate": draw_rate}
-
-
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
+PANELS = {"left": draw_left, "rate": draw_rate}
 
 
 def main(path="heavy_on_light.png"):
@@ -102,7 +85,7 @@ def main(path="heavy_on_light.png"):
     print(f"at most {most['four corners and friction']:.2f} on the way with four corners and friction")
     late = found["four corners and friction"]
     print(f"its mean factor a sweep from 64 to 256: {(late[256] / late[64]) ** (1.0 / 192.0):.4f}")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

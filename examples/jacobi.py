@@ -21,9 +21,9 @@ A file named after a panel holds it alone: sweeps.png, threads.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -77,11 +77,6 @@ def numbers():
     }
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 def draw_sweeps(axes, found):
     """Residual against sweeps."""
     for i, (name, solution) in enumerate(found["stack"].items()):
@@ -105,18 +100,6 @@ def draw_threads(axes, found):
 PANELS = {"sweeps": draw_sweeps, "threads": draw_threads}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="jacobi.png"):
     """Print the table, save the figure."""
     found = numbers()
@@ -138,7 +121,7 @@ def main(path="jacobi.png"):
         print(
             f"three equal rows, {name}: impulses {' '.join(f'{x + 0.0:.3f}' for x in impulse)}, sum {impulse.sum():.3f}"
         )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -22,9 +22,9 @@ A file named after a panel holds it alone: lighter.png, equal.png, orders.png, s
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 
@@ -126,11 +126,6 @@ def numbers():
     }
 
 
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
-
-
 def against_sweeps(axes):
     """Sweeps from 0 on, even steps from 1 to 64."""
     axes.set_xscale("symlog", linthresh=1.0)
@@ -189,18 +184,6 @@ def draw_starts(axes, found):
 PANELS = {"lighter": draw_lighter, "equal": draw_equal, "orders": draw_orders, "starts": draw_starts}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="order_and_warm_start.png"):
     """Print the numbers, save the figure."""
     found = numbers()
@@ -232,7 +215,7 @@ def main(path="order_and_warm_start.png"):
         f"after {SWEEPS[-1]} sweeps: 10 x too large {last['10 x too large']:.3f} against {last['cold']:.3f} cold, "
         f"in reverse {last['in reverse']:.5f} against {last['warm']:.5f} warm"
     )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

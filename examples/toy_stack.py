@@ -30,9 +30,9 @@ ordinary.png, projected.png, deep.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import beside, save
 
 import lavender as lv
 from lavender.measures import natural_map
@@ -95,11 +95,13 @@ def numbers():
     equations = np.linalg.solve(toy.dense(), toy.b)
     clamped = np.maximum(equations, 0.0)
     exact = lv.solve(toy, "direct", tol=1e-12).impulse
+    resting = lv.solve(problem(0.0), "direct", tol=1e-12)
     late, lowest = clamped_after_each_sweep(toy)
     points = {"A^-1 b": equations, "clamped": clamped, "solution": exact}
     return {
         "problem": toy,
-        "resting": lv.solve(problem(0.0), "direct", tol=1e-12).impulse,
+        "resting": resting.impulse,
+        "resting_slack": resting.slack,
         "as_qp": {name: lv.solve(problem(0.0), name, tol=TOL, max_iter=100_000) for name in SOLVERS},
         "late": late,
         "late_r_p": natural_map(toy, late),
@@ -110,6 +112,7 @@ def numbers():
         "slack": np.array([toy.slack(x) for x in impulse]),  # (SWEEPS + 1, N) m/s
         "r_p": np.array([natural_map(toy, x) for x in impulse]),
         "exact": exact,
+        "exact_slack": toy.slack(exact),
         "clamped": clamped,
         "clamped_slack": toy.slack(clamped),
         "clamped_r_p": natural_map(toy, clamped),
@@ -119,11 +122,6 @@ def numbers():
         "projected": {k: abs(x[OPEN] - max(0.0, x[OPEN] - toy.slack(x)[OPEN])) for k, x in points.items()},
         "deep": deep_box(),  # (STEPS, 2)
     }
-
-
-def beside(axes):
-    """The legend beside the axes, where it covers nothing."""
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
 def bars(axes, found, values):
@@ -183,7 +181,8 @@ def draw_r_p(axes, found):
 def points(axes, found, key):
     """One residual at three points, where contact 5 opens."""
     names = ["$A^{-1}b$, which pulls" if k == "A^-1 b" else k for k in found["points"]]
-    axes.barh(names, list(found[key].values()), 0.5)
+    axes.bar_label(axes.barh(names, list(found[key].values()), 0.5), fmt=" %.4f")  # a bar of 0 is not seen
+    axes.margins(x=0.12)
     axes.invert_yaxis()
 
 
@@ -218,24 +217,13 @@ PANELS = {
 }
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="toy_stack.png"):
     """Print the tables, save the figure."""
     found = numbers()
-    print(f"{'contact':<14}" + "".join(f"{i + 1:>9}" for i in range(N)))
-    for name in ("resting", "exact", "clamped", "clamped_slack"):
-        print(f"{name:<14}" + "".join(f"{x + 0.0:>9.4f}" for x in found[name]))
+    print(f"{'contact':<20}" + "".join(f"{i + 1:>9}" for i in range(N)))
+    for name, what in (("at rest", "resting"), ("hit from below", "exact"), ("clamped once", "clamped")):
+        print(f"{f'{name}, N s':<20}" + "".join(f"{x + 0.0:>9.4f}" for x in found[what]))
+        print(f"{'  slack, m/s':<20}" + "".join(f"{x + 0.0:>9.4f}" for x in found[f"{what}_slack"].round(9)))
     print(f"\nat rest, to {TOL:g}: largest difference from OSQP's optimum of the QP, and largest |slack|")
     optimum = found["as_qp"]["osqp"].impulse
     for name, solution in found["as_qp"].items():
@@ -268,7 +256,7 @@ def main(path="toy_stack.png"):
         f"\na box {1e3 * DEEP:.0f} mm in the ground: relative residual {first[0]:.0e} at {1e3 * first[1]:.1f} mm, "
         f"{last[0]:.0e} at {1e3 * last[1]:.1f} mm after {STEPS} steps"
     )
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -19,9 +19,9 @@ A file named after a panel holds it alone: tracks.png, distance.png.
 """
 
 import sys
-from pathlib import Path
 
 import numpy as np
+from panels import save
 
 import lavender as lv
 
@@ -89,18 +89,6 @@ def draw_distance(axes, found):
 PANELS = {"tracks": draw_tracks, "distance": draw_distance}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    name = Path(str(path)).stem
-    shown = [name] if name in PANELS else list(PANELS)
-    canvas = Figure(figsize=(8, 3.2 * len(shown)), layout="constrained")
-    for axes, panel in zip(canvas.subplots(len(shown), squeeze=False).flat, shown, strict=True):
-        PANELS[panel](axes, found)
-    canvas.savefig(path)
-
-
 def main(path="two_particles.png"):
     """Print impulse, velocities and drift, save the figure."""
     found = numbers()
@@ -110,7 +98,7 @@ def main(path="two_particles.png"):
         print(f"particle {i + 1}: velocity {SPEED[i]} -> {np.round(found['after'][i], 6)} m/s")
     print(f"distance stays within {1e6 * np.abs(found['apart'] - 1.0).max():.1f} µm over {STEPS} steps")
     print(f"momentum changes by {np.abs(found['momentum'] - MASS @ SPEED).max():.1e} kg m/s")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

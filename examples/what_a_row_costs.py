@@ -12,8 +12,9 @@ A file named after a panel holds it alone: step.png, row.png. One of these stack
 """
 
 import sys
-from pathlib import Path
 from time import perf_counter
+
+from panels import save
 
 import lavender as lv
 
@@ -73,17 +74,6 @@ def draw_row(axes, found):
 PANELS = {"step": draw_step, "row": draw_row}
 
 
-def figure(found, path):
-    """Every panel below the other, or alone the one that the file is named after."""
-    from matplotlib.figure import Figure
-
-    shown = [draw] if (draw := PANELS.get(Path(str(path)).stem)) else list(PANELS.values())
-    canvas = Figure(figsize=(8, 3 * len(shown)), layout="constrained")
-    for axes, draw in zip(canvas.subplots(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
-        draw(axes, found)
-    canvas.savefig(path)
-
-
 def main(path="what_a_row_costs.png"):
     """Print the table, save the figure."""
     found = numbers()
@@ -91,7 +81,7 @@ def main(path="what_a_row_costs.png"):
     print(f"{'declared':<26}{'rows':>6}{'ms a step':>12}{'of friction alone':>20}")
     for name, t in times.items():
         print(f"{name:<26}{found[name]['rows']:>6}{1e3 * t:>12.3f}{t / times['friction']:>20.2f}")
-    figure(found, path)
+    save(PANELS, found, path)
     print(f"figure: {path}")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import lavender
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "examples"))  # where they find `panels`
 
 
 @functools.cache

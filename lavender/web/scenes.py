@@ -89,7 +89,10 @@ PAGE: tuple[tuple[str, str, str, str], ...] = (
 
 
 class Number(NamedTuple):
-    """A line below the pictures: medians of one of `SOLVER_FIELDS` over steps first + 1 to last, of A and of B."""
+    """A line above the pictures: of A and of B, medians of one of `SOLVER_FIELDS` over steps first + 1 to last.
+
+    Without any step (0 to 0) of the very first solve, which is one substep.
+    """
 
     text: str
     field: str
@@ -98,94 +101,78 @@ class Number(NamedTuple):
     over: str  # "AB" for the ratio A/B, "BA" for B/A, or "" without
 
 
+class Side(NamedTuple):
+    """What is set on one side."""
+
+    iterations: int
+    warm_start: bool  # WARM or COLD
+    order: str = "given"
+    solver: str = "sweeps"
+
+
+COLD, WARM = False, True
+
+
 class Preset(NamedTuple):
     """A button of the page: two settings of one scene side by side."""
 
     name: str  # in the page's address
     title: str
     scene: str
-    a: dict[str, Any]
-    b: dict[str, Any]
+    sides: tuple[Side, Side]
     note: str  # what to see
     numbers: tuple[Number, ...] = ()
 
 
 _LEFT = "residual after the last sweep [N s]"
+_APPROACH = "approach velocity left [m/s]"
 
 #: The chapter's five, under its numbers (docs/chapter.md), opened by a link.
 EXPERIMENTS = (
     Preset(
-        name="experiment=1",
-        title="1 directly, or by sweeps",
-        scene="stack",
-        a={"iterations": 16, "warm_start": False, "solver": "newton"},
-        b={"iterations": 64, "warm_start": False},
-        note=(
-            "A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each step from "
-            "nothing. In the plots along the sweeps each point of A is a factorisation."
-        ),
-        numbers=(
-            Number(_LEFT, "residual_final", 20, 60, "BA"),
-            Number("approach velocity left [m/s]", "violation_final", 20, 60, "BA"),
-        ),
+        "experiment=1",
+        "1 directly, or by sweeps",
+        "stack",
+        (Side(16, COLD, solver="newton"), Side(64, COLD)),
+        "A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each step from nothing. "
+        "In the plots along the sweeps each point of A is a factorisation.",
+        (Number(_LEFT, "residual_final", 20, 60, "BA"), Number(_APPROACH, "violation_final", 20, 60, "BA")),
     ),
     Preset(
-        name="experiment=2",
-        title="2 inequalities, sweep by sweep",
-        scene="stack",
-        a={"iterations": 8, "warm_start": False, "order": "bottom_up"},
-        b={"iterations": 32, "warm_start": False, "order": "bottom_up"},
-        note=(
-            "Pause and step: the plots show the error after every sweep. Each impulse is clamped in its own row, so "
-            "that the error falls from sweep to sweep; clamping once at the end would not do."
-        ),
-        numbers=(
-            Number("second solve: residual [N s]", "residual_final", 0, 1, "AB"),
-            Number("second solve: approach velocity [m/s]", "violation_final", 0, 1, "AB"),
-        ),
+        "experiment=2",
+        "2 inequalities, sweep by sweep",
+        "stack",
+        (Side(8, COLD, "bottom_up"), Side(32, COLD, "bottom_up")),
+        "Pause and step: the plots show the error after every sweep. Each impulse is clamped in its own row, so that "
+        "the error falls from sweep to sweep; clamping once at the end would not do.",
+        (Number(_LEFT, "residual_final", 0, 0, "AB"), Number(_APPROACH, "violation_final", 0, 0, "AB")),
     ),
     Preset(
-        name="experiment=3",
-        title="3 two orders",
-        scene="stack",
-        a={"iterations": 4, "warm_start": False, "order": "bottom_up"},
-        b={"iterations": 4, "warm_start": False, "order": "top_down"},
-        note=(
-            "The same sweeps, from the ground up and from the top down. By the residual B looks better, by the "
-            "approach velocity A does: compare orders by the error of all rows, E."
-        ),
-        numbers=(
-            Number(_LEFT, "residual_final", 20, 60, "AB"),
-            Number("approach velocity left [m/s]", "violation_final", 20, 60, "AB"),
-        ),
+        "experiment=3",
+        "3 two orders",
+        "stack",
+        (Side(4, COLD, "bottom_up"), Side(4, COLD, "top_down")),
+        "The same sweeps, from the ground up and from the top down. By the residual B looks better, by the approach "
+        "velocity A does: compare orders by the error of all rows, E.",
+        (Number(_LEFT, "residual_final", 20, 60, "AB"), Number(_APPROACH, "violation_final", 20, 60, "AB")),
     ),
     Preset(
-        name="experiment=4",
-        title="4 four sweeps or 64",
-        scene="stack",
-        a={"iterations": 4, "warm_start": False, "order": "bottom_up"},
-        b={"iterations": 64, "warm_start": False, "order": "bottom_up"},
-        note=(
-            "B sweeps sixteen times as often; both from nothing, from the ground up. How much less it leaves depends "
-            "on when you look: A begins to lean."
-        ),
-        numbers=(
-            Number(f"second solve: {_LEFT}", "residual_final", 0, 1, "AB"),
-            Number(_LEFT, "residual_final", 20, 60, "AB"),
-            Number(_LEFT, "residual_final", 180, 240, "AB"),
-        ),
+        "experiment=4",
+        "4 four sweeps or 64",
+        "stack",
+        (Side(4, COLD, "bottom_up"), Side(64, COLD, "bottom_up")),
+        "B sweeps sixteen times as often; both from nothing, from the ground up. How much less it leaves depends on "
+        "when you look: A begins to lean.",
+        tuple(Number(_LEFT, "residual_final", *steps, "AB") for steps in ((0, 0), (20, 60), (180, 240))),
     ),
     Preset(
-        name="experiment=5",
-        title="5 warm or cold",
-        scene="stack",
-        a={"iterations": 4, "warm_start": True, "order": "alternating"},
-        b={"iterations": 4, "warm_start": False, "order": "alternating"},
-        note=(
-            "Four sweeps in both. A finds its contacts in the cache and begins where the last step ended; B begins "
-            "from nothing."
-        ),
-        numbers=(
+        "experiment=5",
+        "5 warm or cold",
+        "stack",
+        (Side(4, WARM, "alternating"), Side(4, COLD, "alternating")),
+        "Four sweeps in both. A finds its contacts in the cache and begins where the last step ended; B begins from "
+        "nothing.",
+        (
             Number("residual before the first sweep [N s]", "residual_initial", 20, 90, "BA"),
             Number("contacts found in the cache", "cache_matches", 20, 90, ""),
         ),
@@ -195,58 +182,46 @@ EXPERIMENTS = (
 #: The first opens the page.
 PRESETS = (
     Preset(
-        name="chain-cold",
-        title="a chain, 16 sweeps: warm against cold",
-        scene="chain",
-        a={"iterations": 16, "warm_start": True},
-        b={"iterations": 16, "warm_start": False},
-        note=(
-            "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links "
-            "part."
-        ),
+        "chain-cold",
+        "a chain, 16 sweeps: warm against cold",
+        "chain",
+        (Side(16, WARM), Side(16, COLD)),
+        "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links part.",
     ),
     Preset(
-        name="4-warm-64-cold",
-        title="4 warm against 64 cold",
-        scene="stack",
-        a={"iterations": 4, "warm_start": True},
-        b={"iterations": 64, "warm_start": False},
-        note="B works sixteen times as hard as A and still creeps: each step starts from nothing.",
+        "4-warm-64-cold",
+        "4 warm against 64 cold",
+        "stack",
+        (Side(4, WARM), Side(64, COLD)),
+        "B works sixteen times as hard as A and still creeps: each step starts from nothing.",
     ),
     Preset(
-        name="bottom-up-top-down",
-        title="bottom-up against top-down, cold",
-        scene="stack",
-        a={"iterations": 16, "warm_start": False, "order": "bottom_up"},
-        b={"iterations": 16, "warm_start": False, "order": "top_down"},
-        note="The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
+        "bottom-up-top-down",
+        "bottom-up against top-down, cold",
+        "stack",
+        (Side(16, COLD, "bottom_up"), Side(16, COLD, "top_down")),
+        "The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
     ),
     Preset(
-        name="heavy-on-light",
-        title="heavy on light",
-        scene="heavy_on_light",
-        a={"iterations": 16, "warm_start": True},
-        b={"iterations": 16, "warm_start": False},
-        note="The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
+        "heavy-on-light",
+        "heavy on light",
+        "heavy_on_light",
+        (Side(16, WARM), Side(16, COLD)),
+        "The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
     ),
     Preset(
-        name="newton-against-sweeps",
-        title="newton against sweeps, cold",
-        scene="heavy_on_light",
-        a={"iterations": 16, "warm_start": False, "solver": "newton"},
-        b={"iterations": 64, "warm_start": False},
-        note=(
-            "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box "
-            "slips."
-        ),
+        "newton-against-sweeps",
+        "newton against sweeps, cold",
+        "heavy_on_light",
+        (Side(16, COLD, solver="newton"), Side(64, COLD)),
+        "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box slips.",
     ),
     Preset(
-        name="cards",
-        title="a house of cards",
-        scene="card_house",
-        a={"iterations": 16, "warm_start": True},
-        b={"iterations": 16, "warm_start": False},
-        note="A stands. B slides by what its sweeps leave over, and falls after some seconds.",
+        "cards",
+        "a house of cards",
+        "card_house",
+        (Side(16, WARM), Side(16, COLD)),
+        "A stands. B slides by what its sweeps leave over, and falls after some seconds.",
     ),
 )
 
@@ -318,22 +293,18 @@ def page_scenes() -> dict[str, Any]:
         )
     presets = [
         {
-            "name": name,
-            "title": title,
-            "scene": scene_name,
+            **preset._asdict(),
             "sides": [
                 {
-                    "iterations": side["iterations"],
-                    "warm_start": int(side["warm_start"]),
-                    "order": ORDER_NUMBER[side.get("order", "given")],
-                    "solver": side.get("solver", "sweeps"),
-                    "box": int(side.get("friction_shape") == "box"),
+                    **side._asdict(),
+                    "warm_start": int(side.warm_start),
+                    "order": ORDER_NUMBER[side.order],
+                    "box": 0,
                 }
-                for side in (one, two)
+                for side in preset.sides
             ],
-            "note": note,
-            "numbers": [number._asdict() for number in numbers],
+            "numbers": [number._asdict() for number in preset.numbers],
         }
-        for name, title, scene_name, one, two, note, numbers in (*PRESETS, *EXPERIMENTS)
+        for preset in (*PRESETS, *EXPERIMENTS)
     ]
     return {"layout": layout(), "scenes": scenes, "presets": presets}

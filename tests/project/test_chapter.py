@@ -20,7 +20,9 @@ from click.testing import CliRunner
 from worked import example
 
 import benchmarks.__main__ as benchmarks
+from benchmarks import original
 from lavender.cli import cli
+from lavender.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGE = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
@@ -115,6 +117,8 @@ def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
 def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
     shown = re.findall(r"generated/figures/(\w+)/(\w+)\.svg", PAGE)
     assert len(shown) > 12
+    # no file of one example is overwritten by another's
+    assert len({panel for _, panel in shown}) == len(shown)
     for name, panel in shown:
         assert panel in example(name).PANELS
         assert f"`python examples/{name}.py {panel}.png`" in PAGE
@@ -158,3 +162,14 @@ def test_a_redundant_loop_locks_where_sweeps_let_it_swing():
 def test_the_comparison_sees_a_wrong_number(number, shown):
     with pytest.raises(AssertionError, match="is printed"):
         check([number], "", "at most {} N s", f"first line\nat  most {shown} N s")
+
+
+def test_the_residual_is_added_to_the_source_of_that_release_alone():
+    release = "\n".join(text for text, _ in original.ADDED)
+    found = original.instrumented(release)
+    assert all(name in found for name in ("error_before = largest", "error_after = largest", "asked_turn &&"))
+    assert all(text in found for text, instead in original.ADDED if "{}" in instead)
+    with pytest.raises(InputError, match=r"not physics.cpp of lavendersim 0.2.0"):
+        original.instrumented(release.replace("gContacts[c],dt", "gContacts[i],dt"))
+    asked = re.search(r"```sh\npip download .*\npython -m benchmarks (original) ", PAGE)
+    assert asked and asked[1] in benchmarks.NAMES

@@ -337,19 +337,21 @@ def test_a_lost_state_is_named(visit):
 
 def test_it_opens_moving_with_two_settings_that_make_the_point(visit):
     v = visit("")
-    _, title, scene, one, two, note, _ = PRESETS[0]
+    _, title, scene, (one, two), note, _ = PRESETS[0]
     assert v.page.locator("#scene").input_value() == scene
     assert v.page.locator("#note").text_content() == note
     assert v.page.locator("#play").get_attribute("aria-pressed") == "true"
     assert v.page.locator("#presets button[aria-pressed=true]").text_content() == title
-    assert v.side(0).locator(".warm input").is_checked() == one["warm_start"]
-    assert v.side(1).locator(".warm input").is_checked() == two["warm_start"]
+    assert v.side(0).locator(".warm input").is_checked() == one.warm_start
+    assert v.side(1).locator(".warm input").is_checked() == two.warm_start
     v.page.wait_for_function("lavender.steps > 3")
     v.page.keyboard.press(" ")
     v.page.click("#reset")  # a slow machine is at any step by now
     v.js("lavender.advance(300)")
     gaps = v.js("lavender.sides.map((side) => side.gap())")
-    assert gaps == [pytest.approx(native_gap(scene, 300, **s), rel=1e-9) for s in (one, two)]
+    assert gaps == [
+        pytest.approx(native_gap(scene, 300, s.iterations, s.warm_start), rel=1e-9) for s in (one, two)
+    ]
     assert gaps[1] > 5.0 * gaps[0]  # the sentence says that links part
     caption = v.page.locator("#caption").text_content()
     assert caption == "A's joints are open by {}, B's by {}".format(*(said(v, x) for x in gaps))
@@ -398,7 +400,7 @@ def test_reduced_motion_opens_at_rest(visit):
 
 @pytest.mark.parametrize("preset", [*PRESETS, *EXPERIMENTS], ids=lambda preset: preset[0])
 def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
-    _, title, scene, *sides, note, _ = preset
+    _, title, scene, sides, note, _ = preset
     v = visit()
     v.page.get_by_role("button", name=title, exact=True).click()
     v.page.keyboard.press("Escape")
@@ -410,23 +412,23 @@ def test_presets_set_everything_and_are_part_of_the_address(visit, preset):
     v.js("lavender.advance(30)")
     leans = v.js("lavender.sides.map((side) => side.lean())")
     for i, side in enumerate(sides):
-        values, lean = run(scene, 30, **side)
+        values, lean = run(scene, 30, **side._asdict())
         assert v.values(i)[0] == values
         assert leans[i] == pytest.approx(lean, abs=1e-12)
 
 
 def medians(number, side):
     """Of the native engine, the median that a line of an experiment shows."""
-    settings = dict(side)
-    if settings.pop("solver", "sweeps") == "newton":
-        del settings["iterations"]
+    settings = {"warm_start": side.warm_start, "order": side.order}
+    if side.solver == "newton":
         steps_of = NewtonSteps("stack", **settings)
         values = [steps_of.step() for _ in range(number.last)]
     else:
-        settings.setdefault("order", "given")
-        simulation = lv.Simulation(
-            lv.Scene("stack", solver_iterations=settings.pop("iterations"), **settings)
-        )
+        settings["solver_iterations"] = side.iterations
+        if number.last == 0:
+            one_solve = lv.Simulation(lv.Scene("stack", dt=1 / 240, substeps=1, **settings))
+            return one_solve.step()[0]["solver"][SOLVER_FIELDS.index(number.field)]
+        simulation = lv.Simulation(lv.Scene("stack", **settings))
         values = [simulation.step()[0]["solver"] for _ in range(number.last)]
     return np.median(np.array(values)[number.first :, SOLVER_FIELDS.index(number.field)])
 
@@ -447,7 +449,7 @@ def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, ph
     lines = v.page.locator("#numbers tbody tr").all()
     assert len(lines) == len(preset.numbers) > 0
     for line, number, seen in zip(lines, preset.numbers, v.js("lavender.seen"), strict=True):
-        a, b = (medians(number, side) for side in (preset.a, preset.b))
+        a, b = (medians(number, side) for side in preset.sides)
         assert [seen["a"], seen["b"]] == [a, b]
         assert number.text in line.text_content()
         if number.over:
@@ -455,6 +457,8 @@ def test_an_experiment_opens_by_its_link_and_tells_its_numbers(visit, preset, ph
             shown = float(line.text_content().rsplit("= ")[1])
             assert shown == pytest.approx(ratio, rel=6e-3 if ratio < 1000 else 0.5)  # three digits, or one
     assert v.js("document.documentElement.scrollWidth <= innerWidth")
+    pressed = v.page.locator("#experiments button[aria-pressed=true]").bounding_box()
+    assert 0 <= pressed["x"] < pressed["x"] + pressed["width"] <= v.js("innerWidth")
 
 
 def test_numbers_of_an_experiment_are_of_an_undisturbed_run(visit):

@@ -178,6 +178,10 @@ class App {
     }
     if (this.now !== now) {
       this.now = now;
+      const pressed = document.querySelector("[data-preset][aria-pressed=true]");
+      if (pressed) { // where the row of buttons is wider than the window
+        pressed.parentElement.scrollLeft = pressed.offsetLeft - pressed.parentElement.offsetLeft;
+      }
       this.forgetNumbers();
     }
   }
@@ -190,7 +194,7 @@ class App {
     find("numbers").tBodies[0].replaceChildren(...numbers.map(({ text, first, last }) => {
       const row = document.createElement("tr");
       row.append(Object.assign(document.createElement("th"), { textContent: text }));
-      const steps = last - first > 1 ? `${first + 1} to ${last}` : String(last);
+      const steps = last ? `${first + 1} to ${last}` : "first solve";
       row.append(...[steps, "–", "–", "–"].map((words) => Object.assign(document.createElement("td"), { textContent: words })));
       return row;
     }));

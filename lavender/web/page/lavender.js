@@ -116,6 +116,7 @@ export class Simulation {
     this.short = 0; // substeps that Newton's method left short of TOL
     this.solved = 0; // all that it solved
     this.steps = 0;
+    this.first = null; // the eight values of the very first solve
     this.lost = -1;
     this.#allocate(scene.size);
     for (const [name, values] of Object.entries(scene.arrays)) {
@@ -245,6 +246,7 @@ export class Simulation {
       this.solved += 1;
       this.short += told.met ? 0 : 1;
       status = this.k.functions.lav_engine_finish(...this.buffers);
+      this.first ??= this.values;
     }
     return { ...told, finite: this.#finished(status) };
   }
@@ -256,12 +258,16 @@ export class Simulation {
     }
     let left = this.substeps;
     for (;;) {
-      const status = this.k.functions.lav_engine_substeps(...this.buffers, left, this.done);
+      const status = this.k.functions.lav_engine_substeps(...this.buffers, this.first ? left : 1, this.done);
       left -= this.k.i32(this.done, 1)[0];
-      if (status !== NEED_ROOM) {
+      if (status === NEED_ROOM) {
+        this.#grow();
+        continue;
+      }
+      this.first ??= this.values;
+      if (status !== OK || left === 0) {
         return this.#finished(status);
       }
-      this.#grow();
     }
   }
 
@@ -284,6 +290,7 @@ export class Simulation {
       }
       this.k.functions.lav_engine_solve_watched(...this.buffers, this.curve, this.scratch);
       status = this.k.functions.lav_engine_finish(...this.buffers);
+      this.first ??= this.values;
     }
     const numbers = this.k.f64(this.curve, 2 * n);
     const normal = [];
@@ -308,6 +315,7 @@ export class Simulation {
     return {
       size: this.sizes,
       steps: this.steps,
+      first: this.first,
       lost: this.lost,
       newton: this.newton,
       stepper: this.stepper,
@@ -326,6 +334,7 @@ export class Simulation {
     this.k.i32(this.index, this.lengths[1]).set(snapshot.index);
     this.k.u64(this.keys, this.lengths[2]).set(snapshot.keys);
     this.steps = snapshot.steps;
+    this.first = snapshot.first;
     this.lost = snapshot.lost;
     this.newton = snapshot.newton;
     this.stepper = snapshot.stepper;

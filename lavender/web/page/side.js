@@ -202,13 +202,17 @@ export class Side {
     this.view.draw(this.simulation, this.app.colors);
   }
 
-  // Median of one of the eight values over the steps first + 1 to last; null before, or where the run was touched.
+  // Median of one of the eight values over the steps first + 1 to last, or the first solve's where last is 0; null
+  // before, or where the run was touched.
   median(field, first, last) {
     const { time, values, plain } = this.history;
     if (!plain || values.length < last || values.length !== Math.round(time[time.length - 1] / this.app.scene.dt)) {
       return null;
     }
     const at = SOLVER_FIELDS.indexOf(field);
+    if (last === 0) {
+      return this.simulation.first?.[at] ?? null;
+    }
     const found = values.slice(first, last).map((row) => row[at]).sort((x, y) => x - y);
     const half = found.length >> 1;
     return found.length % 2 ? found[half] : (found[half - 1] + found[half]) / 2;
