@@ -5,7 +5,7 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
+Solving    `solve`, `solve_many`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
@@ -40,7 +40,7 @@ from lavender.errors import (
     UnknownName,
 )
 from lavender.generalized import Generalized
-from lavender.problem import Problem
+from lavender.problem import Problem, QPSolution
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import TABLES, SolverSpec, available, get, known, load_table, register
 from lavender.residuals import Residual, residual
@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.plan import Plan, explain
+    from lavender.quadratic import solve_qp
     from lavender.scene import Scene
     from lavender.suspicions import Suspicion, diagnose
 
@@ -84,6 +85,7 @@ _LATER = {
     "report": "lavender.report",
     "scene": "lavender.scene",
     "solve_many": "lavender.many",
+    "solve_qp": "lavender.quadratic",
     "suite": "lavender.suite",
 }
 
@@ -108,6 +110,7 @@ __all__ = [
     "Motions",
     "Plan",
     "Problem",
+    "QPSolution",
     "Redundancy",
     "Residual",
     "Rows",
@@ -145,6 +148,7 @@ __all__ = [
     "scene",
     "solve",
     "solve_many",
+    "solve_qp",
     "suite",
 ]
 

@@ -1,0 +1,93 @@
+"""`solve_qp`: quadratic programs through `solve`, and the proximal point method where P is singular.
+
+    x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
+
+Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
+program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+from lavender._arrays import number
+from lavender.errors import InputError
+from lavender.problem import Problem, QPSolution
+from lavender.solution import Status
+from lavender.solve import seconds_of, solve
+
+__all__ = ["solve_qp"]
+
+STEPS = 50  # proximal steps; x moves by up to a thousand times its size in each, or the error falls
+INNER = 1e-3  # tol of a proximal step over that of the program
+TIGHTEST = 1e-13
+UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
+
+
+def solve_qp(
+    problem: Problem,
+    solver: str = "auto",
+    *,
+    tol: float = 1e-9,
+    time_limit: float | None = None,
+    **options: Any,
+) -> QPSolution:
+    """Solve a quadratic program made by `Problem.from_qp`.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        As in `lavender.solve`.
+    tol : float
+        Relative error to reach: of the constraint problem, and where P is singular `QPSolution.error` of the program.
+    time_limit : float, optional, s
+    **options
+        Of the solver.
+
+    Returns
+    -------
+    QPSolution
+        x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
+        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it. An unbounded program has a
+        `ray`.
+
+    Raises
+    ------
+    InputError
+        A problem that was made otherwise.
+
+    Examples
+    --------
+    A linear program, P = 0:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
+    >>> lv.solve_qp(problem).x.round(9).tolist()
+    [0.0, 1.0]
+    """
+    qp = getattr(problem, "qp", None)
+    if qp is None:
+        raise InputError("problem is not a quadratic program: make it with Problem.from_qp")
+    tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
+    inner = tol if qp.proximal is None else max(INNER * tol, TIGHTEST)
+    solution = solve(problem, solver, tol=inner, time_limit=time_limit, **options)
+    answer = qp.solution(solution)
+    for _ in range(STEPS if qp.proximal is not None else 0):
+        if solution.status in (Status.INFEASIBLE, Status.INTERRUPTED) or answer.error <= tol:
+            break
+        left = end - perf_counter()
+        if left <= 0.0:
+            break
+        general, last = qp.around(answer.x), answer
+        problem = replace(problem, generalized=general, b=general.bias(qp.target), copy=False)
+        limit = None if time_limit is None else left
+        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
+        answer = replace(qp, generalized=general).solution(solution)
+        ray = qp.ray(answer.x - last.x, UNBOUNDED)
+        if ray is not None:
+            return replace(answer, ray=ray)
+    return answer
