@@ -234,10 +234,15 @@ class Generalized:
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """M v (nv,) [kg m/s] of velocities v (nv,)."""
-        indptr, indices, data = self.operator.mass
-        lower = sp.csr_array((data, indices, indptr), shape=(self.nv, self.nv))
-        own = v if self.order is None else v[self.order]
-        return self._given(lower @ own + lower.T @ own - data[indptr[1:] - 1] * own)
+        out = np.empty(self.nv)
+        self.operator.momentum(v if self.order is None else v[self.order], out)
+        return self._given(out)
+
+    def force(self, impulse: FloatArray) -> FloatArray:
+        """J^T impulse (nv,) [N s] of impulses (m,)."""
+        out = np.empty(self.nv)
+        self.operator.force(impulse, out)
+        return self._given(out)
 
     def solve(self, x: Any) -> FloatArray:
         """M^-1 x (nv,)."""

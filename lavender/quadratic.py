@@ -12,6 +12,8 @@ from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from lavender._arrays import number
 from lavender.errors import InputError
 from lavender.problem import Problem, QPSolution
@@ -20,9 +22,14 @@ from lavender.solve import seconds_of, solve
 
 __all__ = ["solve_qp"]
 
-STEPS = 50  # proximal steps; x moves by up to a thousand times its size in each, or the error falls
-INNER = 1e-3  # tol of a proximal step over that of the program
-TIGHTEST = 1e-13
+STEPS = 50  # proximal steps
+SLOW = 0.1  # where a step leaves more than this of the error, the next has
+SOFTER = 0.1  # this share of D, as long as
+FARTHEST = 1e4  # v* is no further than this, over |x|: rounding of v* is an error of x
+TIGHTEST = 1e-13  # tol of a step
+TINY = 1e-300
+NEAR = 10.0  # |v*| over |x| up to which a residual relative to v* is one relative to x
+ENDS = (Status.INFEASIBLE, Status.INTERRUPTED, Status.TIME_LIMIT)
 UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
 
 
@@ -73,21 +80,36 @@ def solve_qp(
     if qp is None:
         raise InputError("problem is not a quadratic program: make it with Problem.from_qp")
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
-    inner = tol if qp.proximal is None else max(INNER * tol, TIGHTEST)
-    solution = solve(problem, solver, tol=inner, time_limit=time_limit, **options)
-    answer = qp.solution(solution)
-    for _ in range(STEPS if qp.proximal is not None else 0):
-        if solution.status in (Status.INFEASIBLE, Status.INTERRUPTED) or answer.error <= tol:
-            break
-        left = end - perf_counter()
-        if left <= 0.0:
-            break
-        general, last = qp.around(answer.x), answer
-        problem = replace(problem, generalized=general, b=general.bias(qp.target), copy=False)
-        limit = None if time_limit is None else left
-        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
-        answer = replace(qp, generalized=general).solution(solution)
-        ray = qp.ray(answer.x - last.x, UNBOUNDED)
+    solution = solve(problem, solver, tol=tol, time_limit=time_limit, **options)
+    answer = best = qp.solution(solution)
+    centre, tightest, before = None, tol, np.inf
+    if qp.proximal is None and _distance(answer) <= NEAR:
+        return answer
+    for _ in range(STEPS):
+        ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
         if ray is not None:
             return replace(answer, ray=ray)
-    return answer
+        left = end - perf_counter()
+        if solution.status in ENDS or answer.error <= tol or left <= 0.0:
+            break
+        if qp.proximal is not None:
+            slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
+            qp = qp.around(centre, SOFTER if slow and _distance(answer) <= FARTHEST else 1.0)
+            general = qp.generalized
+            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
+        # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
+        far = max(1.0, _distance(answer))
+        inner = max(tol / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
+        if qp.proximal is None and inner >= tightest:
+            break
+        tightest, limit = inner, None if time_limit is None else left
+        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
+        answer = qp.solution(solution)
+        best = min(best, answer, key=lambda one: one.error)
+    return best
+
+
+def _distance(answer: QPSolution) -> float:
+    """|v*| over |x|."""
+    x, free = answer.x, answer.qp.generalized.v_free
+    return float(np.abs(free).max(initial=0.0) / max(np.abs(x).max(initial=0.0), TINY))

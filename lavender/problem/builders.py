@@ -357,7 +357,7 @@ class Builders(Operators):
         Parameters
         ----------
         P : (n, n) array or sparse, or a `qpsolvers.Problem`, which is given alone
-            Symmetric, both triangles, positive semidefinite. Where it is singular a diagonal D is added, 1e-8 of the
+            Symmetric, both triangles, positive semidefinite. Where it is singular a diagonal D is added, 1e-9 of the
             diagonal of P, and the problem is one step of the proximal point method; `lavender.solve_qp` repeats it.
         q : (n,)
         G, h : (mi, n) array or sparse, and (mi,), optional

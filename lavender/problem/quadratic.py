@@ -19,7 +19,7 @@ whose diagonal is zero are zero, as they must be, D stands on these alone; if P 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -28,19 +28,22 @@ import numpy.typing as npt
 from lavender._arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
 from lavender._derived import cached_property
 from lavender._later import issparse
+from lavender._later import sparse as sp
 from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, stacked
+from lavender_ext.judge.measure import all_finite
 
 IntpArray = npt.NDArray[np.intp]
 
 __all__ = ["QPSolution", "QuadraticProgram"]
 
-PROXIMAL = 1e-8  # D over P_ii, or over the largest of them where P_ii = 0
+PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
 FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
+FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
@@ -77,11 +80,11 @@ class QPSolution:
 
     @cached_property
     def _parts(self) -> tuple[FloatArray, ...]:
-        qp, jac = self.qp, self.qp.generalized.jac
-        px = qp.generalized.momentum_of(self.x)
+        qp, of = self.qp, self.qp.generalized
+        px = of.momentum_of(self.x)
         if qp.proximal is not None:
             px = px - qp.proximal * self.x
-        return px, jac @ self.x, jac.T @ self.impulse
+        return px, of.velocity_of(self.x), of.force(self.impulse)
 
     @property
     def objective(self) -> float:
@@ -106,18 +109,18 @@ class QPSolution:
         """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
         return float(abs(self.x @ (self._parts[0] + self.qp.q) - self.qp.target @ self.impulse))
 
-    @property
+    @cached_property
     def error(self) -> float:
         """The largest of the three, each relative to what it is the sum of; 0 is a solution.
 
         The primal residual over the largest of |J x| and |target|; the dual one over the largest of |q|, |P x|,
-        |J^T lambda| and max |P_ij| max |x_i|; the gap over these two times the sums of |lambda| and |x|.
+        |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the sums of |lambda| and |x|.
         """
         px, jx, force = self._parts
         q, target = self.qp.q, self.qp.target
         rows = max(np.abs(target).max(initial=0.0), np.abs(jx).max(initial=0.0))
         heaviest = np.abs(self.qp.generalized.operator.mass[2]).max(initial=0.0)
-        curved = heaviest * np.abs(self.x).max(initial=0.0)
+        curved = FLAT * heaviest * np.abs(self.x).max(initial=0.0)
         forces = max(curved, *(np.abs(part).max(initial=0.0) for part in (px, q, force)))
         energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
         wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
@@ -171,12 +174,14 @@ class QuadraticProgram:
         low[: self.free] = -np.inf
         return Cones.bounded(low, np.full(len(low), np.inf))
 
-    def around(self, centre: FloatArray) -> Generalized:
-        """J and M with the v* of a proximal step from a centre (n,)."""
+    def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
+        """The proximal step from a centre (n,), with this share of D."""
         assert self.proximal is not None
-        return self.generalized.with_jacobian(
-            v_free=self.generalized.solve(self.proximal * centre - self.q)
-        )
+        of, d = self.generalized, share * self.proximal
+        if share != 1.0:
+            of = Generalized(of.jac, of.mass - sp.diags_array(self.proximal - d), of.v_free)
+        general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
+        return replace(self, generalized=general, proximal=d)
 
     def multipliers(
         self, impulse: FloatArray
@@ -215,15 +220,14 @@ class QuadraticProgram:
     def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
         """This direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
         size = np.abs(direction).max(initial=0.0)
-        if self.proximal is None or not 0.0 < size < np.inf:
+        if self.proximal is None or not 0.0 < size < np.inf or not self.q @ direction < 0.0:
             return None
         d = direction / size
-        jac, mass = self.generalized.jac, self.generalized
-        curved, along = np.abs(mass.momentum_of(d) - self.proximal * d).max(), jac @ d
+        of, rows = self.generalized, np.abs(self.generalized.operator.jac[2]).max(initial=0.0)
+        curved, along = np.abs(of.momentum_of(d) - self.proximal * d).max(), of.velocity_of(d)
         short = max(np.abs(along[: self.free]).max(initial=0.0), -along[self.free :].min(initial=0.0))
         steep, largest = -float(self.q @ d), np.abs(self.q).max()
-        heavy = float(np.abs(mass.operator.mass[2]).max(initial=0.0))
-        rows = float(np.abs(jac.data).max(initial=0.0))
+        heavy = np.abs(of.operator.mass[2]).max(initial=0.0)
         falls = curved <= tol * heavy and short <= tol * rows and steep > tol * largest
         return read_only(d) if falls else None
 
@@ -251,7 +255,8 @@ def quadratic(given: Given) -> QuadraticProgram:
     if low is not None and up is not None:
         rows.bounds(low, lb, 1.0)
         rows.bounds(up, ub, -1.0)
-    jac, target = stacked(n, rows.parts), read_only(np.concatenate([np.zeros(0), *rows.targets]))
+    jac = stacked(n, rows.parts)
+    target = read_only(rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets]))
     generalized, proximal = _definite(lower, jac, q, target)
     return QuadraticProgram(generalized, q, target, free, n_a, n_g, kept, fixed, low, up, proximal)
 
@@ -262,11 +267,11 @@ def quadratic(given: Given) -> QuadraticProgram:
 def unpacked(given: Given) -> Given:
     """The eight arrays; the first may be a `qpsolvers.Problem`, or another object with these eight attributes."""
     P = given[0]
+    if given[1] is not None and not hasattr(P, "ub"):
+        return given
     names = ("P", "q", "G", "h", "A", "b", "lb", "ub")
     if not all(hasattr(P, name) for name in names):
-        if given[1] is None:
-            raise InputError(f"P is a {type(P).__name__}; P and q are needed, or a qpsolvers.Problem alone")
-        return given
+        raise InputError(f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone")
     if any(x is not None for x in given[1:]):
         raise InputError("a qpsolvers.Problem holds all arrays: give it alone")
     return tuple(getattr(P, name) for name in names)  # type: ignore[return-value]
@@ -320,11 +325,11 @@ class _Rows:
             self.put(rows, as_array(side, vector, (m,)), 1.0)
             return m, None
         right, kept = as_array(side, vector, (m,), finite=False), None
-        check_not_nan(side, right)
-        if np.isinf(right).any():
+        if not all_finite(right):
+            check_not_nan(side, right)
             kept = np.flatnonzero(right < np.inf)
             rows, right = _picked(rows, kept), right[kept]
-            if np.isinf(right).any():
+            if not all_finite(right):
                 raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")
         self.put(rows, right, -1.0)
         return m, kept
@@ -352,11 +357,10 @@ def _definite(
 ) -> tuple[Generalized, FloatArray | None]:
     """J, M = P + D and D, None where P is positive definite."""
     momentum = -q
+    plain = _shifted(lower, jac, None, momentum)
+    if plain is not None and plain.operator.least_pivot > SINGULAR:
+        return plain, None
     diagonal = lower[2][lower[0][1:] - 1]
-    if diagonal.min(initial=1.0) > 0.0:
-        plain = _shifted(lower, jac, None, momentum)
-        if plain is not None and plain.operator.least_pivot > SINGULAR:
-            return plain, None
     zero = diagonal == 0.0
     unit = np.where(zero, diagonal.max(initial=0.0) or 1.0, diagonal)
     d = np.where(zero, PROXIMAL * unit, 0.0)

@@ -152,6 +152,24 @@ cdef class Operator:
             jac_push(&self.g, &lam[0], &x[0])
             tree_solve(&self.g, &x[0])
 
+    def force(self, const double[::1] lam, double[::1] x):
+        """x = J^T lam (n,)."""
+        x[:] = 0.0
+        if self.g.n and self.g.m:
+            jac_push(&self.g, &lam[0], &x[0])
+
+    def momentum(self, const double[::1] v, double[::1] x):
+        """x = M v (n,)."""
+        cdef const int32_t[::1] mptr = self.mass[0], midx = self.mass[1]
+        cdef const double[::1] mval = self.mass[2]
+        cdef int32_t i, p
+        for i in range(self.g.n):
+            p = mptr[i + 1] - 1
+            x[i] = mval[p] * v[i]
+            for p in range(mptr[i], p):
+                x[i] += mval[p] * v[midx[p]]
+                x[midx[p]] += mval[p] * v[i]
+
     def times(self, const double[::1] x, double[::1] out):
         """out = J x (m,)."""
         cdef int32_t i
