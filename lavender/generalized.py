@@ -111,7 +111,9 @@ class Generalized:
         if jac is None:  # the same J, M and factor
             made = object.__new__(Generalized)
             free = self.v_free if v_free is None else v_free
-            made.__dict__.update(self.__dict__, v_free=as_array("v_free", free, (self.nv,), unit="m/s, rad/s"))
+            made.__dict__.update(
+                self.__dict__, v_free=as_array("v_free", free, (self.nv,), unit="m/s, rad/s")
+            )
             return made
         if self.order is not None:
             return Generalized(jac, self.mass, self.v_free if v_free is None else v_free, self.names)
@@ -328,7 +330,7 @@ def lower_of(
         kernels.lower_of_rows(*compressed(name, given)) if sparse else kernels.lower_of_dense(given)
     )
     if worst > allowed:
-        entries = given.tocsr() if sparse else given
+        entries: Any = sp.csr_array(given) if sparse else given
         where = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
         raise InputError(
             f"{name} is not symmetric: at {where} it is {entries[i, j]:.6g} above and {entries[j, i]:.6g} below the "

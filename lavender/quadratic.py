@@ -73,7 +73,7 @@ def solve_qp(
     >>> import numpy as np
     >>> import lavender as lv
     >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
-    >>> lv.solve_qp(problem).x.round(9).tolist()
+    >>> (lv.solve_qp(problem).x.round(9) + 0.0).tolist()
     [0.0, 1.0]
     """
     qp = getattr(problem, "qp", None)

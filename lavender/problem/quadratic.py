@@ -9,7 +9,7 @@ is the constraint problem of the generalised velocities x with
 f: variables with lb = ub, whose rows are free like those of A; l, u: other finite bounds; of G the rows with finite h.
 All other impulses are >= 0. As M (x - v*) = J^T lambda,
 
-    P x + q + A^T y + G^T z + z_box = 0   with   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
+    P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
 P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
 centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
@@ -124,7 +124,7 @@ class QPSolution:
         forces = max(curved, *(np.abs(part).max(initial=0.0) for part in (px, q, force)))
         energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
         wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
-        return max(found / size if size > 0.0 else found for found, size in wrong)
+        return float(max(found / size if size > 0.0 else found for found, size in wrong))
 
     @property
     def found(self) -> bool:
@@ -218,7 +218,7 @@ class QuadraticProgram:
         return QPSolution(x, *self.multipliers(impulse), found, ray, impulse, self)
 
     def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
-        """This direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
+        """A direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
         size = np.abs(direction).max(initial=0.0)
         if self.proximal is None or not 0.0 < size < np.inf or not self.q @ direction < 0.0:
             return None
@@ -256,7 +256,9 @@ def quadratic(given: Given) -> QuadraticProgram:
         rows.bounds(low, lb, 1.0)
         rows.bounds(up, ub, -1.0)
     jac = stacked(n, rows.parts)
-    target = read_only(rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets]))
+    target = read_only(
+        rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets])
+    )
     generalized, proximal = _definite(lower, jac, q, target)
     return QuadraticProgram(generalized, q, target, free, n_a, n_g, kept, fixed, low, up, proximal)
 
@@ -271,10 +273,12 @@ def unpacked(given: Given) -> Given:
         return given
     names = ("P", "q", "G", "h", "A", "b", "lb", "ub")
     if not all(hasattr(P, name) for name in names):
-        raise InputError(f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone")
+        raise InputError(
+            f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone"
+        )
     if any(x is not None for x in given[1:]):
         raise InputError("a qpsolvers.Problem holds all arrays: give it alone")
-    return tuple(getattr(P, name) for name in names)  # type: ignore[return-value]
+    return tuple(getattr(P, name) for name in names)
 
 
 def _matrix(name: str, given: Any, n: int) -> Compressed:
@@ -346,7 +350,9 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
     bad = np.flatnonzero(~((lb <= ub) & (lb < np.inf) & (ub > -np.inf)))
     if len(bad):
         i = bad[0]
-        raise InputError(f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb <= ub is needed, and a number between them")
+        raise InputError(
+            f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb <= ub is needed, and a number between them"
+        )
 
 
 # -- P that is singular -------------------------------------------------------------------------------

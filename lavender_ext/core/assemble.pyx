@@ -294,7 +294,7 @@ def stacked(int32_t n, parts):
     indptr = np.zeros(m + 2, np.int32)                  # one before, so that filling moves each pointer to its row's end
     cdef int32_t[::1] start = indptr
     first = 0
-    for ptr_, idx_, val_, columns, sign, rows in parts:
+    for ptr_, idx_, val_, columns, _, rows in parts:
         ptr, idx, val = ptr_, idx_, val_
         if ptr.shape[0] != (n if columns else rows) + 1 or ptr[0] != 0 or ptr[ptr.shape[0] - 1] > idx.shape[0] \
                 or idx.shape[0] != val.shape[0]:
