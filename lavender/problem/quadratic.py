@@ -215,7 +215,8 @@ class QuadraticProgram:
         impulse = as_array("impulse", solution, (len(self.target),)) if given is None else given
         x = self.generalized.v_free + self.generalized.change(impulse)
         found = None if given is None else solution
-        return QPSolution(x, *self.multipliers(impulse), found, ray, impulse, self)
+        y, z, box = self.multipliers(impulse)
+        return QPSolution(x=x, y=y, z=z, z_box=box, solution=found, ray=ray, impulse=impulse, qp=self)
 
     def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
         """A direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
@@ -260,7 +261,10 @@ def quadratic(given: Given) -> QuadraticProgram:
         rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets])
     )
     generalized, proximal = _definite(lower, jac, q, target)
-    return QuadraticProgram(generalized, q, target, free, n_a, n_g, kept, fixed, low, up, proximal)
+    return QuadraticProgram(
+        generalized=generalized, q=q, target=target, free=free, n_equalities=n_a, n_inequalities=n_g, kept=kept,
+        fixed=fixed, lower=low, upper=up, proximal=proximal,
+    )  # fmt: skip
 
 
 # -- what is given ------------------------------------------------------------------------------------
