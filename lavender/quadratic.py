@@ -112,4 +112,4 @@ def solve_qp(
 def _distance(answer: QPSolution) -> float:
     """|v*| over |x|."""
     x, free = answer.x, answer.qp.generalized.v_free
-    return float(np.abs(free).max(initial=0.0) / max(np.abs(x).max(initial=0.0), TINY))
+    return float(np.sqrt(free @ free) / max(np.sqrt(x @ x), TINY))

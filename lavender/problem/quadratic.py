@@ -172,7 +172,7 @@ class QuadraticProgram:
         """Free rows, then impulses >= 0."""
         low = np.zeros(len(self.target))
         low[: self.free] = -np.inf
-        return Cones.bounded(low, np.full(len(low), np.inf))
+        return Cones.bounded(low, np.inf)
 
     def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
         """The proximal step from a centre (n,), with this share of D."""
