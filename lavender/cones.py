@@ -225,6 +225,7 @@ class Cones:
             return cls._of(made)
         lower = as_array("lower", lower, (None,), finite=False, unit="N s")
         m = len(lower)
+        upper = as_array("upper", upper, (m,), finite=False, unit="N s")
         return cls(
             np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
         )
