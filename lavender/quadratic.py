@@ -29,7 +29,7 @@ FARTHEST = 1e4  # v* is no further than this, over |x|: rounding of v* is an err
 TIGHTEST = 1e-15  # tol of a step
 TINY = 1e-300
 NEAR = 10.0  # |v*| over |x| up to which a residual relative to v* is one relative to x
-ENDS = (Status.INFEASIBLE, Status.INTERRUPTED, Status.TIME_LIMIT)
+ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
 
 
@@ -89,8 +89,10 @@ def solve_qp(
         ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
         if ray is not None:
             return replace(answer, ray=ray)
+        if solution.status in ENDS:
+            return answer
         left = end - perf_counter()
-        if solution.status in ENDS or answer.error <= tol or left <= 0.0:
+        if solution.status is Status.TIME_LIMIT or answer.error <= tol or left <= 0.0:
             break
         if qp.proximal is not None:
             slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
