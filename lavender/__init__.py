@@ -5,7 +5,7 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
+Solving    `solve`, `solve_many`, `solve_qp`, `prepare` (for steps), `available`, `known`, `explain` (plan of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
@@ -41,7 +41,7 @@ from lavender.errors import (
     UnknownName,
 )
 from lavender.generalized import Generalized
-from lavender.problem import Problem
+from lavender.problem import Problem, QPSolution
 from lavender.redundancy import Redundancy, redundancy
 from lavender.registry import TABLES, SolverSpec, available, get, known, load_table, register
 from lavender.residuals import Residual, residual
@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.plan import Plan, explain
     from lavender.proof import Enclosure, prove
+    from lavender.quadratic import solve_qp
     from lavender.scene import Scene
     from lavender.suspicions import Suspicion, diagnose
 
@@ -88,6 +89,7 @@ _LATER = {
     "report": "lavender.report",
     "scene": "lavender.scene",
     "solve_many": "lavender.many",
+    "solve_qp": "lavender.quadratic",
     "suite": "lavender.suite",
 }
 
@@ -113,6 +115,7 @@ __all__ = [
     "Motions",
     "Plan",
     "Problem",
+    "QPSolution",
     "Redundancy",
     "Residual",
     "Rows",
@@ -151,6 +154,7 @@ __all__ = [
     "scene",
     "solve",
     "solve_many",
+    "solve_qp",
     "suite",
 ]
 

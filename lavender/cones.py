@@ -218,13 +218,14 @@ class Cones:
         return cls(*values) if made is None else cls._of(made)
 
     @classmethod
-    def bounded(cls, lower: FloatArray, upper: FloatArray) -> Cones:
-        """One ROW block for each pair of bounds: lower <= lambda <= upper, arrays (m,) [N s], infinite ones allowed."""
+    def bounded(cls, lower: FloatArray, upper: FloatArray | float) -> Cones:
+        """One ROW block for each pair of bounds, lower <= lambda <= upper: arrays (m,) [N s], or upper inf for all."""
         made = kernels.bounded_rows(lower, upper)
         if made is not None:
             return cls._of(made)
         lower = as_array("lower", lower, (None,), finite=False, unit="N s")
         m = len(lower)
+        upper = as_array("upper", upper, (m,), finite=False, unit="N s")
         return cls(
             np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
         )

@@ -30,7 +30,7 @@ from lavender._later import issparse
 from lavender._later import sparse as sp
 from lavender.errors import InputError
 from lavender_ext.core import generalized as kernels
-from lavender_ext.core.assemble import dense_to_csr
+from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.factor.graph import least_degree
 from lavender_ext.judge.measure import all_finite
 
@@ -85,12 +85,13 @@ class Generalized:
         v_free: Any,
         names: Sequence[str] | None = None,
         like: kernels.Operator | None = None,
+        momentum: bool = False,
     ) -> Generalized:
         """From (indptr, indices, data) of J and of M's lower triangle with its diagonal, columns ascending.
 
         The quick way for adapters, whose engines hold these arrays: int32 and float64, adopted as they are. Only
         finiteness and definiteness are checked. `like` is the operator of a problem before, whose pattern of M's factor
-        serves again where M's entries stand in the same places.
+        serves again where M's entries stand in the same places. With `momentum`, M v* is given as `v_free`.
         """
         made = object.__new__(cls)
         n = len(mass[0]) - 1
@@ -101,23 +102,26 @@ class Generalized:
                 as_array(name, x, (None,), copy=False)
         free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         made._fill(jac, mass, free, names, like)
+        if momentum:
+            made.__dict__["v_free"] = read_only(made.solve(free))
         return made
 
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
         """The same M with another J or v* (None: the same)."""
-        if self.order is not None:
-            return Generalized(
-                self.jac if jac is None else jac,
-                self.mass,
-                self.v_free if v_free is None else v_free,
-                self.names,
+        if jac is None:  # the same J, M and factor
+            made = object.__new__(Generalized)
+            free = self.v_free if v_free is None else v_free
+            made.__dict__.update(
+                self.__dict__, v_free=as_array("v_free", free, (self.nv,), unit="m/s, rad/s")
             )
-        own = self.operator.jac if jac is None else _rows(jac, self.nv)
+            return made
+        if self.order is not None:
+            return Generalized(jac, self.mass, self.v_free if v_free is None else v_free, self.names)
         velocity = (
             self.v_free if v_free is None else as_array("v_free", v_free, (self.nv,), unit="m/s, rad/s")
         )
         made = object.__new__(Generalized)
-        made._fill(own, self.operator.mass, velocity, self.names)
+        made._fill(_rows(jac, self.nv), self.operator.mass, velocity, self.names)
         return made
 
     def _fill(
@@ -230,6 +234,18 @@ class Generalized:
         b: FloatArray = self.operator.bias(v, target)
         return b
 
+    def momentum_of(self, v: FloatArray) -> FloatArray:
+        """M v (nv,) [kg m/s] of velocities v (nv,)."""
+        out = np.empty(self.nv)
+        self.operator.momentum(v if self.order is None else v[self.order], out)
+        return self._given(out)
+
+    def force(self, impulse: FloatArray) -> FloatArray:
+        """J^T impulse (nv,) [N s] of impulses (m,)."""
+        out = np.empty(self.nv)
+        self.operator.force(impulse, out)
+        return self._given(out)
+
     def solve(self, x: Any) -> FloatArray:
         """M^-1 x (nv,)."""
         x = as_array("x", x, (self.nv,))
@@ -287,10 +303,7 @@ def _rows(jac: Any, n: int) -> Compressed:
     given = jac if sparse else borrowed("J", jac, (None, None))
     if given.shape[1] != n:
         raise InputError(f"J has shape {given.shape}; (any, {n}) is needed, as M has {n} velocities")
-    if sparse:
-        data = _compressed("J", given)
-        return data.indptr, data.indices, data.data
-    return dense_to_csr(given)
+    return compressed("J", given) if sparse else dense_to_csr(given)
 
 
 def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
@@ -301,51 +314,40 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
         mass = sp.block_diag(
             [sp.coo_array(block) for block in given], format="csr"
         )  # dense ones warn from SciPy 1.18 on
-    if not issparse(mass):
-        dense = borrowed("M", mass, (None, None))
-        n = len(dense)
-        if dense.shape != (n, n):
-            raise InputError(f"M has shape {dense.shape}; a square matrix is needed")
-        lower, (i, j, worst) = kernels.lower_of_dense(dense)
-        if worst > allowed:
-            _refuse(i, j, dense[i, j], dense[j, i], names)
-        return lower, n
-    n = mass.shape[0]
-    if mass.shape != (n, n):
-        raise InputError(f"M has shape {mass.shape}; a square matrix is needed")
-    whole = _compressed("M", mass)
-    diagonal = whole.diagonal()
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    off = sp.coo_array(whole - whole.T)
-    share = np.abs(off.data) / (scale[off.row] * scale[off.col])
-    if len(share) and share.max() > allowed:
-        at = int(np.argmax(share))
-        i, j = int(off.row[at]), int(off.col[at])
-        _refuse(i, j, whole[i, j], whole[j, i], names)
-    # A diagonal entry in every row, zero or not: the factor says what is wrong with it.
-    lower = sp.coo_array(sp.tril(whole, -1))
-    rows, cols = np.concatenate([lower.row, np.arange(n)]), np.concatenate([lower.col, np.arange(n)])
-    return _arrays(rows, cols, np.concatenate([lower.data, diagonal]), n), n
+    lower = lower_of("M", mass, "give both triangles (Pinocchio's crba fills the upper one)", allowed, names)
+    return lower, len(lower[0]) - 1
 
 
-def _refuse(i: int, j: int, x: float, y: float, names: Sequence[str] | None) -> None:
-    where = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
-    raise InputError(
-        f"M is not symmetric: at {where} it is {x:.6g} above and {y:.6g} below the diagonal, or the other way round; "
-        "give both triangles (Pinocchio's crba fills the upper one)"
+def lower_of(
+    name: str, matrix: Any, hint: str, allowed: float = ASYMMETRY, names: Sequence[str] | None = None
+) -> Compressed:
+    """Lower triangle of a symmetric matrix, dense or sparse, with every entry of its diagonal, zero or not."""
+    sparse = issparse(matrix)
+    given = matrix if sparse else borrowed(name, matrix, (None, None))
+    if given.shape[0] != given.shape[1]:
+        raise InputError(f"{name} has shape {given.shape}; a square matrix is needed")
+    lower, (i, j, worst) = (
+        kernels.lower_of_rows(*compressed(name, given)) if sparse else kernels.lower_of_dense(given)
     )
+    if worst > allowed:
+        entries: Any = sp.csr_array(given) if sparse else given
+        where = f"({i}, {j})" if names is None else f"({names[i]}, {names[j]})"
+        raise InputError(
+            f"{name} is not symmetric: at {where} it is {entries[i, j]:.6g} above and {entries[j, i]:.6g} below the "
+            f"diagonal, or the other way round; {hint}"
+        )
+    return lower
 
 
-def _compressed(name: str, given: Any) -> sp.csr_array:
-    """Without entries that are zero."""
-    out = as_csr(name, given)
-    if out.nnz and not out.data.all():
-        out = out.copy()
-        out.data.setflags(write=True)
-        out.eliminate_zeros()
-        for part in (out.data, out.indices, out.indptr):
-            read_only(part)
-    return out
+def compressed(name: str, given: Any) -> Compressed:
+    """Rows of a sparse matrix without entries that are zero, checked whole."""
+    m, n = given.shape
+    if given.format in ("csr", "csc") and m < 2**31 > n:
+        made = stacked(n, [(given.indptr, given.indices, given.data, given.format == "csc", 1.0, m)])
+        if made is not None:
+            return made
+    out = as_csr(name, given)  # what can be made to fit, and words for what cannot
+    return stacked(n, [(out.indptr, out.indices, out.data, False, 1.0, m)])
 
 
 # -- orders without fill -----------------------------------------------------------------------------

@@ -5,11 +5,22 @@
 `Problem` holds rows (J and M^-1 of bodies, `lavender/rows.py`), J and M in generalised coordinates
 (`lavender/generalized.py`) or a matrix, one of them, and derives the rest on first use.
 
-Four files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
-`builders.py` (ways to make one), `problem.py` (`Problem` itself and its other forms).
+Files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
+`quadratic.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).
 """
 
 from lavender.problem.data import FRICTION, LAWS, OPERATORS, PRECISIONS, Names, check_problem
 from lavender.problem.problem import Problem, VelocityForm
+from lavender.problem.quadratic import QPSolution
 
-__all__ = ["FRICTION", "LAWS", "OPERATORS", "PRECISIONS", "Names", "Problem", "VelocityForm", "check_problem"]
+__all__ = [
+    "FRICTION",
+    "LAWS",
+    "OPERATORS",
+    "PRECISIONS",
+    "Names",
+    "Problem",
+    "QPSolution",
+    "VelocityForm",
+    "check_problem",
+]

@@ -15,6 +15,7 @@ from lavender.generalized import Generalized
 from lavender.problem.data import checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
 from lavender.problem.operators import Operators
+from lavender.problem.quadratic import quadratic, unpacked
 from lavender.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
@@ -335,6 +336,59 @@ class Builders(Operators):
             **more,
         )
 
+    @classmethod
+    def from_qp(
+        cls: type[P],
+        P: Any,
+        q: ArrayLike | None = None,
+        G: Any = None,
+        h: ArrayLike | None = None,
+        A: Any = None,
+        b: ArrayLike | None = None,
+        lb: ArrayLike | None = None,
+        ub: ArrayLike | None = None,
+        **more: Any,
+    ) -> P:
+        """A convex quadratic program: min 1/2 x.P x + q.x subject to G x <= h, A x = b, lb <= x <= ub.
+
+        x are generalised velocities of the mass matrix P; `lavender.solve_qp` gives x and the multipliers, or
+        `problem.qp.solution(solution)` those of a solution by `lavender.solve`.
+
+        Parameters
+        ----------
+        P : (n, n) array or sparse, or a `qpsolvers.Problem`, which is given alone
+            Symmetric, both triangles, positive semidefinite. Where it is singular a diagonal D is added, 1e-9 of the
+            diagonal of P, and the problem is one step of the proximal point method; `lavender.solve_qp` repeats it.
+        q : (n,)
+        G, h : (mi, n) array or sparse, and (mi,), optional
+            Entries of h may be inf.
+        A, b : (me, n) array or sparse, and (me,), optional
+        lb, ub : (n,), optional
+            Entries may be infinite.
+        **more
+            As `Problem`: name, guess, ...
+
+        Zeros are left out of dense matrices, which are then solved as sparse ones; all arrays are copied.
+
+        Raises
+        ------
+        InputError
+            Shapes that do not fit, NaN, lb > ub; P not symmetric, or not positive semidefinite, with its least
+            eigenvalue.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lavender as lv
+        >>> P, q = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([1.0, 1.0])
+        >>> problem = lv.Problem.from_qp(P, q, A=np.ones((1, 2)), b=[1.0], lb=np.zeros(2), ub=[0.7, 0.7])
+        >>> answer = lv.solve_qp(problem)
+        >>> answer.x.round(9).tolist(), answer.y.round(9).tolist(), answer.z_box.round(9).tolist()
+        ([0.3, 0.7], [-1.95], [0.0, 0.1])
+        """
+        qp = quadratic(unpacked((P, q, G, h, A, b, lb, ub)))
+        return cls(qp.generalized.bias(qp.target), qp.cones, generalized=qp.generalized, qp=qp, **more)
+
     def updated(
         self: P,
         *,
@@ -388,7 +442,7 @@ class Builders(Operators):
         # Private here, so that nothing else is copied a second time.
         given = self.b if b is None else as_array("b", b, (self.m,), unit="m/s")
         warm = None if guess is None else as_array("guess", guess, (self.m,), unit="N s")
-        return replace(self, generalized=general, b=given, guess=warm, copy=False)
+        return replace(self, generalized=general, b=given, guess=warm, qp=None, copy=False)
 
 
 def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:

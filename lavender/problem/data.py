@@ -83,6 +83,7 @@ class ProblemData:
     copy: bool = field(default=True, repr=False)
     generalized: Generalized | None = None
     precision: str = ""
+    qp: Any = field(default=None, repr=False, compare=False)
     derived: Derived = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -257,7 +258,7 @@ class ProblemData:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ProblemData):
             return NotImplemented
-        given = (f.name for f in fields(self) if f.init and f.name not in ("matrix", "copy"))
+        given = (f.name for f in fields(self) if f.init and f.compare and f.name not in ("matrix", "copy"))
         if not all(equal(getattr(self, name), getattr(other, name)) for name in given):
             return False
         if issparse(self.matrix) and issparse(other.matrix):

@@ -72,6 +72,8 @@ class Problem(Builders):
     precision : {"float64", "float32"}, optional
         Precision in which an engine computed these numbers and computes its answers; `lavender.residual` then knows
         which error rounding alone explains. Default: that of `rows`. Problems are always solved in float64.
+    qp : QuadraticProgram, optional
+        The program that `Problem.from_qp` made this problem of; files do not hold it.
 
     Raises
     ------

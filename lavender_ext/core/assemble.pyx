@@ -14,6 +14,8 @@ from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
 
+cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
+
 
 cdef inline int32_t body_of(const rows_t* r, int32_t block, int32_t side) noexcept nogil:
     if block < r.n_joints:
@@ -255,6 +257,72 @@ def dense_to_csr(const double[:, ::1] a):
     whole.setflags(False)
     numbers.setflags(False)
     return whole[:n + 1], whole[n + 1:], numbers
+
+
+cdef int32_t count_rows(Py_ssize_t lines, Py_ssize_t across, const int32_t* ptr, const int32_t* idx, const double* val,
+                        bint columns, int32_t* count) noexcept nogil:
+    # count[row] += its nonzeros; False where the matrix has no ascending indices in range, or numbers that are not finite.
+    cdef Py_ssize_t i
+    cdef int32_t p
+    cdef double s = 0.0                                 # stays 0, or becomes NaN
+    for i in range(lines):
+        if ptr[i + 1] < ptr[i]:
+            return False
+        for p in range(ptr[i], ptr[i + 1]):
+            if not 0 <= idx[p] < across or p > ptr[i] and idx[p] <= idx[p - 1]:
+                return False
+            s += 0.0 * val[p]
+            count[idx[p] if columns else i] += val[p] != 0.0
+    return s == 0.0
+
+
+def stacked(int32_t n, parts):
+    """Rows of n columns of several matrices, one under another, as (indptr, indices, data) without entries that are zero.
+
+    A part is (indptr, indices, data, whether these are of columns, a sign that it is multiplied with, its rows). None where a
+    part is not int32 and float64 in canonical form, and finite: who checks at length finds the words.
+    """
+    cdef const int32_t[::1] ptr, idx
+    cdef const double[::1] val
+    cdef double sign
+    cdef bint columns
+    cdef int32_t m = 0, rows, first, i, p, nnz
+    for part in parts:
+        m += part[5]
+        if part[0].dtype is not I4 or part[1].dtype is not I4 or part[2].dtype is not F8:
+            return None
+    indptr = np.zeros(m + 2, np.int32)                  # one before, so that filling moves each pointer to its row's end
+    cdef int32_t[::1] start = indptr
+    first = 0
+    for ptr_, idx_, val_, columns, _, rows in parts:
+        ptr, idx, val = ptr_, idx_, val_
+        if ptr.shape[0] != (n if columns else rows) + 1 or ptr[0] != 0 or ptr[ptr.shape[0] - 1] > idx.shape[0] \
+                or idx.shape[0] != val.shape[0]:
+            return None
+        if idx.shape[0] and not count_rows(ptr.shape[0] - 1, rows if columns else n, &ptr[0], &idx[0], &val[0], columns,
+                                           &start[2] + first if rows else NULL):
+            return None
+        first += rows
+    for i in range(m):
+        start[i + 2] += start[i + 1]
+    nnz = start[m + 1]
+    indices, data = np.empty(nnz, np.int32), np.empty(nnz)
+    cdef int32_t[::1] column = indices
+    cdef double[::1] value = data
+    first = 1
+    for ptr_, idx_, val_, columns, sign, rows in parts:
+        ptr, idx, val = ptr_, idx_, val_
+        for i in range(<int32_t>ptr.shape[0] - 1):
+            for p in range(ptr[i], ptr[i + 1]):
+                if val[p] != 0.0:
+                    nnz = first + (idx[p] if columns else i)
+                    column[start[nnz]] = i if columns else idx[p]
+                    value[start[nnz]] = sign * val[p]
+                    start[nnz] += 1
+        first += rows
+    for x in (indptr, indices, data):
+        x.setflags(False)
+    return indptr[:m + 1], indices, data
 
 
 cdef public void lav_gram_pattern(int32_t m, const int32_t* indptr, const int32_t* indices, const int32_t* ptr,

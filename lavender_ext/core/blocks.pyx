@@ -214,17 +214,18 @@ def free_rows(Py_ssize_t m):
 
 
 def bounded_rows(lower, upper):
-    """One row for each pair of bounds; None where anything is amiss."""
+    """One row for each pair of bounds, `upper` perhaps inf for all; None where anything is amiss."""
     cdef const double[::1] low, high
     cdef Py_ssize_t m
-    for x in (lower, upper):
+    cdef bint open_ = type(upper) is float and upper == INF
+    for x in (lower, lower if open_ else upper):
         if type(x) is not ndarray or x.dtype is not F8 or x.ndim != 1 or not x.flags.c_contiguous:
             return None
-    low, high = lower, upper
+    low, high = lower, lower if open_ else upper
     m = low.shape[0]
     if high.shape[0] != m or m >= 2147483647:
         return None
-    return rows_between(m, &low[0] if m else NULL, &high[0] if m else NULL)
+    return rows_between(m, &low[0] if m else NULL, &high[0] if m and not open_ else NULL)
 
 
 cdef Blocks rows_between(Py_ssize_t m, const double* lower, const double* upper):

@@ -109,6 +109,17 @@ cdef class Operator:
         return self.g.lptr[self.g.n] - (len(self.mass[1]) - self.g.n)
 
     @property
+    def least_pivot(self):
+        """The least pivot of M over its diagonal entry; 1 of a diagonal M."""
+        cdef const int32_t[::1] mptr = self.mass[0]
+        cdef const double[::1] mval = self.mass[2]
+        cdef double least = 1.0
+        cdef int32_t i
+        for i in range(self.g.n):
+            least = min(least, 1.0 / (self.g.inv_pivot[i] * mval[mptr[i + 1] - 1]))
+        return least
+
+    @property
     def work(self):
         """Multiply-adds of the factor: of a row with c entries left of the diagonal c (c + 1) / 2."""
         cdef int32_t i, c
@@ -140,6 +151,24 @@ cdef class Operator:
                 return
             jac_push(&self.g, &lam[0], &x[0])
             tree_solve(&self.g, &x[0])
+
+    def force(self, const double[::1] lam, double[::1] x):
+        """x = J^T lam (n,)."""
+        x[:] = 0.0
+        if self.g.n and self.g.m:
+            jac_push(&self.g, &lam[0], &x[0])
+
+    def momentum(self, const double[::1] v, double[::1] x):
+        """x = M v (n,)."""
+        cdef const int32_t[::1] mptr = self.mass[0], midx = self.mass[1]
+        cdef const double[::1] mval = self.mass[2]
+        cdef int32_t i, p
+        for i in range(self.g.n):
+            p = mptr[i + 1] - 1
+            x[i] = mval[p] * v[i]
+            for p in range(mptr[i], p):
+                x[i] += mval[p] * v[midx[p]]
+                x[midx[p]] += mval[p] * v[i]
 
     def times(self, const double[::1] x, double[::1] out):
         """out = J x (m,)."""
@@ -193,6 +222,46 @@ def lower_of_dense(const double[:, ::1] a):
         nnz += 1
         k[i + 1] = nnz
     return (whole[:n + 1], whole[n + 1:], values), (at_i, at_j, worst)
+
+
+def lower_of_rows(const int32_t[::1] ptr, const int32_t[::1] idx, const double[::1] val):
+    """The same of compressed rows with ascending columns; an entry across the diagonal that is not stored is 0."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1, i, p, q, low, high, nnz = 0, at_i = 0, at_j = 0
+    cdef double worst = 0.0, x, s
+    diagonal, whole, values = np.zeros(n), new(2 * n + 1 + idx.shape[0], I4), new(n + idx.shape[0])
+    cdef double[::1] d = diagonal, v = values
+    cdef int32_t[::1] k = whole
+    k[0] = 0
+    for i in range(n):
+        for p in range(ptr[i], ptr[i + 1]):
+            if idx[p] == i:
+                d[i] = val[p]
+    for i in range(n):
+        for p in range(ptr[i], ptr[i + 1]):
+            if idx[p] == i:
+                continue
+            low, high = ptr[idx[p]], ptr[idx[p] + 1]
+            while low < high:
+                q = low + (high - low) // 2
+                if idx[q] < i:
+                    low = q + 1
+                else:
+                    high = q
+            x = fabs(val[p] - (val[low] if low < ptr[idx[p] + 1] and idx[low] == i else 0.0))
+            if x > 0.0:
+                s = d[i] * d[idx[p]]
+                x = x / sqrt(s) if s > 0.0 else x
+                if x > worst:
+                    worst, at_i, at_j = x, i, idx[p]
+            if idx[p] < i:
+                k[n + 1 + nnz] = idx[p]
+                v[nnz] = val[p]
+                nnz += 1
+        k[n + 1 + nnz] = i
+        v[nnz] = d[i]
+        nnz += 1
+        k[i + 1] = nnz
+    return (whole[:n + 1], whole[n + 1:n + 1 + nnz], values[:nnz]), (at_i, at_j, worst)
 
 
 def pattern_fill(const int32_t[::1] mptr, const int32_t[::1] midx):

@@ -1,0 +1,424 @@
+"""Quadratic programs as constraint problems: a pure conversion, and the way back.
+
+    min 1/2 x.P x + q.x   subject to   A x = b,  G x <= h,  lb <= x <= ub                                 (1)
+
+is the constraint problem of the generalised velocities x with
+
+    M = P,   v* = -P^-1 q,   J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]           (2)
+
+f: variables with lb = ub, whose rows are free like those of A; l, u: other finite bounds; of G the rows with finite h.
+All other impulses are >= 0. As M (x - v*) = J^T lambda,
+
+    P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
+
+P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
+centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
+D (c - x), and `lavender.solve_qp` repeats it around the x found until that is small. Where the rows of P
+whose diagonal is zero are zero, as they must be, D stands on these alone; if P is singular otherwise, on every row.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender._arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
+from lavender._derived import cached_property
+from lavender._later import issparse
+from lavender._later import sparse as sp
+from lavender.cones import Cones
+from lavender.errors import InputError
+from lavender.generalized import Compressed, Generalized, compressed, lower_of
+from lavender_ext.core.assemble import dense_to_csr, stacked
+from lavender_ext.judge.measure import all_finite
+
+IntpArray = npt.NDArray[np.intp]
+
+__all__ = ["QPSolution", "QuadraticProgram"]
+
+PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
+SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
+SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
+FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
+FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
+SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
+Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
+
+
+@dataclass(frozen=True, eq=False)
+class QPSolution:
+    """x and the multipliers of a quadratic program, in the signs of OSQP and qpsolvers, and how wrong they are.
+
+    P x + q + A^T y + G^T z + z_box = 0,  z >= 0,  z_box > 0 at ub and < 0 at lb.
+
+    Parameters
+    ----------
+    x : (n,)
+    y : (me,), or None without A
+        Multipliers of A x = b.
+    z : (mi,), or None without G
+        Multipliers of G x <= h; 0 where h is infinite.
+    z_box : (n,), or None without lb and ub
+        Multipliers of the bounds.
+    solution : Solution or None
+        Of the constraint problem: status, work, certificate.
+    ray : (n,), or None
+        A direction in which the objective falls for ever, |ray| = 1 in its largest entry: the program is unbounded.
+    """
+
+    x: FloatArray
+    y: FloatArray | None
+    z: FloatArray | None
+    z_box: FloatArray | None
+    solution: Any
+    ray: FloatArray | None
+    impulse: FloatArray = field(repr=False)  # (m,) lambda
+    qp: QuadraticProgram = field(repr=False)
+
+    @cached_property
+    def _parts(self) -> tuple[FloatArray, ...]:
+        qp, of = self.qp, self.qp.generalized
+        px = of.momentum_of(self.x)
+        if qp.proximal is not None:
+            px = px - qp.proximal * self.x
+        return px, of.velocity_of(self.x), of.force(self.impulse)
+
+    @property
+    def objective(self) -> float:
+        """1/2 x.P x + q.x."""
+        return float(0.5 * self.x @ self._parts[0] + self.qp.q @ self.x)
+
+    @property
+    def primal_residual(self) -> float:
+        """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
+        short, free = self.qp.target - self._parts[1], self.qp.free
+        return float(max(np.abs(short[:free]).max(initial=0.0), short[free:].max(initial=0.0)))
+
+    @property
+    def dual_residual(self) -> float:
+        """max |P x + q + A^T y + G^T z + z_box|, or the largest negative z where that is more."""
+        px, _, force = self._parts
+        wrong = -self.impulse[self.qp.free :].min(initial=0.0)
+        return float(max(np.abs(px + self.qp.q - force).max(initial=0.0), wrong))
+
+    @property
+    def duality_gap(self) -> float:
+        """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
+        return float(abs(self.x @ (self._parts[0] + self.qp.q) - self.qp.target @ self.impulse))
+
+    @cached_property
+    def error(self) -> float:
+        """The largest of the three, each relative to what it is the sum of; 0 is a solution.
+
+        The primal residual over the largest of |J x| and |target|; the dual one over the largest of |q|, |P x|,
+        |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the sums of |lambda| and |x|.
+        """
+        px, jx, force = self._parts
+        q, target = self.qp.q, self.qp.target
+        rows = max(np.abs(target).max(initial=0.0), np.abs(jx).max(initial=0.0))
+        heaviest = np.abs(self.qp.generalized.operator.mass[2]).max(initial=0.0)
+        curved = FLAT * heaviest * np.abs(self.x).max(initial=0.0)
+        forces = max(curved, *(np.abs(part).max(initial=0.0) for part in (px, q, force)))
+        energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
+        wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
+        return float(max(found / size if size > 0.0 else found for found, size in wrong))
+
+    @property
+    def found(self) -> bool:
+        """Whether the error is at most 1e-6 and the program is not unbounded."""
+        return self.ray is None and self.error <= 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticProgram:
+    """What a problem made by `Problem.from_qp` knows of its program (`problem.qp`).
+
+    Parameters
+    ----------
+    generalized : Generalized
+        J of (2) and M = P + D.
+    q : (n,)
+    target : (m,)
+        The right-hand sides of (2).
+    free : int
+        Rows of A and of variables with lb = ub, which come first.
+    n_equalities, n_inequalities : int or None
+        Rows of A and of G as given; None without.
+    kept : (mi,) int or None
+        Rows of G that are in J; None: all.
+    fixed, lower, upper : (n_f,), (n_l,), (n_u,) int, or None without lb and ub
+        Variables of the rows of bounds.
+    proximal : (n,) or None
+        D, where P is singular.
+    """
+
+    generalized: Generalized
+    q: FloatArray
+    target: FloatArray
+    free: int
+    n_equalities: int | None
+    n_inequalities: int | None
+    kept: IntpArray | None
+    fixed: IntpArray | None
+    lower: IntpArray | None
+    upper: IntpArray | None
+    proximal: FloatArray | None
+
+    @property
+    def cones(self) -> Cones:
+        """Free rows, then impulses >= 0."""
+        low = np.zeros(len(self.target))
+        low[: self.free] = -np.inf
+        return Cones.bounded(low, np.inf)
+
+    def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
+        """The proximal step from a centre (n,), with this share of D."""
+        assert self.proximal is not None
+        of, d = self.generalized, share * self.proximal
+        if share != 1.0:
+            of = Generalized(of.jac, of.mass - sp.diags_array(self.proximal - d), of.v_free)
+        general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
+        return replace(self, generalized=general, proximal=d)
+
+    def multipliers(
+        self, impulse: FloatArray
+    ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
+        """(y, z, z_box) of impulses (m,); of a certificate the proof that the program has no feasible point.
+
+        Then A^T y + G^T z + z_box = 0 and b.y + h.z + (ub or lb).z_box < 0.
+        """
+        y = z = box = None
+        at, end = self.n_equalities or 0, len(impulse)
+        if self.n_equalities is not None:
+            y = -impulse[:at]
+        if self.fixed is not None and self.lower is not None and self.upper is not None:
+            box = np.zeros(len(self.q))
+            box[self.upper] = impulse[end - len(self.upper) :]
+            end -= len(self.upper)
+            box[self.lower] -= impulse[end - len(self.lower) : end]
+            end -= len(self.lower)
+            box[self.fixed] = -impulse[at : self.free]
+        if self.n_inequalities is not None:
+            z = impulse[self.free : end]
+            if self.kept is not None:
+                whole = np.zeros(self.n_inequalities)
+                whole[self.kept] = z
+                z = whole
+        return y, z, box
+
+    def solution(self, solution: Any, ray: FloatArray | None = None) -> QPSolution:
+        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,)."""
+        given = getattr(solution, "impulse", None)
+        impulse = as_array("impulse", solution, (len(self.target),)) if given is None else given
+        x = self.generalized.v_free + self.generalized.change(impulse)
+        found = None if given is None else solution
+        y, z, box = self.multipliers(impulse)
+        return QPSolution(x=x, y=y, z=z, z_box=box, solution=found, ray=ray, impulse=impulse, qp=self)
+
+    def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
+        """A direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
+        size = np.abs(direction).max(initial=0.0)
+        if self.proximal is None or not 0.0 < size < np.inf or not self.q @ direction < 0.0:
+            return None
+        d = direction / size
+        of, rows = self.generalized, np.abs(self.generalized.operator.jac[2]).max(initial=0.0)
+        curved, along = np.abs(of.momentum_of(d) - self.proximal * d).max(), of.velocity_of(d)
+        short = max(np.abs(along[: self.free]).max(initial=0.0), -along[self.free :].min(initial=0.0))
+        steep, largest = -float(self.q @ d), np.abs(self.q).max()
+        heavy = np.abs(of.operator.mass[2]).max(initial=0.0)
+        falls = curved <= tol * heavy and short <= tol * rows and steep > tol * largest
+        return read_only(d) if falls else None
+
+
+def quadratic(given: Given) -> QuadraticProgram:
+    """The program of P, q, G, h, A, b, lb, ub as a constraint problem; see `Problem.from_qp`."""
+    P, q, G, h, A, b, lb, ub = given
+    q = as_array("q", q, (None,))
+    n = len(q)
+    lower = _hessian(P, n)
+    rows = _Rows(n)
+    n_a, _ = rows.given("A", A, "b", b)
+    fixed = low = up = None
+    if lb is not None or ub is not None:
+        lb, ub = (
+            np.full(n, infinite) if x is None else as_array(name, x, (n,), finite=False)
+            for name, x, infinite in (("lb", lb, -np.inf), ("ub", ub, np.inf))
+        )
+        _check_bounds(lb, ub)
+        equal = lb == ub
+        fixed, low, up = (np.flatnonzero(on) for on in (equal, (lb > -np.inf) > equal, (ub < np.inf) > equal))
+        rows.bounds(fixed, lb, 1.0)
+    free = rows.m
+    n_g, kept = rows.given("G", G, "h", h)
+    if low is not None and up is not None:
+        rows.bounds(low, lb, 1.0)
+        rows.bounds(up, ub, -1.0)
+    jac = stacked(n, rows.parts)
+    target = read_only(
+        rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets])
+    )
+    generalized, proximal = _definite(lower, jac, q, target)
+    return QuadraticProgram(
+        generalized=generalized, q=q, target=target, free=free, n_equalities=n_a, n_inequalities=n_g, kept=kept,
+        fixed=fixed, lower=low, upper=up, proximal=proximal,
+    )  # fmt: skip
+
+
+# -- what is given ------------------------------------------------------------------------------------
+
+
+def unpacked(given: Given) -> Given:
+    """The eight arrays; the first may be a `qpsolvers.Problem`, or another object with these eight attributes."""
+    P = given[0]
+    if given[1] is not None and not hasattr(P, "ub"):
+        return given
+    names = ("P", "q", "G", "h", "A", "b", "lb", "ub")
+    if not all(hasattr(P, name) for name in names):
+        raise InputError(
+            f"P is a {type(P).__name__}, q None; P and q are needed, or a qpsolvers.Problem alone"
+        )
+    if any(x is not None for x in given[1:]):
+        raise InputError("a qpsolvers.Problem holds all arrays: give it alone")
+    return tuple(getattr(P, name) for name in names)
+
+
+def _matrix(name: str, given: Any, n: int) -> Compressed:
+    """Rows of a dense or sparse matrix of n columns without its zeros, checked; one dimension is one row."""
+    if not issparse(given):
+        dense = borrowed(name, given, (None,) * max(1, len(shape_of(name, given))))
+        given = dense[None] if dense.ndim == 1 else dense
+    if len(given.shape) != 2 or given.shape[1] != n:
+        raise InputError(f"{name} has shape {given.shape}; (any, {n}) is needed, as q has {n} entries")
+    return compressed(name, given) if issparse(given) else dense_to_csr(given)
+
+
+def _hessian(P: Any, n: int) -> Compressed:
+    """P's lower triangle with its diagonal."""
+    if shape_of("P", P) != (n, n):
+        raise InputError(f"P has shape {shape_of('P', P)}; ({n}, {n}) is needed, as q has {n} entries")
+    return lower_of("P", P, "give both triangles, or (P + P^T) / 2, which has the same x.P x")
+
+
+class _Rows:
+    """J and target of (2), put together from above."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.m = n, 0
+        self.parts = list[tuple[Any, ...]]()
+        self.targets = list[FloatArray]()
+
+    def put(self, rows: Compressed, right: FloatArray, sign: float) -> None:
+        self.parts.append((*rows, False, sign, len(right)))
+        self.targets.append(sign * right)
+        self.m += len(right)
+
+    def bounds(self, at: IntpArray, bound: FloatArray, sign: float) -> None:
+        """sign x_i >= sign bound_i of these variables."""
+        k = len(at)
+        self.put((np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.ones(k)), bound[at], sign)
+
+    def given(self, name: str, matrix: Any, side: str, vector: Any) -> tuple[int | None, IntpArray | None]:
+        """A or G; how many rows were given, and which of them are put here: None, all; not those with h infinite."""
+        if (matrix is None) != (vector is None):
+            missing = name if matrix is None else side
+            raise InputError(f"{missing} is missing: {name} and {side} go together")
+        if matrix is None:
+            return None, None
+        rows = _matrix(name, matrix, self.n)
+        m = len(rows[0]) - 1
+        if name == "A":
+            self.put(rows, as_array(side, vector, (m,)), 1.0)
+            return m, None
+        right, kept = as_array(side, vector, (m,), finite=False), None
+        if not all_finite(right):
+            check_not_nan(side, right)
+            kept = np.flatnonzero(right < np.inf)
+            rows, right = _picked(rows, kept), right[kept]
+            if not all_finite(right):
+                raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")
+        self.put(rows, right, -1.0)
+        return m, kept
+
+
+def _picked(rows: Compressed, kept: IntpArray) -> Compressed:
+    ptr, idx, val = rows
+    size = np.diff(ptr)
+    on = np.repeat(np.isin(np.arange(len(size)), kept), size)
+    return np.concatenate([[0], np.cumsum(size[kept])]).astype(np.int32), idx[on], val[on]
+
+
+def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
+    bad = np.flatnonzero(~((lb <= ub) & (lb < np.inf) & (ub > -np.inf)))
+    if len(bad):
+        i = bad[0]
+        raise InputError(
+            f"variable {i}: lb = {lb[i]}, ub = {ub[i]}; lb <= ub is needed, and a number between them"
+        )
+
+
+# -- P that is singular -------------------------------------------------------------------------------
+
+
+def _definite(
+    lower: Compressed, jac: Compressed, q: FloatArray, target: FloatArray
+) -> tuple[Generalized, FloatArray | None]:
+    """J, M = P + D and D, None where P is positive definite."""
+    momentum = -q
+    plain = _shifted(lower, jac, None, momentum)
+    if plain is not None and plain.operator.least_pivot > SINGULAR:
+        return plain, None
+    diagonal = lower[2][lower[0][1:] - 1]
+    zero = diagonal == 0.0
+    unit = np.where(zero, diagonal.max(initial=0.0) or 1.0, diagonal)
+    d = np.where(zero, PROXIMAL * unit, 0.0)
+    made = _shifted(lower, jac, d, momentum) if zero.any() and _rows_are_empty(lower, zero) else None
+    if made is None:
+        if _shifted(lower, jac, SHIFT * unit, momentum) is None:
+            raise InputError(f"P is not positive semidefinite: {_least(lower, diagonal)}")
+        d = PROXIMAL * unit
+        made = _shifted(lower, jac, d, momentum)
+        assert made is not None  # as with less
+    size = np.abs(jac[2]).max(initial=0.0)
+    expected = np.abs(target).max(initial=0.0) / size if size > 0.0 else 0.0
+    far = np.abs(made.v_free).max() / (FAR * expected) if expected > 0.0 else 0.0
+    if far > 1.0:
+        d = far * d
+        made = _shifted(lower, jac, d, momentum)
+        assert made is not None
+    return made, read_only(d)
+
+
+def _shifted(
+    lower: Compressed, jac: Compressed, d: FloatArray | None, momentum: FloatArray
+) -> Generalized | None:
+    """With P + diag(d); None where that is not positive definite."""
+    ptr, idx, val = lower
+    if d is not None:
+        val = val.copy()
+        val[ptr[1:] - 1] += d
+    try:
+        return Generalized.compressed(jac, (ptr, idx, val), momentum, momentum=True)
+    except InputError:
+        return None
+
+
+def _rows_are_empty(lower: Compressed, zero: FloatArray) -> bool:
+    """Whether rows and columns whose diagonal is zero hold nothing else, so that P is semidefinite as its rest is."""
+    ptr, idx, _ = lower
+    beside = zero[idx] | np.repeat(zero, np.diff(ptr))
+    return bool(np.count_nonzero(beside) == np.count_nonzero(zero))
+
+
+def _least(lower: Compressed, diagonal: FloatArray) -> str:
+    n = len(diagonal)
+    if n <= SHOWN:
+        ptr, idx, val = lower
+        dense = np.zeros((n, n))
+        dense[np.repeat(np.arange(n), np.diff(ptr)), idx] = val
+        value = np.linalg.eigvalsh(dense)  # which reads the lower triangle
+        return f"its least eigenvalue is {value[0]:.3g}, its largest {value[-1]:.3g}"
+    i = int(np.argmin(diagonal))
+    return f"P + {SHIFT:g} diag(P) has no Cholesky factor; the least diagonal entry is P[{i}, {i}] = {diagonal[i]:.3g}"

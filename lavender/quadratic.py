@@ -1,0 +1,117 @@
+"""`solve_qp`: quadratic programs through `solve`, and the proximal point method where P is singular.
+
+    x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
+
+Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
+program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import number
+from lavender.errors import InputError
+from lavender.problem import Problem, QPSolution
+from lavender.solution import Status
+from lavender.solve import seconds_of, solve
+
+__all__ = ["solve_qp"]
+
+STEPS = 50  # proximal steps
+SLOW = 0.1  # where a step leaves more than this of the error, the next has
+SOFTER = 0.1  # this share of D, as long as
+FARTHEST = 1e4  # v* is no further than this, over |x|: rounding of v* is an error of x
+TIGHTEST = 1e-15  # tol of a step
+TINY = 1e-300
+NEAR = 10.0  # |v*| over |x| up to which a residual relative to v* is one relative to x
+ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
+UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
+
+
+def solve_qp(
+    problem: Problem,
+    solver: str = "auto",
+    *,
+    tol: float = 1e-9,
+    time_limit: float | None = None,
+    **options: Any,
+) -> QPSolution:
+    """Solve a quadratic program made by `Problem.from_qp`.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        As in `lavender.solve`.
+    tol : float
+        Relative error to reach: of the constraint problem, and where P is singular `QPSolution.error` of the program.
+    time_limit : float, optional, s
+    **options
+        Of the solver.
+
+    Returns
+    -------
+    QPSolution
+        x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
+        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it. An unbounded program has a
+        `ray`.
+
+    Raises
+    ------
+    InputError
+        A problem that was made otherwise.
+
+    Examples
+    --------
+    A linear program, P = 0:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
+    >>> (lv.solve_qp(problem).x.round(9) + 0.0).tolist()
+    [0.0, 1.0]
+    """
+    qp = getattr(problem, "qp", None)
+    if qp is None:
+        raise InputError("problem is not a quadratic program: make it with Problem.from_qp")
+    tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
+    solution = solve(problem, solver, tol=tol, time_limit=time_limit, **options)
+    answer = best = qp.solution(solution)
+    centre, tightest, before = None, tol, np.inf
+    if qp.proximal is None and _distance(answer) <= NEAR:
+        return answer
+    for _ in range(STEPS):
+        ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
+        if ray is not None:
+            return replace(answer, ray=ray)
+        if solution.status in ENDS:
+            return answer
+        left = end - perf_counter()
+        if solution.status is Status.TIME_LIMIT or answer.error <= tol or left <= 0.0:
+            break
+        if qp.proximal is not None:
+            slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
+            qp = qp.around(centre, SOFTER if slow and _distance(answer) <= FARTHEST else 1.0)
+            general = qp.generalized
+            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
+        # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
+        far = max(1.0, _distance(answer))
+        inner = max(tol / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
+        if qp.proximal is None and inner >= tightest:
+            break
+        tightest, limit = inner, None if time_limit is None else left
+        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
+        answer = qp.solution(solution)
+        best = min(best, answer, key=lambda one: one.error)
+    return best
+
+
+def _distance(answer: QPSolution) -> float:
+    """|v*| over |x|."""
+    x, free = answer.x, answer.qp.generalized.v_free
+    return float(np.sqrt(free @ free) / max(np.sqrt(x @ x), TINY))

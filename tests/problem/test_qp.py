@@ -1,0 +1,305 @@
+"""Quadratic programs: signs as OSQP and qpsolvers have them, the gap by a judge of its own, what has no solution."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from random_problems import seeds
+
+import lavender as lv
+
+NAMES = ("P", "q", "G", "h", "A", "b", "lb", "ub")
+
+
+def kkt(qp, answer):
+    """(primal, dual, gap) of min 1/2 x.P x + q.x, G x <= h, A x = b, lb <= x <= ub, from the arrays as given."""
+    x, force = answer.x, qp["P"] @ answer.x + qp["q"]
+    short, wrong, value = [0.0], [0.0], x @ force
+    if qp["A"] is not None:
+        force = force + qp["A"].T @ answer.y
+        short.append(np.abs(qp["A"] @ x - qp["b"]).max(initial=0.0))
+        value += qp["b"] @ answer.y
+    if qp["G"] is not None:
+        force = force + qp["G"].T @ answer.z
+        short.append((qp["G"] @ x - qp["h"]).max(initial=0.0))
+        wrong.append(-answer.z.min(initial=0.0))
+        finite = qp["h"] < np.inf
+        wrong.append(np.abs(answer.z[~finite]).max(initial=0.0))
+        value += qp["h"][finite] @ answer.z[finite]
+    for bound, sign in (("ub", 1.0), ("lb", -1.0)):
+        if qp[bound] is not None:
+            short.append((sign * (x - qp[bound])).max())
+            push = np.maximum(sign * answer.z_box, 0.0)
+            finite = np.isfinite(qp[bound])
+            wrong.append(push[~finite].max(initial=0.0))
+            value += sign * qp[bound][finite] @ push[finite]
+    if answer.z_box is not None:
+        force = force + answer.z_box
+    return max(short), max(*wrong, np.abs(force).max()), abs(value)
+
+
+def drawn(seed, singular=False):
+    """A feasible program of up to 8 variables: rows that repeat or are empty, fixed variables, sides at infinity."""
+    rng = np.random.default_rng(seed)
+    n, me, mi = int(rng.integers(1, 9)), int(rng.integers(0, 3)), int(rng.integers(0, 8))
+    root, x = rng.normal(size=(int(rng.integers(0, n + 1)), n)), rng.normal(size=n)
+    qp = dict.fromkeys(NAMES) | {"P": root.T @ root, "q": rng.normal(size=n)}
+    if singular and rng.random() < 0.5:
+        qp["P"] = np.diag(rng.integers(0, 2, n).astype(float))
+    if not singular:
+        qp["P"] = qp["P"] + rng.uniform(0.05, 1.0) * np.eye(n)
+    if me:
+        qp["A"] = rng.normal(size=(me, n))
+        if rng.random() < 0.3:
+            qp["A"] = np.vstack([qp["A"], qp["A"][:1]])
+        qp["b"] = qp["A"] @ x
+    if mi:
+        qp["G"] = rng.normal(size=(mi, n)) * (rng.random((mi, 1)) < 0.8)
+        qp["h"] = qp["G"] @ x + rng.random(mi) * rng.integers(0, 2, mi)
+        qp["h"][rng.random(mi) < 0.1] = np.inf
+    if singular or rng.random() < 0.6:  # a box around all variables, so that no objective falls for ever
+        share = 1.0 if singular else 0.7
+        fixed = rng.random(n) < 0.15
+        for bound, sign in (("lb", -1.0), ("ub", 1.0)):
+            some = np.where(rng.random(n) < share, x + sign * rng.random(n), sign * np.inf)
+            qp[bound] = np.where(fixed, x, some)
+    return qp
+
+
+def sparse(qp, make=sp.csc_matrix):
+    return {k: make(v) if k in "PGA" and v is not None else v for k, v in qp.items()}
+
+
+@given(seed=seeds)
+def test_the_answer_has_no_residual_and_no_gap(seed):
+    qp = drawn(seed)
+    answer = lv.solve_qp(lv.Problem.from_qp(**qp))
+    # Relative to v* or x, of programs whose entries are near 1; multipliers divide by rows that are nearly dependent.
+    size = 1.0 + np.abs(answer.x).sum() + np.abs(answer.impulse).sum()
+    found = kkt(qp, answer)
+    assert max(found) <= 1e-7 * size
+    own = answer.primal_residual, answer.dual_residual, answer.duality_gap
+    np.testing.assert_allclose(own, found, atol=1e-11 * size**2)  # rounding alone
+    assert answer.found
+    x = answer.x
+    np.testing.assert_allclose(answer.objective, 0.5 * x @ qp["P"] @ x + qp["q"] @ x, atol=1e-11 * size**2)
+
+
+@given(seed=seeds)
+def test_a_singular_p_takes_proximal_steps_to_the_same_judge(seed):
+    qp = drawn(seed, singular=True)
+    answer = lv.solve_qp(lv.Problem.from_qp(**qp))
+    size = 1.0 + np.abs(answer.x).sum() + np.abs(answer.impulse).sum()
+    assert answer.ray is None
+    assert max(kkt(qp, answer)) <= 1e-6 * size
+
+
+@pytest.mark.filterwarnings("ignore:Converted matrix", "ignore:The default value of raise_error")
+@pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
+@settings(max_examples=30)
+@given(seed=seeds)
+def test_x_and_multipliers_are_those_of_qpsolvers(backend, seed):
+    qpsolvers = pytest.importorskip("qpsolvers")
+    if backend not in qpsolvers.available_solvers:
+        pytest.skip(f"{backend} is not installed")
+    rng = np.random.default_rng(seed)
+    root, inside = rng.normal(size=(4, 4)), rng.uniform(-0.4, 0.4, 4)
+    G, A = rng.normal(size=(1, 4)), rng.normal(size=(1, 4))
+    lb, ub = np.array([-0.4, -np.inf, -0.5, -np.inf]), np.array([0.4, 0.5, np.inf, np.inf])
+    hessian, q = root.T @ root + 0.5 * np.eye(4), 3.0 * rng.normal(size=4)
+    qp = qpsolvers.Problem(hessian, q, G, G @ inside, A, A @ inside, lb, ub)
+    tight = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 100_000} if backend == "osqp" else {}
+    other, answer = qpsolvers.solve_problem(qp, solver=backend, **tight), lv.solve_qp(lv.Problem.from_qp(qp))
+    assert other.is_optimal(1e-5)
+    size = 1.0 + max(np.abs(part).max() for part in (answer.x, answer.y, answer.z, answer.z_box))
+    for name in (
+        "x",
+        "y",
+        "z",
+        "z_box",
+    ):  # wrong by the backend's tolerance over curvatures and angles of rows
+        np.testing.assert_allclose(
+            getattr(answer, name), getattr(other, name), atol=1e-3 * size, err_msg=name
+        )
+
+
+@given(seed=seeds)
+def test_sparse_and_dense_matrices_are_the_same_problem(seed):
+    qp = drawn(seed)
+    dense = lv.Problem.from_qp(**qp)
+    for make in (sp.csc_matrix, sp.csr_array, sp.coo_array, sp.lil_matrix):
+        other = lv.Problem.from_qp(**sparse(qp, make))
+        assert other == dense
+        assert lv.solve_qp(other).x.tobytes() == lv.solve_qp(dense).x.tobytes()
+    fortran = {k: None if v is None else np.asfortranarray(v) for k, v in qp.items()}
+    assert lv.Problem.from_qp(**fortran) == dense
+
+
+def test_zeros_of_dense_matrices_are_left_out():
+    n = 50
+    problem = lv.Problem.from_qp(
+        np.eye(n), np.ones(n), G=np.eye(n), h=np.zeros(n), A=np.zeros((1, n)), b=[0.0]
+    )
+    assert len(problem.generalized.operator.jac[1]) == n
+    assert len(problem.generalized.operator.mass[1]) == n
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", "osqp"])
+def test_any_solver_solves_a_program(solver):
+    answer = lv.solve_qp(
+        lv.Problem.from_qp(np.eye(2), [-1.0, -1.0], G=[[1.0, 1.0]], h=[1.0]), solver, tol=1e-6
+    )
+    np.testing.assert_allclose(answer.x, [0.5, 0.5], atol=1e-5)
+    np.testing.assert_allclose(answer.z, [0.5], atol=1e-5)
+    assert answer.y is None
+    assert answer.z_box is None
+
+
+def test_one_solution_has_its_x_and_multipliers_too():
+    problem = lv.Problem.from_qp(2.0 * np.eye(2), [0.0, 0.0], A=[1.0, 1.0], b=[2.0], lb=[1.5, -1.0])
+    solution = lv.solve(problem, tol=1e-12)
+    answer = problem.qp.solution(solution)
+    np.testing.assert_allclose(answer.x, [1.5, 0.5], atol=1e-10)
+    np.testing.assert_allclose(answer.y, [-1.0], atol=1e-10)
+    np.testing.assert_allclose(answer.z_box, [-2.0, 0.0], atol=1e-10)
+    assert problem.qp.solution(solution.impulse).x.tobytes() == answer.x.tobytes()
+
+
+def test_without_rows_x_is_the_free_minimum():
+    answer = lv.solve_qp(lv.Problem.from_qp([[2.0, 0.0], [0.0, 4.0]], [2.0, 4.0]))
+    np.testing.assert_allclose(answer.x, [-1.0, -1.0], rtol=1e-15)
+    empty = lv.solve_qp(lv.Problem.from_qp(np.eye(2), [1.0, 2.0], G=np.zeros((0, 2)), h=[], lb=[-np.inf] * 2))
+    assert (empty.x.tolist(), empty.z.tolist(), empty.z_box.tolist()) == ([-1.0, -2.0], [], [0.0, 0.0])
+
+
+@given(seed=seeds)
+def test_the_error_is_relative_to_x_where_the_free_minimum_is_far(seed):
+    rng = np.random.default_rng(seed)
+    n, rows = 5, rng.normal(size=(3, 5))
+    x = rng.normal(size=n)
+    problem = lv.Problem.from_qp(  # v* = -P^-1 q is about 1e6 times as far as x
+        1e-6 * np.eye(n), rng.normal(size=n), G=rows, h=rows @ x + 0.1, lb=x - 1.0, ub=x + 1.0
+    )
+    assert np.abs(problem.generalized.v_free).max() > 1e4
+    answer = lv.solve_qp(problem)
+    assert answer.primal_residual <= 1e-8 * (1.0 + np.abs(x).max())
+    assert answer.found
+
+
+def test_a_time_limit_is_that_of_all_steps():
+    rng = np.random.default_rng(3)
+    n = 60
+    root = rng.normal(size=(20, n))
+    problem = lv.Problem.from_qp(root.T @ root, rng.normal(size=n), lb=-np.ones(n), ub=np.ones(n))
+    late = lv.solve_qp(problem, time_limit=1e-6)
+    assert late.solution.status is lv.Status.TIME_LIMIT
+    assert late.error > 1e-6  # and says so
+    assert lv.solve_qp(problem, time_limit=60.0).found
+
+
+# -- what has no solution --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hessian", [np.eye(2), np.zeros((2, 2)), np.diag([1.0, 0.0])])
+def test_rows_that_contradict_each_other_are_proven_infeasible(hessian):
+    G, h = np.array([[1.0, 1.0], [-1.0, -1.0]]), np.array([-1.0, -1.0])
+    problem = lv.Problem.from_qp(hessian, [1.0, 1.0], G=G, h=h, lb=[-5.0, -5.0])
+    answer = lv.solve_qp(problem)
+    assert answer.solution.status is lv.Status.INFEASIBLE
+    assert not answer.found
+    _, z, box = problem.qp.multipliers(answer.solution.certificate)
+    assert z.min() >= 0.0
+    assert box.max() <= 0.0  # Farkas: no x has G x <= h and x >= lb
+    np.testing.assert_allclose(G.T @ z + box, 0.0, atol=1e-9 * z.max())
+    assert h @ z + np.array([-5.0, -5.0]) @ box < 0.0
+
+
+def test_an_empty_row_that_nothing_fulfils_is_infeasible_and_one_that_asks_nothing_is_none():
+    bad = lv.solve_qp(lv.Problem.from_qp(np.eye(2), [1.0, 1.0], G=np.zeros((1, 2)), h=[-1.0]))
+    assert bad.solution.status is lv.Status.INFEASIBLE
+    assert lv.solve_qp(lv.Problem.from_qp(np.eye(2), [1.0, 1.0], G=np.zeros((1, 2)), h=[1.0])).found
+
+
+@pytest.mark.parametrize(
+    ("hessian", "q", "rows"),
+    [
+        (np.zeros((2, 2)), [-1.0, 0.0], {"lb": [0.0, 0.0]}),
+        (np.diag([1.0, 0.0]), [1.0, -1.0], {"G": [[1.0, 0.0]], "h": [1.0]}),
+        (np.ones((2, 2)), [1.0, -1.0], {"A": [[0.0, 0.0]], "b": [0.0]}),
+    ],
+)
+def test_an_unbounded_program_has_a_ray(hessian, q, rows):
+    answer = lv.solve_qp(lv.Problem.from_qp(hessian, q, **rows))
+    assert not answer.found
+    d = answer.ray
+    assert np.abs(d).max() == 1.0
+    np.testing.assert_allclose(hessian @ d, 0.0, atol=1e-6)
+    assert np.dot(q, d) < -0.5
+    assert rows.get("lb") is None or d.min() >= -1e-6
+
+
+# -- what is refused -------------------------------------------------------------------------------
+
+EYE, TWO = np.eye(2), np.zeros(2)
+REFUSED = [
+    ({"P": np.array([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at \(1, 0\) .*0\.5"),
+    ({"P": sp.csc_matrix([[1.0, 0.5], [0.0, 1.0]])}, r"P is not symmetric: at .*0\.5"),
+    (
+        {"P": np.array([[1.0, 2.0], [2.0, 1.0]])},
+        r"P is not positive semidefinite: its least eigenvalue is -1,",
+    ),
+    ({"P": np.diag([1.0, -0.25])}, r"P is not positive semidefinite: its least eigenvalue is -0\.25"),
+    (
+        {"P": np.array([[0.0, 1.0], [1.0, 5.0]])},
+        r"P is not positive semidefinite: its least eigenvalue is -0\.19",
+    ),
+    ({"P": np.eye(3)}, r"P has shape \(3, 3\); \(2, 2\) is needed"),
+    ({"P": np.ones(2)}, r"P has shape \(2,\); \(2, 2\) is needed"),
+    ({"P": np.array([[1.0, np.nan], [np.nan, 1.0]])}, r"P must be finite; entry \[0, 1\]"),
+    ({"P": sp.csc_matrix([[np.nan, 0.0], [0.0, 1.0]])}, r"P must be finite"),
+    ({"q": [1.0, np.nan]}, r"q must be finite; entry \[1\]"),
+    ({"q": None}, r"P and q are needed, or a qpsolvers.Problem alone"),
+    ({"G": EYE}, r"h is missing: G and h go together"),
+    ({"b": TWO}, r"A is missing: A and b go together"),
+    ({"G": np.eye(3), "h": np.zeros(3)}, r"G has shape \(3, 3\); \(any, 2\) is needed"),
+    ({"G": EYE, "h": np.zeros(3)}, r"h has shape \(3,\); \(2,\) is needed"),
+    ({"G": EYE, "h": [0.0, np.nan]}, r"h must not be NaN; entry \[1\]"),
+    ({"G": EYE, "h": [0.0, -np.inf]}, r"h is -inf at \[1\]"),
+    ({"A": EYE, "b": [0.0, np.inf]}, r"b must be finite; entry \[1\]"),
+    ({"A": np.array([[np.inf, 0.0]]), "b": [0.0]}, r"A must be finite; entry \[0, 0\]"),
+    ({"lb": [0.0, np.nan]}, r"variable 1: lb = nan"),
+    ({"lb": [0.0, 2.0], "ub": [1.0, 1.0]}, r"variable 1: lb = 2.0, ub = 1.0"),
+    ({"lb": [np.inf, 0.0]}, r"variable 0: lb = inf"),
+    ({"ub": np.zeros(3)}, r"ub has shape \(3,\); \(2,\) is needed"),
+]
+
+
+@pytest.mark.parametrize(("given", "words"), REFUSED)
+def test_what_is_no_convex_program_is_refused_with_its_figure(given, words):
+    with pytest.raises(lv.InputError, match=words):
+        lv.Problem.from_qp(**({"P": EYE, "q": TWO} | given))
+
+
+def test_a_problem_that_is_no_program_is_refused():
+    with pytest.raises(lv.InputError, match=r"make it with Problem\.from_qp"):
+        lv.solve_qp(lv.Problem.lcp(np.eye(1), [1.0]))
+    problem = lv.Problem.from_qp(EYE, TWO, G=EYE, h=TWO)
+    assert problem.updated(b=[1.0, 1.0]).qp is None  # other numbers than the program's
+
+
+def test_arrays_are_copied_and_copies_are_programs_too():
+    qp = drawn(7)
+    problem = lv.Problem.from_qp(**qp)
+    x = lv.solve_qp(problem).x
+    for value in qp.values():
+        if value is not None:
+            value[...] = 7.0
+    again = lv.solve_qp(problem)
+    assert again.x.tobytes() == x.tobytes()
+    assert again.error <= 1e-8
+    for other in (copy.copy(problem), pickle.loads(pickle.dumps(problem))):
+        assert other == problem
+        assert lv.solve_qp(other).x.tobytes() == x.tobytes()
