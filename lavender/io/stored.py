@@ -30,7 +30,7 @@ ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
-PART = re.compile(r"\..*\.\d+\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
+PART = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
 FORGOTTEN = 86400.0  # s, after which a part is of a writer that was killed: none takes that long
 
 
@@ -181,8 +181,22 @@ def _clear(folder: Path) -> None:
     """Remove what writers that were killed have left in a folder; once in a process, since folders can be large."""
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
-            if PART.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > FORGOTTEN:
+            part = PART.fullmatch(entry.name)
+            if part and time.time() - entry.stat().st_mtime > FORGOTTEN and not _runs(int(part[1])):
                 os.unlink(entry)
+
+
+def _runs(process: int) -> bool:
+    """A process of this machine: a clock that was set makes its part look old. Windows keeps what is open by itself."""
+    if os.name != "posix":
+        return False
+    try:
+        os.kill(process, 0)
+        return True
+    except PermissionError:
+        return True
+    except (OSError, OverflowError):
+        return False
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
