@@ -8,12 +8,12 @@ from pathlib import Path
 import click
 import numpy as np
 
-from benchmarks.output import folder_of
 from lavender._arrays import FloatArray
 from lavender.cli.options import parameters_of
 from lavender.engine import Film, Simulation
-from lavender.engine.picture import PICTURES, save_picture
+from lavender.engine.picture import picture_suffix, save_picture
 from lavender.errors import InputError
+from lavender.io.stored import writable
 from lavender.phenomena import chosen, run
 from lavender.phenomena.parts import Phenomenon, Record, Track, Values
 
@@ -87,9 +87,8 @@ def command(
     magnify: float,
 ) -> None:
     """The phenomenon NAME as each engine does it, beside each other: .gif, .mp4 (animations), .png, .svg (strips)."""
-    folder_of(out)
-    if out.suffix.lower() not in PICTURES:
-        raise InputError(f"{out}: a file that ends in {', '.join(PICTURES)} is needed")
+    writable(out)
+    picture_suffix(out)
     (phenomenon,) = chosen([name])
     case = parameters_of(parameters) if parameters else dict(phenomenon.cases[0])
     tracks: dict[str, Track] = {}

@@ -11,10 +11,9 @@ from typing import Any
 import click
 
 from lavender.bench import machine
-from lavender.errors import InputError
-from lavender.io.stored import write_text
+from lavender.io.stored import writable, write_text
 
-__all__ = ["folder_of", "markdown", "out_option", "write_json"]
+__all__ = ["markdown", "out_option", "write_json"]
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -25,18 +24,13 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
 
 
-def folder_of(out: Path | None) -> Path | None:
-    """`--out FILE`, refused before anything is measured where its folder does not exist."""
-    if out is not None and not out.parent.is_dir():
-        raise InputError(f"--out {out}: there is no such folder")
-    return out
-
-
 def out_option(text: str, name: str = "--out") -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """`--out FILE`, which a command gets as a path whose folder exists, or None."""
-    return click.option(
-        name, type=click.Path(path_type=Path), callback=lambda ctx, option, path: folder_of(path), help=text
-    )
+    """`--out FILE`, which a command gets as a path that it may write, or None."""
+
+    def checked(context: click.Context, option: click.Parameter, path: Path | None) -> Path | None:
+        return None if path is None else writable(path)
+
+    return click.option(name, type=click.Path(path_type=Path), callback=checked, help=text)
 
 
 def write_json(path: Path, lines: Iterable[Any], **more: Any) -> None:

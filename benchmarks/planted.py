@@ -60,6 +60,7 @@ class Given:
     dt: float
     target: Any  # (m,)
     cones: Cones
+    gap: Any  # (c,) m, between surfaces
     rows: Rows | None = None
     v_free: Any = None  # v + dt a
 
@@ -82,6 +83,12 @@ class Given:
             mu=c.mu[kj:],
             tangents=c.n_tangents[kj:],
         )
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What `diagnose` takes beside the problem."""
+        velocity = self.before if self.rows is None else self.before.reshape(-1, 6)
+        return {"velocity": velocity, "gap": self.gap, "dt": self.dt}
 
     @property
     def contacts(self) -> Any:
@@ -126,6 +133,7 @@ def planted(given: Given) -> Iterator[tuple[str, Given]]:
         yield "targets times dt once more", given.aimed(given.dt)
         yield "targets divided by dt twice", given.aimed(1.0 / given.dt)
     yield "v* = v + a, without dt", replace(given, v_free=given.before + given.change)
+    yield "v* = v, without a", replace(given, v_free=given.before)
     if np.any(given.cones.mu > 0.0):
         yield "mu in degrees", given.rubbed()
 
@@ -147,10 +155,11 @@ def scenes() -> Iterator[tuple[str, Given]]:
         depth = np.random.default_rng(steps).uniform(0.0, DEPTH, len(touch))
         target[np.abs(target) < 1e-9] = 0.0
         target[touch] = SHARE * depth / dt
+        gap = -dt * np.where(target > 0.0, target / SHARE, target)[contact]
         fall = np.where(rows.inv_mass[:, None] > 0.0, [0.0, 0.0, -9.81, 0.0, 0.0, 0.0], 0.0).ravel()
         mass = np.linalg.inv(rows.inverse_mass_matrix().toarray()) if np.all(rows.inv_mass > 0.0) else None
         v = rows.v_free.ravel() - dt * fall
-        yield f"{name} {steps}", Given(p.jacobian.toarray(), mass, v, fall, dt, target, p.cones, rows)
+        yield f"{name} {steps}", Given(p.jacobian.toarray(), mass, v, fall, dt, target, p.cones, gap, rows)
 
 
 def robots(models: tuple[str, ...]) -> Iterator[tuple[str, Given]]:
@@ -174,7 +183,7 @@ def robots(models: tuple[str, ...]) -> Iterator[tuple[str, Given]]:
             except LavenderError:
                 continue
             assert general is not None
-            jac, target, mu = [], [], []
+            jac, target, mu, gap = [], [], [], []
             for contact in data.contact:
                 bodies = model.geom_bodyid[contact.geom]
                 at = [np.zeros((3, model.nv)) for _ in bodies]
@@ -183,10 +192,11 @@ def robots(models: tuple[str, ...]) -> Iterator[tuple[str, Given]]:
                 jac.append(contact.frame.reshape(3, 3) @ (at[1] - at[0]))
                 target += [-contact.dist / dt * (1.0 if contact.dist > 0.0 else SHARE), 0.0, 0.0]
                 mu.append(contact.friction[0])
+                gap.append(contact.dist)
             mass, cones = general.mass.toarray(), Cones.contacts(np.array(mu))
             acceleration = (general.v_free - data.qvel) / dt
             given = np.concatenate(jac), mass, data.qvel.copy(), acceleration, dt, np.array(target), cones
-            yield f"{Path(path).stem} {step}", Given(*given)
+            yield f"{Path(path).stem} {step}", Given(*given, np.array(gap))
 
 
 def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]]:
@@ -196,16 +206,20 @@ def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]
     forms = {
         "bodies": of_bodies,
         "the same, J and M": [(name, replace(x, rows=None)) for name, x in of_bodies],
-        "robots, J and M": robots(models),
+        "robots, J and M": list(robots(models)),
     }
     for form, problems in forms.items():
-        for _, given in problems:
+        for more in ("", ", the state too"):
             right: set[str] = set()
-            for mistake, wrong in planted(given):
-                kinds = {suspicion.kind for suspicion in diagnose(wrong.problem)}
+            for mistake, wrong in (x for _, given in problems for x in planted(given)):
+                told = diagnose(wrong.problem, **(wrong.state if more else {}))
+                kinds = {suspicion.kind for suspicion in told}
                 right = kinds if mistake == NONE else right
-                hit, all_ = found.setdefault(form, {}).get(mistake, (0, 0))
-                found[form][mistake] = hit + bool(kinds if mistake == NONE else kinds - right), all_ + 1
+                hit, all_ = found.setdefault(form + more, {}).get(mistake, (0, 0))
+                found[form + more][mistake] = (
+                    hit + bool(kinds if mistake == NONE else kinds - right),
+                    all_ + 1,
+                )
     return found
 
 

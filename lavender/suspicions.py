@@ -25,9 +25,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray
+from lavender._arrays import FloatArray, as_array, number
 from lavender._later import sparse as sp
 from lavender.cones import ROUND, ROW
+from lavender.errors import InputError
 from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
 from lavender.rows import Rows
@@ -58,7 +59,9 @@ class Suspicion:
         return f"{self.kind}: {self.reason}" + (f" ({where})" if where else "")
 
 
-def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
+def diagnose(
+    problem: Problem, impulse: Any = None, *, velocity: Any = None, gap: Any = None, dt: float | None = None
+) -> tuple[Suspicion, ...]:
     """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
     Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
@@ -70,6 +73,13 @@ def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
     problem : Problem
     impulse : (m,) N s, optional
         A solution to examine; default: the problem's guess.
+    velocity : (n, 6) of bodies, (nv,) of J and M, m/s and rad/s, optional
+        Before the step. v* is held to it: it alone tells accelerations without their dt, or forgotten.
+    gap : (n_contacts,) m, optional
+        Between the surfaces of each contact, negative where they overlap; with `dt`. Targets are held to it: it alone
+        tells their sign, and a dt too many or too few.
+    dt : float, s, optional
+        The step.
 
     Returns
     -------
@@ -79,7 +89,8 @@ def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
     Raises
     ------
     InputError
-        `problem` is not a Problem, or `impulse` has another shape.
+        `problem` is not a Problem, an array has another shape, `gap` comes without `dt`, or either it or `velocity`
+        with a matrix, which has no v*.
 
     Examples
     --------
@@ -90,9 +101,11 @@ def diagnose(problem: Problem, impulse: Any = None) -> tuple[Suspicion, ...]:
     ['friction', 'tangents first']
     """
     check_problem(problem)
+    state = _state(problem, velocity, gap, dt)
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
     with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
         found = [s for check in _CHECKS for s in check(problem)]
+        found += _stepped(problem, *state)
         if given is not None:
             found += _impulses(problem, given)
     return tuple(found)
@@ -206,17 +219,19 @@ def _impulses(p: Problem, impulse: FloatArray) -> Iterator[Suspicion]:
 # -- J and v*: targets -------------------------------------------------------------------------------------
 
 
-def _motion(p: Problem) -> tuple[FloatArray, FloatArray] | None:
-    """J v* and target (m,) [m/s]; None for a matrix."""
+def _motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """J v* and target (m,) [m/s], and v*; None for a matrix."""
     if p.rows is not None:
-        u = p.jacobian @ p.rows.v_free.ravel()
+        v = p.rows.v_free
+        u = p.jacobian @ v.ravel()
     elif p.generalized is not None:
-        u = p.generalized.velocity_of(p.generalized.v_free)
+        v = p.generalized.v_free
+        u = p.generalized.velocity_of(v)
     else:
         return None
     target = p.b + u
     target[np.abs(target) <= 1e-12 * np.abs(u).max(initial=0.0)] = 0.0  # rounding of both
-    return u, target
+    return u, target, v
 
 
 def _targets(p: Problem) -> Iterator[Suspicion]:
@@ -225,7 +240,7 @@ def _targets(p: Problem) -> Iterator[Suspicion]:
     contact = c.kind != ROW
     if motion is None or not contact.any():
         return
-    u, target = motion
+    u, target, _ = motion
     normal, tangent = c.normal_rows, c.friction_rows
     joints = int(np.count_nonzero(~c.contact_rows))
     if joints and np.any(target[tangent]) and not np.any(np.roll(target, joints)[tangent]):
@@ -307,6 +322,68 @@ def _at_rest(r: Rows) -> bool:
     v = r.v_free[moving, :3]
     fall = np.median(v, axis=0)
     return bool(np.linalg.norm(v - fall, axis=1).max() <= 0.1 * np.linalg.norm(fall))
+
+
+# -- the state before the step ------------------------------------------------------------------------------
+
+
+def _state(
+    p: Problem, velocity: Any, gap: Any, dt: float | None
+) -> tuple[FloatArray | None, FloatArray | None, float]:
+    motion = None if velocity is None and gap is None else _motion(p)
+    if motion is None and (velocity is not None or gap is not None):
+        raise InputError(
+            "velocity and gap are held to v* and J, which a matrix does not have: leave them out"
+        )
+    if velocity is not None and motion is not None:
+        velocity = as_array("velocity", velocity, motion[2].shape, unit="m/s")
+    if gap is not None:
+        if dt is None:
+            raise InputError("gap [m] is held to targets [m/s] by the step: give dt [s] too")
+        gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.kind != ROW)),), unit="m")
+    return velocity, gap, 0.0 if dt is None else number("dt [s]", dt, above=0.0)
+
+
+def _stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicion]:
+    # v* = v + dt a; the target of a normal is -gap/dt, or a share of it where surfaces overlap
+    motion = None if velocity is None and gap is None else _motion(p)
+    contact = np.flatnonzero(p.cones.kind != ROW)
+    if motion is None or not len(contact):
+        return
+    normal = p.cones.normal_rows
+    if velocity is not None:
+        g, r = p.generalized, p.rows
+        step = (motion[2] - velocity).ravel()
+        change = np.abs(p.jacobian @ step if g is None else g.velocity_of(step))[normal]
+        push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
+        if g is not None and g.nv <= LARGE:
+            push = np.array([step[j : j + 3] for j in _free(g.mass.toarray())]).reshape(-1, 3)
+        fall = (
+            np.linalg.norm(push, axis=1) if len(push) else change
+        )  # light fingers are faster than what flies
+        fall = fall[fall > 0.01 * fall.max()]  # of spins, and of bodies beside each other, nothing
+        most = float(np.median(fall)) if len(fall) else 0.0
+        if not step.any():
+            yield _of(
+                p, "v_free", "v* is v: are the accelerations of the step, dt a, forgotten? (or no force acts)"
+            )
+        elif most > 0.5 * G:
+            reason = f"v* differs from v by {most:.3g} m/s in the median: do accelerations lack their dt?"
+            yield _of(p, "v_free", reason, change=most)
+    if gap is None:
+        return
+    target = motion[1][normal]
+    told = (target != 0.0) & (np.abs(gap) > 1e-9)
+    if not told.any():
+        return
+    if np.mean(target[told] * gap[told] > 0.0) > 0.7:
+        reason = "targets have the sign of the gaps: what is apart may approach (-gap/dt), what overlaps has to part"
+        yield _of(p, "targets", reason, contact[told])
+    share = float(np.median(np.abs(target[told] / gap[told]))) * dt
+    if not 1.5 * dt <= share <= 0.1 / dt:
+        reason = f"targets are {share:.2g} of gap/dt in the median, where all of it is 1: "
+        reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
+        yield _of(p, "targets", reason, contact[told], share=share)
 
 
 # -- contacts of bodies --------------------------------------------------------------------------------------

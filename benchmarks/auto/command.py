@@ -14,7 +14,7 @@ from benchmarks.auto.curves import curves, read, write
 from benchmarks.auto.rates import count_rates, fit, gathered
 from benchmarks.auto.regret import Regret, regrets, summary, table
 from benchmarks.auto.replay import regret
-from benchmarks.output import folder_of, write_json
+from benchmarks.output import out_option, write_json
 from lavender.bench import machine
 from lavender.bench import seeds as from_seeds
 from lavender.bench.cases import resolve
@@ -43,15 +43,10 @@ __all__ = ["command"]
     help="Timed runs of auto and of the best.",
 )
 @click.option("--worst", default=12, show_default=True, help="Cases to list.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=None, help="Write every measurement here too, JSON."
-)
-@click.option(
+@out_option("Write every measurement here too, JSON.")
+@out_option(
+    "Record what each candidate does alone, turn by turn, into this file, one curve a line; compare nothing.",
     "--record",
-    "record",
-    type=click.Path(path_type=Path),
-    default=None,
-    help="Record what each candidate does alone, turn by turn, into this file, one curve a line; compare nothing.",
 )
 @click.option(
     "--fit",
@@ -76,8 +71,6 @@ def command(
 
     On FILES, or on families of the suite with seeds. Published seeds should be others than those tuned on.
     """
-    folder_of(out)
-    folder_of(record)
     if recorded:
         cases_of = gathered(read(recorded), lambda name: resolve([name])[0].problem)
         found_rates = fit(cases_of)

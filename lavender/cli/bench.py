@@ -10,7 +10,7 @@ import click
 
 from lavender.cli.options import EXIT_UNMET, one_thread
 from lavender.errors import InputError, LavenderError
-from lavender.io.stored import write_text
+from lavender.io.stored import writable, write_text
 
 __all__ = ["bench"]
 
@@ -48,6 +48,8 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
     Exit code 1: a model is left out, of every number.
     """
     one_thread()
+    if out is not None:
+        writable(out)
     try:
         import mujoco as mj
     except ImportError:

@@ -44,7 +44,7 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
         for name, said in wrong.items():
             click.echo(f"{'':<14}{name}: {said}")
     if not found["same_bits"]:
-        raise SystemExit(1)
+        raise click.exceptions.Exit(1)
 
 
 def _suspect(files: tuple[str, ...], as_json: bool) -> None:
@@ -69,4 +69,4 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
     else:
         click.echo(f"{len(found)} looked at, {suspect or 'none'} suspicious")
     if missing or suspect or unread:
-        raise SystemExit(EXIT_BAD_INPUT if missing else EXIT_UNMET)
+        raise click.exceptions.Exit(EXIT_BAD_INPUT if missing else EXIT_UNMET)

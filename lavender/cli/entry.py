@@ -12,7 +12,7 @@ import click
 
 from lavender import _starting
 from lavender._version import __version__
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, unheard
 from lavender.errors import LavenderError, UnknownName
 
 __all__ = ["cli", "main"]
@@ -67,6 +67,7 @@ def main(args: Sequence[str] | None = None) -> None:
         code = cli.main(
             args=None if args is None else list(args), prog_name="lavender", standalone_mode=False
         )
+        sys.stdout.flush()
     except LavenderError as error:
         click.echo(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
@@ -76,9 +77,9 @@ def main(args: Sequence[str] | None = None) -> None:
     except (click.exceptions.Abort, KeyboardInterrupt):
         click.echo("lavender: stopped", err=True)
         code = EXIT_INTERRUPTED
-    except BrokenPipeError:
-        # `lavender solvers | head`: nobody reads any more.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except (BrokenPipeError, SystemExit):
+        # `lavender solvers | head`: nobody reads any more, which click and rich turn into an exit of their own.
+        unheard()
         code = 0
     except MemoryError as error:
         click.echo(
@@ -86,6 +87,15 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         code = EXIT_BAD_INPUT
     except OSError as error:  # a full disk behind stdout, for one
-        click.echo(f"lavender: {error}", err=True)
+        click.echo(f"lavender: {error}{_where()}", err=True)
         code = EXIT_BAD_INPUT
     raise SystemExit(code if isinstance(code, int) else 0)
+
+
+def _where() -> str:
+    """What explains an error of the system."""
+    try:
+        os.getcwd()
+    except OSError:
+        return " (the working directory is gone: change to a folder that is there)"
+    return ""

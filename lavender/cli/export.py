@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.cli.options import refuse_unused
+from lavender.io.stored import writable
 
 __all__ = ["export"]
 
@@ -41,6 +42,7 @@ def export(
         refuse_unused(context, ["solver", "vectors"], "without --for")
     elif kind != "c":
         raise click.UsageError("--for goes with c: test vectors are checked by a C program")
+    writable(folder, folder=True)  # before the vectors are solved for
     more = chosen.made(records, solver, vectors) if records is not None else {}
     written = library.write(kind, folder, more=more, replace=replace)
     click.echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

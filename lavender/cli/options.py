@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +32,7 @@ __all__ = [
     "Seeds",
     "bytes_of",
     "console",
+    "going_on",
     "one_thread",
     "parameters_of",
     "plain",
@@ -39,6 +42,7 @@ __all__ = [
     "refuse_unused",
     "refuse_unused_recording",
     "threshold_option",
+    "unheard",
 ]
 
 EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
@@ -169,6 +173,20 @@ def console(stderr: bool = False) -> Console:
         max(shutil.get_terminal_size().columns, LEAST_WIDTH) if known else 10_000
     )  # nothing is folded or cut
     return Console(stderr=stderr, width=width)
+
+
+def unheard() -> None:
+    """Nobody reads what is printed (`| head`): from here on it goes nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextlib.contextmanager
+def going_on() -> Iterator[None]:
+    """Around what a command prints before it has written its last file: written it is, whoever reads."""
+    try:
+        yield
+    except (BrokenPipeError, SystemExit):  # rich makes an exit of it
+        unheard()
 
 
 def was_given(context: click.Context, name: str) -> bool:

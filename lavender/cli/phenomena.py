@@ -10,7 +10,7 @@ import click
 
 from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
-from lavender.io.stored import write_text
+from lavender.io.stored import writable, write_text
 from lavender.phenomena import WAYS, Record, chosen, run
 from lavender.phenomena import table as tables
 from lavender.phenomena.engines import versions_of_node
@@ -69,8 +69,8 @@ def phenomena(
     if listed:
         click.echo(tables.described(chosen(names)))
         return
-    if out is not None and not out.parent.is_dir():
-        raise click.UsageError(f"{out}: there is no folder {out.parent}")
+    if out is not None:
+        writable(out)
     case = parameters_of(parameters) if parameters else None
     some = {"steppers": _names(steppers), "engines": _names(engines)}
     found: list[Record] = []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, one_thread
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
 from lavender.errors import InputError, LavenderError
 
 __all__ = ["reference"]
@@ -33,9 +33,13 @@ def reference(files: tuple[str, ...]) -> None:
                 raise InputError(f"{item.source} is no file; a reference is written beside one")
             written = motion.save_reference(item.problem, item.source)
             told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
-            out.print(told, highlight=False, markup=False, soft_wrap=True)
+            with going_on():
+                out.print(told, highlight=False, markup=False, soft_wrap=True)
         except LavenderError as error:
-            out.print(f"{item.name}: {error}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+            with going_on():
+                out.print(
+                    f"{item.name}: {error}", style="yellow", highlight=False, markup=False, soft_wrap=True
+                )
             unread = isinstance(error, InputError) and item.named and not Path(item.source).is_file()
             missing += unread
             unmet += not unread

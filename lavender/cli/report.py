@@ -29,7 +29,7 @@ from lavender.cli.options import (
     was_given,
 )
 from lavender.errors import InputError
-from lavender.io.stored import write_text
+from lavender.io.stored import writable, write_text
 
 __all__ = ["report"]
 
@@ -110,6 +110,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         if not (math.isfinite(limit) and limit > 0.0):
             raise InputError(f"time budget {limit} must be a positive number of seconds")
     _refuse_unused(context, files, asked["solvers"])
+    writable(out, folder=True)
     taken: set[Path] = set()
     how = {name: asked[name] for name in RECORDING}
     files = tuple(_recorded(f, out, taken, asked["fresh"], how) for f in files)
@@ -130,11 +131,14 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     index = write(
         found, out, figures=not asked["no_figures"]
     )  # before a pipe that nobody reads ends the command
-    print_report(found, console(), whole=asked["tables"])
+    paper = None
     if asked["paper"]:
         from lavender.report.paper import write_paper
 
-        _say(f"figures, tables and method of a paper: {write_paper(found, out / 'paper')}")
+        paper = write_paper(found, out / "paper")
+    print_report(found, console(), whole=asked["tables"])
+    if paper is not None:
+        _say(f"figures, tables and method of a paper: {paper}")
     _say(f"\n{count(len(done.records), 'run')}; page: {index}")
     if done.note:
         _say(done.note)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lavender.cli.options import parameters_of, refuse_unused
+from lavender.cli.options import going_on, parameters_of, refuse_unused
 from lavender.errors import InputError
 
 __all__ = ["run"]
+
+FILES = ("trace", "plot", "film", "record")  # options that leave them
 
 
 @click.command()
@@ -90,11 +93,12 @@ def run(
     if record is None:
         refuse_unused(context, ["skip", "replace"], "without --record")
 
-    live = sys.stdout.isatty()
+    live, files = sys.stdout.isatty(), any(asked[name] is not None for name in FILES)
 
     def show(text: str) -> None:
         # on a terminal each line takes the place of the one before
-        click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
+        with going_on() if files else contextlib.nullcontext():
+            click.echo(f"\r{text}\x1b[K" if live else text, nl=not live)
 
     found = run_scene(
         scene,

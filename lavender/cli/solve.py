@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import click
 
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
 from lavender.errors import InputError
-from lavender.io.stored import destination, write_atomically
+from lavender.io.stored import writable, write_atomically
 
 __all__ = ["solve"]
 
@@ -62,7 +61,7 @@ def solve(
 
     one_thread()
     if output is not None:
-        _check_writable(output)
+        writable(output)
     (item, *more) = bench.resolve([file])
     if more:
         raise InputError(f"{file} holds {len(more) + 1} problems; give one file")
@@ -73,13 +72,6 @@ def solve(
     solution = solve_problem(
         item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options
     )
-    click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    if solution.history is not None:
-        click.echo(f"{'iterations':>10}  {'time':>9}  {'relative':>9}  {'energy':>9}  {'velocity':>9}")
-        h = solution.history
-        for n, t, r, e, v in zip(h.iterations, h.time, h.relative, h.energy, h.velocity, strict=True):
-            click.echo(f"{n:>10}  {seconds(t):>9}  {residual(r):>9}  {residual(e):>9}  {residual(v):>9}")
-    click.echo(str(solution))
     if output is not None:
         import numpy as np
 
@@ -102,6 +94,14 @@ def solve(
                 )
 
         write_atomically(output, write)
+    click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    if solution.history is not None:
+        click.echo(f"{'iterations':>10}  {'time':>9}  {'relative':>9}  {'energy':>9}  {'velocity':>9}")
+        h = solution.history
+        for n, t, r, e, v in zip(h.iterations, h.time, h.relative, h.energy, h.velocity, strict=True):
+            click.echo(f"{n:>10}  {seconds(t):>9}  {residual(r):>9}  {residual(e):>9}  {residual(v):>9}")
+    click.echo(str(solution))
+    if output is not None:
         click.echo(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
@@ -113,11 +113,3 @@ def solve(
         return
     if tol > 0.0 and not (solution.success or judged.at_floor):
         raise click.exceptions.Exit(EXIT_UNMET)
-
-
-def _check_writable(path: Path) -> None:
-    # Nothing is opened or made: another process may be writing there.
-    target = destination(path)
-    needed = [target.parent, target] if target.exists() else [target.parent]
-    if not all(os.access(place, os.W_OK) for place in needed):
-        raise InputError(f"cannot write {path}: give a path that you may write to")

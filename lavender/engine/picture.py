@@ -21,7 +21,7 @@ from lavender.io.stored import as_path, write_atomically, write_figure
 from lavender.scene.parts import rotation
 from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
-__all__ = ["PICTURES", "save_picture"]
+__all__ = ["PICTURES", "picture_suffix", "save_picture"]
 
 PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
 DPI = 160  # of an animation: 480 pixels at the width that is the default
@@ -37,6 +37,16 @@ FACES = (
 )  # -x +x -y +y -z +z
 LIGHT = np.array([-0.45, -0.62, 0.64])
 COLORS = ("#7a5fb5", "#4f7cac", "#5b9279", "#b5895f", "#a85f7a", "#6b8fb5", "#8a7fb0")
+
+
+def picture_suffix(path: str | PathLike[str]) -> str:
+    """The suffix of a picture's file; InputError for one that cannot be made here."""
+    suffix = as_path(path).suffix
+    if suffix.lower() not in PICTURES:
+        raise InputError(f"{str(path)!r} ends in {suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
+    if suffix.lower() == ".mp4" and which("ffmpeg") is None:
+        raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
+    return suffix.lower()
 
 
 def save_picture(
@@ -55,18 +65,13 @@ def save_picture(
     nearest that whole hundredths of a second allow). `.png`, `.svg`, `.pdf`: `frames` of them side by side, evenly
     spaced. `turn` and `tilt` [rad] say where the eye is, `size` [inch] how wide one frame is.
     """
-    path = as_path(path)
-    suffix = path.suffix.lower()
-    if suffix not in PICTURES:
-        raise InputError(f"{str(path)!r} ends in {path.suffix!r}; .gif, .mp4, .png, .svg or .pdf is needed")
+    path, suffix = as_path(path), picture_suffix(path)
     films = film if isinstance(film, Mapping) else {"": film}
     if not films or not all(len(one) for one in films.values()):
         raise InputError("the film has no frames; step first")
     frames, rate = whole_number("frames", frames, 1), number("rate [1/s]", rate, above=0.0)
     size = number("size [inch]", size, low=0.5, high=50.0)
     turn, tilt = number("turn [rad]", turn), number("tilt [rad]", tilt)
-    if suffix == ".mp4" and which("ffmpeg") is None:
-        raise InputError("an .mp4 needs ffmpeg, which is not here; a .gif needs nothing")
     stages = [Stage(one, turn, tilt, name) for name, one in films.items()]
     ends = np.array([stage.bounds for stage in stages])
     for stage in stages:  # one scale for all

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import FloatArray, whole_number
-from lavender.engine.picture import PICTURES, save_picture
+from lavender.engine.picture import PICTURES, picture_suffix, save_picture
 from lavender.engine.simulation import SOLVER_FIELDS, Simulation
-from lavender.io.stored import folder_for_steps, write_figure, write_text
+from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
 from lavender.registry import get
 from lavender.scene import Scene
 
@@ -170,6 +170,14 @@ def run_scene(
     the run in a page, no faster than it would go, and after it until Ctrl-C.
     """
     every = whole_number("every", every, 1)
+    for path in (trace, plot, film):
+        if path is not None:
+            writable(path)
+    if plot is not None:
+        check_figure(plot)
+    drawn = film is not None and Path(film).suffix.lower() in PICTURES
+    if film is not None and drawn:
+        picture_suffix(film)
     given = dict(parameters or {})
     if iterations is not None:
         given["solver_iterations"] = iterations
@@ -196,7 +204,7 @@ def run_scene(
         if plot is not None:
             found.plot(plot)
         if film is not None and taken is not None:
-            if Path(film).suffix.lower() in PICTURES:
+            if drawn:
                 save_picture(taken, film)
             else:
                 taken.save(film)

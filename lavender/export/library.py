@@ -12,7 +12,7 @@ import lavender_ext
 from lavender.errors import InputError, LavenderError
 from lavender.export.amalgamate import CutFailed, amalgamate, source_hash
 from lavender.export.header import functions, javascript
-from lavender.io.stored import write_bytes, write_text
+from lavender.io.stored import writable, write_bytes, write_text
 from lavender.web import compile as wasm
 
 __all__ = ["HEADER", "source", "write"]
@@ -80,10 +80,11 @@ def write(
     Raises
     ------
     InputError
-        A file of that name is there and is another.
+        A file of that name is there and is another; the folder cannot be written.
     LavenderError
         As `source`.
     """
+    writable(out, folder=True)
     folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
     made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
     if kind == "npm":

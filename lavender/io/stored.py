@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -29,7 +30,7 @@ ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said
 MAX_BYTES = 2**31  # of what a file makes in memory; a megabyte can declare a terabyte
 PART_OF_NAME = 40  # characters, at most four bytes each, of the 255 that a name may have
 NUMBER = 8  # bytes of a number once it is read: float64, or an index before it is checked
-PART = re.compile(r"\..*\.\d+\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
+PART = re.compile(r"\..*\.(\d+)\.\d+\.part(\.\w+)?")  # names of files that are not whole yet
 FORGOTTEN = 86400.0  # s, after which a part is of a writer that was killed: none takes that long
 
 
@@ -58,7 +59,7 @@ def folder_for_steps(
     `replace` takes the problem files out that it holds; those of a recording that is `continued` stay. What an engine
     said of others goes in either case. Whoever records into it meanwhile is refused.
     """
-    folder, replace = as_path(path), flag("replace", replace)
+    folder, replace = writable(path, folder=True), flag("replace", replace)
     with contextlib.ExitStack() as held:
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -94,19 +95,27 @@ def _hold(folder: Path, held: contextlib.ExitStack) -> None:
         pass  # a file system without locks
 
 
+def _behind_links(path: Path) -> Path:
+    try:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError) as error:
+        what = "the working directory is gone" if isinstance(error, FileNotFoundError) else error
+        raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
+
+
 def destination(path: str | os.PathLike[str]) -> Path:
     """Where a file of that path is written: behind its symbolic links, a regular file or a new one.
 
     InputError for a folder, a pipe, a socket or a device, which is never replaced, and for links without end.
     """
-    path, target = as_path(path), None
+    path = as_path(path)
+    target = _behind_links(path)
     try:
-        target = Path(os.path.realpath(path))
         found = os.stat(path)
     except (OSError, ValueError) as error:
-        if target is not None and isinstance(error, FileNotFoundError):
+        if isinstance(error, FileNotFoundError):
             return target
-        what = f"{getattr(error, 'strerror', None) or error}" if target else "the working directory is gone"
+        what = getattr(error, "strerror", None) or error
         raise InputError(f"cannot write {path}: {what}; give a path that can be written") from None
     if not stat.S_ISREG(found.st_mode):
         what = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
@@ -115,6 +124,35 @@ def destination(path: str | os.PathLike[str]) -> Path:
     else:
         what = "a file that has lost its name"  # of an open descriptor
     raise InputError(f"cannot write {path}: it is {what}, which is not replaced; give the name of a file")
+
+
+def writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
+    """`path`, refused before the work where its file could not be written after it; a `folder` may have to be made.
+
+    Nothing is opened or made: another process may be writing there.
+    """
+    path = as_path(path)
+    place = _behind_links(path) if folder else destination(path).parent
+    try:
+        while folder and place != place.parent and not place.exists():
+            place = place.parent
+        mode = place.stat().st_mode
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {_why(error, place)}") from None
+    if not stat.S_ISDIR(mode):
+        raise InputError(f"cannot write {path}: {place} is no folder; give a path in one")
+    own = [path] if not folder and path.exists() else []
+    if not all(os.access(x, os.W_OK) for x in (place, *own)):
+        raise InputError(f"cannot write {path}: you may not write there; give a path that you may write to")
+    return path
+
+
+def _why(error: OSError, place: Path) -> str:
+    """What keeps a file from being written, and what to do."""
+    if isinstance(error, FileNotFoundError) and not place.is_dir():
+        return f"the folder {place} is not there; make it first"
+    room = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    return f"{error.strerror or error}; {'make room' if room else 'give a path that can be written'}"
 
 
 def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any]) -> None:
@@ -132,10 +170,7 @@ def write_atomically(path: str | os.PathLike[str], write: Callable[[Path], Any])
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
         os.replace(temporary, target)
     except OSError as error:
-        reason = error.strerror or error
-        raise InputError(
-            f"cannot write {path}: {reason}; make room, or give a path that can be written"
-        ) from None
+        raise InputError(f"cannot write {path}: {_why(error, target.parent)}") from None
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -146,8 +181,22 @@ def _clear(folder: Path) -> None:
     """Remove what writers that were killed have left in a folder; once in a process, since folders can be large."""
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
-            if PART.fullmatch(entry.name) and time.time() - entry.stat().st_mtime > FORGOTTEN:
+            part = PART.fullmatch(entry.name)
+            if part and time.time() - entry.stat().st_mtime > FORGOTTEN and not _runs(int(part[1])):
                 os.unlink(entry)
+
+
+def _runs(process: int) -> bool:
+    """A process of this machine: a clock that was set makes its part look old. Windows keeps what is open by itself."""
+    if os.name != "posix":
+        return False
+    try:
+        os.kill(process, 0)
+        return True
+    except PermissionError:
+        return True
+    except (OSError, OverflowError):
+        return False
 
 
 def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
@@ -160,10 +209,22 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def check_figure(path: str | os.PathLike[str]) -> Path:
+    """The file of a figure, .png without a suffix; InputError for a format that matplotlib does not write."""
+    path = as_path(path)
+    path = path if path.suffix else path.with_name(path.name + ".png")
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        formats = ", ".join(sorted(known))
+        raise InputError(f"cannot write the figure {str(path)!r}: its suffix must be of {formats}")
+    return path
+
+
 def write_figure(canvas: Any, path: str | os.PathLike[str], **how: Any) -> None:
     """`write_atomically` of a figure of matplotlib, whose format the suffix says; png without one."""
-    path = Path(path)
-    path = path if path.suffix else path.with_name(path.name + ".png")
+    path = check_figure(path)
     from matplotlib import rc_context
 
     try:

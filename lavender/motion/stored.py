@@ -11,7 +11,7 @@ import numpy as np
 
 from lavender.errors import InputError
 from lavender.io import npz
-from lavender.io.stored import write_bytes
+from lavender.io.stored import writable, write_bytes
 from lavender.motion.reference import Reference, judged, kept, reference
 from lavender.problem import Problem
 
@@ -30,10 +30,10 @@ def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
 
     InputError where nothing solved the problem: then there is nothing to keep.
     """
+    out = writable(_beside(path))
     found = reference(problem.disk)
     if not found.accepted:
         raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
-    out = _beside(path)
     buffer = BytesIO()
     np.savez(buffer, impulse=found.impulse, solver=np.array(found.solver))
     write_bytes(out, buffer.getvalue())

@@ -17,7 +17,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.errors import InputError, LavenderError
-from lavender.io.stored import write_bytes, write_text
+from lavender.io.stored import writable, write_bytes, write_text
 from lavender.web import compile as wasm
 from lavender.web.scenes import page_scenes
 
@@ -30,8 +30,7 @@ SHIPPED = HERE  # the folder of the modules that come with the package
 
 def build_module(out: Path, name: str = "lavender") -> wasm.Built:
     """Compile the kernels to a WebAssembly module: "lavender", which stands alone, or "newton" beside it."""
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"the folder {out.resolve().parent} does not exist; make it first")
+    writable(out)
     part = wasm.PARTS[name]
     try:
         return wasm.build(out, ROOT, part.modules, beside=part.beside)
@@ -66,6 +65,7 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
     """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
+    writable(folder, folder=True)
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)

@@ -62,7 +62,7 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
         (["--boxes", "0"], "--boxes"),
         (["--sweeps", "0"], "--sweeps"),
         (["--engines", "lavender", "--sweeps", "3"], "solver_iterations"),
-        (["--out", "/no/such/folder/x.json"], "no such folder"),
+        (["--out", "/no/such/folder/x.json"], "is not there"),
     ],
 )
 def test_what_makes_no_sense_is_refused_before_anything_is_measured(words, error):

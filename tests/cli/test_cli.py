@@ -757,3 +757,79 @@ def test_a_report_tells_what_looks_wrong(lavender, tmp_path):
     assert told in out
     assert told in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert bench.read(tmp_path / "out").cases["duplicated(k=3)"].suspicions[0].startswith(told)
+
+
+def _must_not_begin(*_, **__):
+    raise AssertionError("the work began")
+
+
+@pytest.mark.parametrize(
+    ("words", "work"),
+    [
+        ("run stack --plot {}/x.svg", "lavender.engine.Simulation.step"),
+        ("run stack --trace {}/x.csv", "lavender.engine.Simulation.step"),
+        ("run stack --film {}/x.film", "lavender.engine.Simulation.step"),
+        ("run stack --film {}/x.gif", "lavender.engine.Simulation.step"),
+        ("solve toy_stack --output {}/x.npz", "lavender.bench.resolve"),
+        ("phenomena lift --out {}/x.json", "lavender.cli.phenomena.run"),
+        ("web build {}/x.wasm", "lavender.web.compile.build"),
+        ("export c {}/sub", "lavender.export.library.source"),
+        ("export npm {}/sub", "lavender.export.library.source"),
+        ("web page {}/sub", "lavender.web.pages.module"),
+        ("report toy_stack --out {}/sub", "lavender.bench.resolve"),
+        ("report toy_stack --campaign --out {}/sub", "lavender.bench.resolve"),
+        ("run stack --record {}/sub", "lavender.engine.Simulation.step"),
+    ],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch, tmp_path, words, work):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(work, _must_not_begin)
+    for place in ("file",) if "/sub" in words else ("file", "absent"):  # a folder is made, with its parents
+        code, out, err = lavender(*words.format(tmp_path / place).split())
+        assert (code, out) == (cli.EXIT_BAD_INPUT, "")
+        assert re.search(r"^lavender: cannot write .*; (make|give) ", err)
+        assert str(tmp_path / place) in err
+
+
+def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkeypatch):
+    monkeypatch.setattr("lavender.engine.Simulation.step", _must_not_begin)
+    code, _, err = lavender("run", "stack", "--plot", "x.plot")
+    assert code == cli.EXIT_BAD_INPUT and "suffix" in err and "svg" in err
+    monkeypatch.setattr("lavender.engine.picture.which", lambda name: None)
+    code, _, err = lavender("run", "stack", "--film", "x.mp4")
+    assert code == cli.EXIT_BAD_INPUT and "ffmpeg" in err
+
+
+@pytest.mark.parametrize("words", ["--workers 2", "--workers 1", "--solvers pgs --budgets 2 --no-figures"])
+def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, words):
+    os.rmdir(os.getcwd())
+    words = words if "--solvers" in words else f"--campaign --solvers pgs --no-figures {words}"
+    code, _, err = lavender("report", path, *words.split(), "--out", tmp_path / "out")
+    assert code == 0 or (code == cli.EXIT_BAD_INPUT and "the working directory is gone" in err)
+    for words in ("run stack --steps 2 --record r", "export c c", "solve toy_stack --output x.npz"):
+        code, _, err = lavender(*words.split())
+        assert code == cli.EXIT_BAD_INPUT and "the working directory is gone" in err
+
+
+def _unread(*words):
+    """Exit code and words of errors of a command whose output nobody reads."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "lavender", *map(str, words)]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize("words", ["cases", "solvers", "--help", "run --help", "explain toy_stack"])
+def test_a_pipe_that_nobody_reads_ends_a_command_quietly(words):
+    assert _unread(*words.split()) == (0, "")
+
+
+def test_files_are_written_whoever_reads(path, tmp_path):
+    made = [tmp_path / name for name in ("x.csv", "x.svg", "x.npz")]
+    words = ("run", "stack", "--steps", 3, "--trace", made[0], "--plot", made[1])
+    assert _unread(*words) == (0, "")
+    assert _unread("solve", path, "--output", made[2]) == (0, "")
+    assert _unread("reference", path) == (0, "")
+    assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))

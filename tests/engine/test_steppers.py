@@ -385,3 +385,31 @@ def test_a_stopped_prepare_leaves_no_softness_behind():
     state.kernel.prepare()
     assert state.a["b"].tobytes() == first[0].tobytes() and state.a["d"].tobytes() == first[1].tobytes()
     assert state.head[HEAD["stepper"]] == STEPPERS["soft_step"].number
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box"])
+@pytest.mark.parametrize("name", ["impulses", "soft_step"])
+def test_what_moves_less_than_half_its_size_and_the_margin_passes_nothing(name, shape):
+    """The promise of docs/engine.md, at whatever distance the substep begins; and no speed comes of a wall at rest."""
+    h, margin = 1 / 240, 0.01
+    for size in (0.02, 0.2):
+        for wall in (None, 0.001, 0.1):
+            for share in (0.3, 0.98):
+                for phase in (0.0, 0.2, 0.4, 0.6, 0.8, 0.999):
+                    far = share * (0.5 * size + margin)  # m a substep
+                    scene = lv.Scene(stepper=name, dt=h, substeps=1, gravity=0.0, margin=margin)
+                    scene.add_plane() if wall is None else scene.add_box(
+                        (2, 2, wall), position=(0, 0, -wall / 2), static=True
+                    )
+                    at = {
+                        "position": (0.01, 0.02, 0.5 * size + margin + phase * far),
+                        "velocity": (0, 0, -far / h),
+                    }
+                    scene.add_sphere(size / 2, **at) if shape == "sphere" else scene.add_box(
+                        (size,) * 3, **at
+                    )
+                    sim = lv.Simulation(scene)
+                    for _ in range(12):
+                        seen = sim.step()[0]
+                        assert np.linalg.norm(seen["velocities"][1][:3]) <= far / h * (1 + 1e-9)
+                    assert seen["positions"][1][2] > 0.0, (size, wall, share, phase)

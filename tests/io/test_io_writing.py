@@ -4,6 +4,8 @@ import errno
 import os
 import signal
 import stat
+import subprocess
+import sys
 from importlib.util import find_spec
 
 import numpy as np
@@ -327,3 +329,15 @@ def test_two_recordings_are_not_written_into_one_folder_at_a_time(tmp_path):
     assert len(simulation.record(tmp_path, 2)) == 2  # which goes on
     with pytest.raises(lv.InputError, match="holds 4 problem files"):
         lv.Simulation("stack").record(tmp_path, 2)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows keeps files that are open")
+def test_a_clock_that_jumps_takes_no_part_from_a_writer_that_runs(tmp_path):
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    own, dead = (tmp_path / f".x.npz.{pid}.1.part" for pid in (os.getpid(), ended.pid))
+    for part in (own, dead):
+        part.write_bytes(b"half")
+        os.utime(part, (0, 0))  # as after a clock that was decades late
+    write_text(tmp_path / "y", "")
+    assert own.exists() and not dead.exists()

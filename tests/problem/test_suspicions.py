@@ -250,6 +250,31 @@ def test_numbers_at_the_edge_of_float64_are_looked_at(what, size):
         assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
 
 
+STATE = {
+    "gap or depth of the wrong sign": "targets",
+    "targets times dt once more": "targets",
+    "targets divided by dt twice": "targets",
+    "v* = v + a, without dt": "v_free",
+    "v* = v, without a": "v_free",
+}
+
+
+def test_the_state_before_the_step_tells_what_the_problem_alone_does_not():
+    for name, sound in list(scenes())[::5]:
+        for x in (sound, replace(sound, rows=None)):
+            assert lv.diagnose(x.problem, **x.state) == (), name
+            for mistake, wrong in planted(x):
+                kinds = {s.kind for s in lv.diagnose(wrong.problem, **wrong.state)}
+                assert STATE.get(mistake) is None or STATE[mistake] in kinds, (name, mistake)
+    problem = SCENES["stack"]
+    with pytest.raises(lv.InputError, match="give dt"):
+        lv.diagnose(problem, gap=np.zeros(problem.rows.n_contacts))
+    with pytest.raises(lv.InputError, match="shape"):
+        lv.diagnose(problem, velocity=np.zeros(3))
+    with pytest.raises(lv.InputError, match="a matrix does not have"):
+        lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
+
+
 def test_what_is_no_problem_is_refused():
     with pytest.raises(lv.InputError, match=r"lavender\.Problem is needed"):
         lv.diagnose(np.eye(3))
