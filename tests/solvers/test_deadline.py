@@ -278,3 +278,24 @@ print(sorted(set(sys.modules) - before))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_package_loads_what_auto_needs_and_a_name_its_own_file():
+    """Files of the others, and what nobody needs, are a quarter of what `import lavender` adds to NumPy."""
+    code = """
+import sys
+import lavender as lv
+
+files = lambda: {name.rpartition(".")[2] for name in sys.modules if name.startswith("lavender.solvers.")}
+print(sorted({"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} & files()), "pathlib" in sys.modules)
+before = set(sys.modules)
+lv.solve(lv.Problem.lcp([[2.0]], [1.0]), "jacobi", time_limit=0.01)
+print(sorted(set(sys.modules) - before))
+print(list(lv.registry.specs())[:3], list(lv.registry.specs())[-1], lv.registry.get("jacobi").own)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    first, second, third = done.stdout.splitlines()
+    assert first == "[] False"
+    assert "lavender.solvers.jacobi" in second and "external" not in second and "lemke" not in second
+    # The order of the table, whoever was asked for first.
+    assert third.startswith("['auto', 'direct', 'newton']") and third.endswith("True")
