@@ -86,7 +86,7 @@ def solve_many(
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
     # What the results of those to come take is kept free.
-    shares = [judging_time(p, False) if type(p) is Problem and deadline.is_set else 0.0 for p in given]
+    shares = [judging_time(p) if type(p) is Problem and deadline.is_set else 0.0 for p in given]
     deadline.keep(sum(shares))
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.

@@ -255,11 +255,12 @@ class Prepared:
             _check_records(self.spec, history, callback)
             if deadline.is_set:
                 asked = self.problem if problem is None else problem.disk
-                if deadline.passed(setup_time(asked)) and not self.spec.external:
-                    return self._unjudged(problem or self._given, asked, impulse, tol)
                 # Of what was found, and of where it began.
                 passes = 2 if impulse is not None or asked.guess is not None else 1
-                deadline.keep(passes * judging_time(asked))
+                last = passes * judging_time(asked)
+                if deadline.passed(setup_time(asked) + last) and not self.spec.external:
+                    return self._unjudged(problem or self._given, asked, impulse, tol)
+                deadline.keep(last)
             if self.solver is None:
                 if problem is not None and problem is not self._given:
                     _check_problem(problem, self.spec)

@@ -119,13 +119,18 @@ class Operators(ProblemData):
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @once
+    def _bound(self) -> Any:
+        # Of bodies: the most entries that A can have, and what it is formed by. Time limits ask it of every candidate.
+        return assemble.bound(self.data)
+
+    @once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
         # has it may exchange.
         if self.generalized is not None:
             return self._product()
         if self.rows is not None:
-            most, start, blocks = assemble.bound(self.data)
+            most, start, blocks = self._bound
             most = min(most, self.m**2)  # blocks that share both bodies count twice
             if most >= MOST_ENTRIES:
                 raise TooLarge(

@@ -9,10 +9,11 @@ from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from benchmarks.islands import fresh
-from lavender import deadline, registry, suite
+from lavender import deadline, registry, residuals, suite
 from lavender.residuals import judging_time
 from lavender.solvers.auto import Auto
 from lavender.solvers.methods import Candidate, Resumed, setup_time
+from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
 from lavender_ext.small import checked_sweeps
 
@@ -131,7 +132,7 @@ def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
             assert solution.status is lv.Status.TIME_LIMIT and "set up" in solution.message
             assert solution.solver.name == name and not solution.work
             assert solution.residual.relative == least
-    assert asked or name in ("sequential_impulses", "anderson", "nncg")
+    assert asked or name in ("sequential_impulses", "anderson", "nncg", "block_gauss_seidel")
 
 
 @pytest.mark.parametrize("name", [*OWN, "auto"])
@@ -200,6 +201,42 @@ def test_where_the_judge_would_be_late_the_start_goes_back_unjudged(name, clock)
         assert np.array_equal(solution.impulse, expected) and not solution.impulse.flags.writeable
         assert solution.residual.relative == lv.residual(problem, expected).relative
         assert solution.iterations == 0 and "unjudged" in solution.message and str(solution)
+
+
+@pytest.mark.parametrize("name", ["J and M, dense", "matrix, lcp", "bodies, coulomb"])
+def test_the_judge_begins_only_what_he_can_end(name, clock, monkeypatch):
+    """What he sets up fits, his pass behind it does not."""
+    problem = fresh(PROBLEMS[name]())
+    limit = residuals.setup_time(problem) + 0.9 * judging_time(problem)
+    solution = lv.solve(problem, "newton", time_limit=limit)
+    assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+    assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel"])
+def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock):
+    """A was counted, and so nothing begun, for sweeps that never read it."""
+    problem = PROBLEMS["J and M, dense"]()
+    residuals.reference(problem)
+    assert lv.solve(problem, name, time_limit=2.0 * judging_time(problem), max_iter=3).iterations == 3
+    assert "_compressed" not in vars(problem)
+
+
+def test_a_of_j_and_m_is_counted_by_its_products():
+    """Of a sparse J they are few; by the rows that share a tree, all of them, forming A was counted 30 times too dear."""
+    rng = np.random.default_rng(0)
+    jac = np.zeros((900, 300))
+    jac[np.arange(900)[:, None], rng.integers(0, 300, (900, 3))] = 1.0
+    mass = np.eye(300) + 1e-3 * (np.eye(300, k=1) + np.eye(300, k=-1))  # one tree
+    cones = lv.Cones.contacts(np.full(300, 0.5), 2)
+    sparse = lv.Problem.from_jacobian(jac, mass, np.ones(300), cones=cones)
+    full = over_velocities(900, 300)
+    for problem in (sparse, full):
+        whole = problem.metric.whitened()
+        columns = np.bincount(whole[1], minlength=300)
+        assert problem.metric.products_of_a >= np.sum(columns.astype(float) ** 2)
+    assert full.metric.products_of_a == 300 * 900**2
+    assert forming(sparse) < forming(full)
 
 
 @pytest.mark.parametrize("form", FORMS)
