@@ -123,6 +123,14 @@ class Operators(ProblemData):
         # Of bodies: the most entries that A can have, and what it is formed by. Time limits ask it of every candidate.
         return assemble.bound(self.data)
 
+    @property
+    def most_entries(self) -> float:
+        """Entries that A has, or can have at most where it is not formed."""
+        if self.matrix is not None or "_compressed" in self.__dict__:
+            return float(len(self._compressed[1]))
+        most = self._bound[0] if self.rows is not None else self.metric.entries_of_a
+        return min(float(most), float(self.m) ** 2)
+
     @once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever

@@ -42,11 +42,7 @@ DENSE, SPARSE, SPARSE_ROWS = (
 
 def entries_of(problem: Problem) -> float:
     """Entries of A, at most where it is not formed."""
-    if problem.matrix is not None or "_compressed" in problem.__dict__:
-        return float(len(problem._compressed[1]))
-    if problem.rows is not None:
-        return min(float(problem._bound[0]), float(problem.m) ** 2)
-    return min(float(problem.metric.entries_of_a), float(problem.m) ** 2)
+    return problem.most_entries
 
 
 def forming(problem: Problem) -> float:

@@ -223,7 +223,7 @@ def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock):
 
 
 def test_a_of_j_and_m_is_counted_by_its_products():
-    """Of a sparse J they are few; by the rows that share a tree, all of them, forming A was counted 30 times too dear."""
+    """Of a sparse J they are few; by rows that share a tree, all of them, forming A was counted 30 times too dear."""
     rng = np.random.default_rng(0)
     jac = np.zeros((900, 300))
     jac[np.arange(900)[:, None], rng.integers(0, 300, (900, 3))] = 1.0
@@ -290,6 +290,40 @@ def test_the_limit_of_many_is_of_the_whole_call(clock, monkeypatch):
         solutions = lv.solve_many(problems, time_limit=1.0, threads=threads)
         assert len(solutions) == 6 and clock.now <= 1.0
         assert solutions[0].success
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, clock):
+    """The judge's time was kept free for each: of 1,000 problems under 0.1 s nothing was solved."""
+    drawn = (FORMS[form](random_contact_problem(seed, "cone", 2, False)) for seed in range(20))
+    small = [fresh(p) for p in drawn if p.m <= registry.SMALL_ROWS for _ in range(50)]
+    without = lv.solve_many(small, threads=threads)
+    within = lv.solve_many([fresh(p) for p in small], time_limit=0.3, threads=threads)
+    assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
+    assert [a.status for a in within] == [b.status for b in without]
+
+
+def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
+    problems = [dense(100, "lcp", seed) for seed in range(4)]
+    first = lv.solve(problems[0])
+
+    def slow(*of, **more):
+        clock.now += 1.0
+        return first
+
+    monkeypatch.setattr(sys.modules["lavender.many"], "solve", slow)
+    starts = [None, None, np.ones(100), None]
+    made = lv.solve_many(problems, time_limit=0.5, impulses=starts)
+    assert made[0] is first or made[0].success
+    for problem, start, late in zip(problems[1:], starts[1:], made[1:], strict=True):
+        assert late.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+        assert np.array_equal(late.impulse, problem.start() if start is None else start)
+        assert (
+            late.residual.relative == lv.residual(problem, late.impulse).relative and "turn" in late.message
+        )
+    with pytest.raises(lv.CapabilityError):
+        lv.solve_many([problems[0], dense(30, "cone")], "direct", time_limit=0.5)
 
 
 def test_the_first_solve_imports_nothing():
