@@ -119,16 +119,16 @@ class Operators(ProblemData):
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @once
-    def _bound(self) -> Any:
-        # Of bodies: the most entries that A can have, and what it is formed by. Time limits ask it of every candidate.
-        return assemble.bound(self.data)
+    def _meetings(self) -> float:
+        # Rows of bodies that meet, those that share both twice; counted once, as time limits ask it of every candidate.
+        return float(assemble.bound(self.data)[0]) if self.rows is not None else 0.0
 
     @property
     def most_entries(self) -> float:
         """Entries that A has, or can have at most where it is not formed."""
         if self.matrix is not None or "_compressed" in self.__dict__:
             return float(len(self._compressed[1]))
-        most = self._bound[0] if self.rows is not None else self.metric.entries_of_a
+        most = self._meetings if self.rows is not None else self.metric.entries_of_a
         return min(float(most), float(self.m) ** 2)
 
     @once
@@ -138,7 +138,7 @@ class Operators(ProblemData):
         if self.generalized is not None:
             return self._product()
         if self.rows is not None:
-            most, start, blocks = self._bound
+            most, start, blocks = assemble.bound(self.data)
             most = min(most, self.m**2)  # blocks that share both bodies count twice
             if most >= MOST_ENTRIES:
                 raise TooLarge(

@@ -116,5 +116,5 @@ def _entries(problem: Problem) -> int | None:
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None
-    entries = int(problem._bound[0])
+    entries = int(problem._meetings)
     return entries if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else None

@@ -184,7 +184,7 @@ def _opening(problem: Problem) -> float:
     elif problem.rows is None:
         entries = problem.metric.entries_of_a
     else:
-        entries = 24 * problem.m if _is_over_bodies(problem) else int(problem._bound[0])
+        entries = 24 * problem.m if _is_over_bodies(problem) else int(problem._meetings)
     formed = 0.0
     if problem.generalized is not None:
         formed = 1e-9 * (weights.FORMED_START + weights.FORMED * float(problem.metric.entries_of_a))
