@@ -20,6 +20,7 @@ NAMES = (
     "gallery",
     "islands",
     "kernels",
+    "limits",
     "motions",
     "newton",
     "original",

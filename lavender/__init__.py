@@ -43,7 +43,7 @@ from lavender.errors import (
 from lavender.generalized import Generalized
 from lavender.problem import Problem, QPSolution
 from lavender.redundancy import Redundancy, redundancy
-from lavender.registry import TABLES, SolverSpec, available, get, known, load_table, register
+from lavender.registry import SolverSpec, available, get, known, register
 from lavender.residuals import Residual, residual
 from lavender.rows import Rows
 from lavender.solution import Claim, Solution, Status, Turn
@@ -172,5 +172,6 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-load_table(TABLES[0])  # with the package: the first solve may have a time limit
+for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
+    get(_name)  # with the package: the first solve may have a time limit
 lavender._starting.end()

@@ -1,7 +1,6 @@
 """Imported before everything else: are the kernels built? If not, what to do is said, not which module is missing."""
 
 import importlib.util
-from pathlib import Path
 
 #: Every solve passes through the judge; where its module is there, the build has run to its end.
 MODULE = "lavender_ext.judge.measure"
@@ -10,6 +9,8 @@ MODULE = "lavender_ext.judge.measure"
 def check(module: str = MODULE) -> None:
     """Raise ImportError where a compiled module of the kernels cannot be found."""
     if importlib.util.find_spec(module) is None:
+        from pathlib import Path  # with what it imports 4 % of `import lavender`
+
         spec = importlib.util.find_spec("lavender_ext")
         where = Path(spec.origin).parent if spec is not None and spec.origin else Path("lavender_ext")
         raise ImportError(

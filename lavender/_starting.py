@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from pathlib import PurePath
 from types import FrameType
 
 __all__ = ["begin", "end"]
@@ -22,10 +21,10 @@ def _is_command() -> bool:
     if first == "-m":  # as long as the module is looked for
         words = sys.orig_argv
         return words[words.index("-m") + 1] in ("lavender", "lavender.cli")
-    path = PurePath(first)
-    if path.name == "__main__.py":
-        return path.parent == PurePath(__file__).parent
-    return path.name.removesuffix(".exe").removesuffix("-script.py") == "lavender"
+    folder, name = os.path.split(first)
+    if name == "__main__.py":
+        return folder == os.path.dirname(__file__)
+    return name.removesuffix(".exe").removesuffix("-script.py") == "lavender"
 
 
 def _stop(number: int, frame: FrameType | None) -> None:

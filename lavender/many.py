@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from threading import Timer
 from time import perf_counter
 from typing import Any
 
@@ -21,12 +22,15 @@ from lavender.errors import InputError
 from lavender.loop import LEAST
 from lavender.problem import Problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import judging_time
 from lavender.solution import Solution, Status, uninterrupted
-from lavender.solve import check_budget, rest_of, seconds_of, solve
+from lavender.solve import check_budget, check_taken, rest_of, seconds_of, solve, unjudged
 from lavender_ext.small.many import Batch
 
 __all__ = ["solve_many"]
+
+LATE = 4e-5  # s, of a problem whose turn comes too late
+BATCHED = 0.1  # s left of a limit from which one compiled loop is asked: a problem in it takes a tenth of that at most
+NO_TURN = "the time limit was over before its turn: the start, unjudged"
 
 
 def solve_many(
@@ -54,7 +58,8 @@ def solve_many(
         As `solve`.
     time_limit : float, optional, s
         Limit of the whole call on the wall clock. Problems take their turns in order, each with all of the time left;
-        those whose turn comes too late keep their start.
+        those whose turn comes too late keep their start, unjudged until their residual is read. Below 0.1 s all are
+        solved one by one, without the compiled loop.
 
     Returns
     -------
@@ -85,46 +90,57 @@ def solve_many(
     limit = seconds_of(time_limit)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
-    # What the results of those to come take is kept free.
-    shares = [judging_time(p, False) if type(p) is Problem and deadline.is_set else 0.0 for p in given]
-    deadline.keep(sum(shares))
+    deadline.keep(LATE * len(given))  # for those whose turn comes too late
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
     together = spec.own and spec.small is not None and spec.small.limits is not None and not options
     together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
-    together = together and not deadline.is_set
+    together = together and (not deadline.is_set or not deadline.passed(BATCHED))
     at = [
         i
         for i, p in enumerate(given)
         if type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse
     ]
 
-    stop = bytearray(1)  # not 0: nothing more is begun
+    stop, full = bytearray(1), bytearray(1)  # not 0: nothing more is begun, or nothing more in a batch
+    left = deadline.left(LEAST)
+    alarm = Timer(left, full.__setitem__, (0, 1)) if together and at and left is not None else None
 
     def batch(part: list[int]) -> None:
-        _batch(given, starts, part, tol, spec, made, stop)
+        _batch(given, starts, part, tol, spec, made, full)
 
     def alone(i: int) -> None:
         if stop[0]:
             return
-        deadline.keep(-shares[i])
+        deadline.keep(-LATE)
+        if deadline.passed():
+            check_taken(given[i], spec)
+            made[i] = unjudged(given[i], spec, options, starts[i], tol, NO_TURN)
+            return
         found = solve(given[i], solver, impulse=starts[i], time_limit=deadline.left(LEAST), **more)
         made[i] = found if "callback" in options else uninterrupted(found)
 
+    if alarm is not None:
+        alarm.daemon = True
+        alarm.start()
     parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []
-    if threads == 1:
-        for part in parts:
-            batch(part)
-        for i, solution in enumerate(made):
-            if solution is None:
-                alone(i)
-    else:
-        with ThreadPoolExecutor(threads) as pool:
-            try:
-                list(pool.map(batch, parts))
-                list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
-            finally:
-                stop[0] = 1  # of Ctrl-C the other threads hear nothing
+    try:
+        if threads == 1:
+            for part in parts:
+                batch(part)
+            for i, solution in enumerate(made):
+                if solution is None:
+                    alone(i)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                try:
+                    list(pool.map(batch, parts))
+                    list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
+                finally:
+                    stop[0] = full[0] = 1  # of Ctrl-C the other threads hear nothing
+    finally:
+        if alarm is not None:
+            alarm.cancel()
     return [solution for solution in made if solution is not None]
 
 

@@ -217,7 +217,7 @@ class SolverSpec:
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
-        other = registered.get(self.with_bounds)
+        other = specs().get(self.with_bounds)
         bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
         return other if bounds else None
 
@@ -253,8 +253,13 @@ registered: dict[str, SolverSpec] = {}
 def load_table(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
     for spec in importlib.import_module(table).SPECS:
-        object.__setattr__(spec, "own", True)
-        registered.setdefault(spec.name, spec)
+        registered.pop(spec.name, None)  # those that were asked for by name go to their places, too
+        _add_own(spec)
+
+
+def _add_own(spec: SolverSpec) -> None:
+    object.__setattr__(spec, "own", True)
+    registered[spec.name] = spec
 
 
 @cache
@@ -314,15 +319,24 @@ def get(name: str) -> SolverSpec:
         Its package is not installed; the message says what to install.
     """
     spec = registered.get(name) if isinstance(name, str) else None
-    if spec is None:
-        load()
-        spec = registered.get(name) if isinstance(name, str) else None
+    if spec is None and isinstance(name, str):
+        spec = _found(name)
     if spec is None:
         raise UnknownName("solver", name, specs())
     reason = spec.missing()
     if reason:
         raise SolverUnavailable(f"solver {name!r} {reason}")
     return spec
+
+
+def _found(name: str) -> SolverSpec | None:
+    """One that is not registered yet: of ours its file alone is imported, for which a time limit has room."""
+    own: SolverSpec | None = importlib.import_module(TABLES[0]).spec_of(name)
+    if own is not None:
+        _add_own(own)
+        return own
+    load()
+    return registered.get(name)
 
 
 def known(problem: Problem | None = None) -> dict[str, str | None]:

@@ -56,8 +56,9 @@ __all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
 FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
 AT_REST = 1e-9  # m/s, V0 below which doing nothing counts as a solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
-RESULT, PASS = 2e-4, 1.5e-9  # s of one result, and for each multiply-add of the judge's pass
-WHITENED, READ = 3.5e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of a matrix
+# As `solvers/setup_times.py`, by the same command:
+RESULT, PASS = 1e-4, 1.5e-9  # s of one result, and for each multiply-add of the judge's pass
+WHITENED, READ = 4e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of it, or of a matrix
 OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
 CHUNK = 2**22  # numbers of J M^-1 that are formed at once: 32 MB
 
@@ -236,22 +237,32 @@ def judged(problem: Problem, impulse: FloatArray) -> measure.Judged:
     return measure.Judged(data, impulse)
 
 
-def judging_time(problem: Problem, known: bool = True) -> float:
-    """What a pass of the judge takes [s] and the result made of it, counted of what he reads, or of rows alone."""
-    return RESULT + PASS * float(problem.metric.work if known else OF_ROW * problem.m)
+def judging_time(problem: Problem) -> float:
+    """What a pass of the judge takes [s] and the result made of it, counted of what he reads, set up or not."""
+    return RESULT + PASS * (float(problem.metric.work) if _is_set_up(problem) else _read(problem)[0])
 
 
 def setup_time(problem: Problem) -> float:
     """What the judge sets up before his first pass takes [s], as counted: A in rows, J L^-1, or numbers of bodies."""
-    general, view = problem.generalized, problem.derived.view
-    if "metric" in problem.__dict__ or (view is not None and view.ready):
-        return 0.0
+    return 0.0 if _is_set_up(problem) else _read(problem)[1]
+
+
+def _is_set_up(problem: Problem) -> bool:
+    view = problem.derived.view
+    return "metric" in problem.__dict__ or (view is not None and view.ready)
+
+
+def _read(problem: Problem) -> tuple[float, float]:
+    """Multiply-adds of a pass at most, and what setting it up takes [s]."""
+    general = problem.generalized
     if general is not None:
-        factor, trees = len(general.operator.mass[1]), int(np.count_nonzero(general.operator.parents < 0))
-        return WHITENED * general.m * factor * min(2.0 / max(trees, 1), 1.0)
+        # A row of Y has at most the entries of J's with all that L reaches from them, by the mean of L's rows.
+        reached = (len(general.operator.mass[1]) + general.operator.fill) / max(general.nv, 1)
+        entries = min(len(general.operator.jac[1]) * reached, float(general.m) * general.nv)
+        return 2.0 * entries, (READ + WHITENED * reached) * entries
     if problem.rows is not None:
-        return PASS * OF_ROW * problem.m
-    return READ * float(problem.matrix.size)
+        return OF_ROW * float(problem.m), PASS * OF_ROW * problem.m
+    return float(problem.matrix.size), READ * float(problem.matrix.size)
 
 
 def remember(problem: Problem, last: measure.Judged) -> None:

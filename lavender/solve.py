@@ -42,6 +42,7 @@ __all__ = ["Prepared", "prepare", "solve"]
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
+JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -162,7 +163,7 @@ class Prepared:
         self, problem: Problem, spec: SolverSpec, options: dict[str, Any], begin: bool = True
     ) -> None:
         watch = Stopwatch()  # a check may form A, which is set-up
-        _check_problem(problem, spec)
+        check_taken(problem, spec)
         for name in options:
             if name not in spec.accepts:
                 if name in FRONT_DOOR:
@@ -255,14 +256,15 @@ class Prepared:
             _check_records(self.spec, history, callback)
             if deadline.is_set:
                 asked = self.problem if problem is None else problem.disk
-                if deadline.passed(setup_time(asked)) and not self.spec.external:
-                    return self._unjudged(problem or self._given, asked, impulse, tol)
                 # Of what was found, and of where it began.
                 passes = 2 if impulse is not None or asked.guess is not None else 1
-                deadline.keep(passes * judging_time(asked))
+                last = passes * judging_time(asked)
+                if deadline.passed(setup_time(asked) + last) and not self.spec.external:
+                    return unjudged(problem or self._given, self.spec, self.options, impulse, tol, JUDGE_LATE)
+                deadline.keep(last)
             if self.solver is None:
                 if problem is not None and problem is not self._given:
-                    _check_problem(problem, self.spec)
+                    check_taken(problem, self.spec)
                     self._replace(problem)
                 self._begin(deadline)
             self._refresh(problem, deadline)
@@ -272,18 +274,6 @@ class Prepared:
             if self._late:
                 self.solver, self._late = None, False  # the next call begins again
             self._lock.release()
-
-    def _unjudged(self, given: Problem, problem: Problem, impulse: Any, tol: float) -> Solution:
-        """The start as it is, where even the judge would be late; he measures it for the first who asks."""
-        start = problem._start if problem.guess is None else problem.guess
-        if impulse is not None:
-            start = given.on_disk(problem.impulse_array(impulse))
-        claim = Claim(
-            TIME_LIMIT, 0, {}, "what the judge reads takes longer than the time limit: the start, unjudged"
-        )
-        answer = start if given is problem else given.cones.stretch * start
-        late = judged_later, (given, problem, self.spec, self.options, start.copy(), claim, tol)
-        return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late)
 
     def _loop(
         self, impulse: Any, tol: float, deadline: Deadline, history: bool, callback: Callback | None
@@ -335,7 +325,7 @@ class Prepared:
                 self._set_up(self.problem, False, deadline)
         else:
             watch = Stopwatch()
-            _check_problem(problem, self.spec)
+            check_taken(problem, self.spec)
             given, problem = problem, problem.disk
             self._set_up(problem, not same_structure(self.problem, problem), deadline)
             self.setup_time = watch.seconds
@@ -365,6 +355,19 @@ class Prepared:
             raise  # before the start
         except BREAKDOWN as error:
             self.state, self._broken = None, last_words(error)
+
+
+def unjudged(
+    given: Problem, spec: SolverSpec, options: dict[str, Any], impulse: Any, tol: float, words: str
+) -> Solution:
+    """The start as it is, where even the judge would be late; he measures it for the first who asks."""
+    problem = given.disk
+    start = problem._start if problem.guess is None else problem.guess
+    if impulse is not None:
+        start = given.on_disk(problem.impulse_array(impulse))
+    answer = start if given is problem else given.cones.stretch * start
+    late = judged_later, (given, problem, spec, options, start.copy(), Claim(TIME_LIMIT, 0, {}, words), tol)
+    return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late)
 
 
 def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
@@ -501,7 +504,8 @@ def rest_of(
     }
 
 
-def _check_problem(problem: Problem, spec: SolverSpec) -> None:
+def check_taken(problem: Problem, spec: SolverSpec) -> None:
+    """Raise where it is no problem, or the solver refuses it."""
     check_problem(problem)
     reason = spec.refuses(problem)
     if reason:

@@ -30,6 +30,7 @@ SERVED = "lavender.external._served"
 ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
 WORDS = 500  # characters of what a backend said
 GRACE = 2.0  # limits after which a backend that was told its own is ended
+ENTRY = 12.0  # bytes of an entry of a program
 HAND_OVER = 3e8  # bytes in a second that go to another process: pickled, through a pipe, and back into arrays
 
 _lock = Lock()

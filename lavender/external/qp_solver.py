@@ -20,6 +20,7 @@ from lavender.solution import Claim, Status
 __all__ = ["OPTIONS", "QPSolver", "refusal"]
 
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
+START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
 OPTIONS = {
     "isolate": "where a time_limit is given, the backend runs in a process of its own, which is ended; default True",
     "form": "'impulse', 'velocity' (needs rows) or 'auto' (default): by size, mass ratio and backend",
@@ -44,6 +45,11 @@ class QPSolver:
                 f"settings is a {type(self.settings).__name__}; a mapping of names to values is needed"
             )
         flag("isolate", self.isolate)
+
+    def setup_time(self, problem: Problem) -> float:
+        """What forming the program takes [s], and handing it over where it runs elsewhere, as counted."""
+        entry = PROGRAM + (apart.ENTRY / apart.HAND_OVER if self.isolate else 0.0)
+        return START + entry * problem.most_entries
 
     @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> QP:

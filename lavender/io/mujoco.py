@@ -78,6 +78,7 @@ OTHER_MODEL = "The model was changed, or MjData is of another one: give a model 
 _SEEN: WeakKeyDictionary[Any, Any] = (
     WeakKeyDictionary()
 )  # a model's operator, whose pattern is compared before use
+NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 NO_CONTACT = SimpleNamespace(
     dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
 )
@@ -125,8 +126,8 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     mj = _mujoco(model, data)
     opt = model.opt
     m, n, dt = int(data.nefc), int(model.nv), _timestep(opt)
-    smooth = data.qacc_smooth
-    mass = _mass(mj, model, data, smooth)
+    smooth, before = data.qacc_smooth, _SEEN.get(model)
+    mass = _mass(mj, model, data, smooth, NO_TRIANGLE if before is None else before.mass[:2])
     cones, scale, key, held = _blocks(mj, model, data, dt)
     jac = _rows(mj, model, data, m, n, scale)
     rhs, softness, v_free, sound, gap, gaps = export.numbers(
@@ -137,7 +138,6 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     if not gap <= SAME:
         softness, sound = _compliance(data) * scale * scale, False
     names = Names(cones.n_blocks, lambda: _words(mj, model, held, m))
-    before = _SEEN.get(model)
     general = Generalized.compressed(jac, mass, v_free, like=before)
     if before is None or before.n != n:
         _SEEN[model] = general.operator
@@ -231,8 +231,8 @@ def _timestep(opt: Any) -> float:
     return dt
 
 
-def _mass(mj: Any, model: Any, data: Any, smooth: Any) -> Any:
-    """(indptr, indices, data) of M's lower triangle.
+def _mass(mj: Any, model: Any, data: Any, smooth: Any, like: Any) -> Any:
+    """(indptr, indices, data) of M's lower triangle, the first two those of `like` where they are the same.
 
     M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
     """
@@ -240,7 +240,7 @@ def _mass(mj: Any, model: Any, data: Any, smooth: Any) -> Any:
         parts = model.M_rowadr, model.M_rownnz, model.M_colind, data.M
     except AttributeError:  # an earlier MuJoCo
         parts = _whole_mass(mj, model, data)
-    made = export.lower(*parts, smooth, data.qfrc_smooth)
+    made = export.lower(*parts, smooth, data.qfrc_smooth, like)
     if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
     mass, gap = made

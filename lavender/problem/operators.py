@@ -119,6 +119,19 @@ class Operators(ProblemData):
         return sp.csr_array((data, indices, indptr), shape=(self.m, self.m))
 
     @once
+    def _meetings(self) -> float:
+        # Rows of bodies that meet, those that share both twice; counted once, as time limits ask it of every candidate.
+        return float(assemble.bound(self.data)[0]) if self.rows is not None else 0.0
+
+    @property
+    def most_entries(self) -> float:
+        """Entries that A has, or can have at most where it is not formed."""
+        if self.matrix is not None or "_compressed" in self.__dict__:
+            return float(len(self._compressed[1]))
+        most = self._meetings if self.rows is not None else self.metric.entries_of_a
+        return min(float(most), float(self.m) ** 2)
+
+    @once
     def _compressed(self) -> tuple[IntArray, IntArray, FloatArray]:
         # (indptr, indices, data) of A. Kernels and the judge read these: `csr` is an object whose arrays whoever
         # has it may exchange.

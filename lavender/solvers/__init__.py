@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from importlib import import_module
+from typing import Any
 
 from lavender.registry import SolverSpec
+
+__all__ = ["SPECS", "spec_of"]
 
 # File in this folder, with its SPEC; from the exact to the plain.
 _TABLE = (
@@ -23,4 +26,15 @@ _TABLE = (
     "gauss_seidel",
 )
 
-SPECS: tuple[SolverSpec, ...] = tuple(import_module(f"{__name__}.{name}").SPEC for name in _TABLE)
+SPECS: tuple[SolverSpec, ...]  # of all, imported when they are first asked for
+
+
+def spec_of(name: str) -> SolverSpec | None:
+    """The spec of one solver, whose file is imported now if it was not before; None if it is not in the table."""
+    return import_module(f"{__name__}.{name}").SPEC if name in _TABLE else None
+
+
+def __getattr__(name: str) -> Any:
+    if name != "SPECS":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return tuple(map(spec_of, _TABLE))

@@ -13,7 +13,6 @@ from lavender.solution import Claim
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated
-from lavender_ext.core import assemble
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
@@ -117,5 +116,5 @@ def _entries(problem: Problem) -> int | None:
     rows = problem.rows
     if rows is None or problem.law != "lcp" or rows.n_joints or problem.m > problem.n_blocks:
         return None
-    entries = int(assemble.bound(problem.data)[0])
+    entries = int(problem._meetings)
     return entries if entries <= min(NEIGHBOURS * problem.m, ENTRIES) else None

@@ -34,7 +34,6 @@ from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.setup_times import loading
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
-from lavender_ext.core import assemble
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
@@ -185,7 +184,7 @@ def _opening(problem: Problem) -> float:
     elif problem.rows is None:
         entries = problem.metric.entries_of_a
     else:
-        entries = 24 * problem.m if _is_over_bodies(problem) else int(assemble.bound(problem.data)[0])
+        entries = 24 * problem.m if _is_over_bodies(problem) else int(problem._meetings)
     formed = 0.0
     if problem.generalized is not None:
         formed = 1e-9 * (weights.FORMED_START + weights.FORMED * float(problem.metric.entries_of_a))

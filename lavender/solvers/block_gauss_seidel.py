@@ -18,7 +18,8 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, swept
+from lavender.solvers.setup_times import forming
+from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.local import gauss_seidel
 from lavender_ext.sweep import serial
 
@@ -26,6 +27,9 @@ from lavender_ext.sweep import serial
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
     """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+
+    def _forming(self, problem: Problem) -> float:
+        return forming(problem) if problem.rows is None and not reads_whitened(problem) else 0.0
 
     def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
         data = swept(problem)

@@ -18,7 +18,7 @@ from lavender.ordering import block_order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
-from lavender.solvers.setup_times import forming
+from lavender.solvers.setup_times import summed
 from lavender.solvers.sweeping import SweepState, run_kernel
 from lavender_ext.sweep import serial
 
@@ -49,7 +49,7 @@ class Jacobi:
 
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""
-        return forming(problem)
+        return summed(problem)
 
     def prepare(self, problem: Problem) -> JacobiState:
         return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)

@@ -21,6 +21,7 @@ from lavender.ordering import Order
 from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.solution import Claim
+from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import SweepState, Threaded, plan_of, reads_whitened, run_kernel, run_threads
 from lavender_ext.sweep import serial
 
@@ -44,6 +45,9 @@ class PGS(Threaded):
         if self.uses_threads(state):
             return run_threads(state, impulse, max_iter, tol, self.threads)
         return run_kernel(state, impulse, max_iter, tol)
+
+    def _forming(self, problem: Problem) -> float:
+        return 0.0 if reads_whitened(problem) else forming(problem)
 
     def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
         if reads_whitened(problem):

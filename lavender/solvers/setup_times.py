@@ -1,16 +1,16 @@
 """What set-ups take [s], counted from a problem's size before any of it is done: asked under a time limit alone.
 
-A set-up cannot be stopped, so one that does not fit in the time left is not begun. Rates are of one core of 2023, and
-about half as much again as measured on quiet problems of the suite and of dense matrices.
+A set-up cannot be stopped, so one that does not fit in the time left is not begun. Rates are of one core of 2023, half
+as much again as `python -m benchmarks limits` finds on problems of the suite, dense matrices, and J and M.
 """
 
 from __future__ import annotations
 
 import sys
 
+from lavender import residuals
 from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
-from lavender_ext.core import assemble
 
 __all__ = [
     "entries_of",
@@ -21,15 +21,16 @@ __all__ = [
     "over_bodies",
     "over_rows",
     "over_velocities",
+    "summed",
     "sweeping",
 ]
 
-START = 6e-5  # s, of each
-# s for each entry of A: formed of bodies, or of J and M, with as many products for each as a row of Y has entries;
-# compared with its mirror image; laid out for a factor by Python.
-FORMED, PRODUCT, COMPARED, LAID_OUT = 1e-8, 2e-9, 1.2e-8, 6e-8
+START = 5e-5  # s, of each
+ROW, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
+# s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.
+LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
 # s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
-BODIES, VELOCITIES, ORDERED = 4e-8, 4.5e-8, 1e-7
+BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
 LOADING = 0.3  # s of a part of SciPy
 DENSE, SPARSE, SPARSE_ROWS = (
@@ -41,19 +42,18 @@ DENSE, SPARSE, SPARSE_ROWS = (
 
 def entries_of(problem: Problem) -> float:
     """Entries of A, at most where it is not formed."""
-    if problem.matrix is not None or "_compressed" in problem.__dict__:
-        return float(len(problem._compressed[1]))
-    if problem.rows is not None:
-        return min(float(assemble.bound(problem.data)[0]), float(problem.m) ** 2)
-    return min(float(problem.metric.entries_of_a), float(problem.m) ** 2)
+    return problem.most_entries
 
 
 def forming(problem: Problem) -> float:
     """A, where it is not known yet."""
     if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:
         return 0.0
-    in_row = 0.0 if problem.rows is not None else problem.metric.work / (2.0 * problem.m)
-    return START + (FORMED + PRODUCT * in_row) * entries_of(problem)
+    if problem.rows is None:
+        entries = PRODUCT * float(problem.metric.products_of_a)
+    else:
+        entries = FORMED * entries_of(problem)
+    return START + ROW * problem.m + entries
 
 
 def loading(*modules: str) -> float:
@@ -64,9 +64,17 @@ def loading(*modules: str) -> float:
 def over_rows(problem: Problem) -> float:
     """A, whether it is symmetric, and a matrix that a solver makes of it."""
     entries = entries_of(problem)
-    compared = COMPARED * entries if problem.matrix is not None and "_scan" not in problem.__dict__ else 0.0
+    compared = (
+        residuals.READ * entries if problem.matrix is not None and "_scan" not in problem.__dict__ else 0.0
+    )
     loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
-    return START + forming(problem) + compared + LAID_OUT * entries + loaded
+    laid_out = WHOLE if entries == float(problem.m) ** 2 else LAID_OUT
+    return START + forming(problem) + compared + laid_out * entries + loaded
+
+
+def summed(problem: Problem) -> float:
+    """A, and sums of its rows by SciPy."""
+    return forming(problem) + SUMMED * entries_of(problem) + START + loading("scipy.sparse")
 
 
 def factored(problem: Problem) -> float:

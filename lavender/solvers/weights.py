@@ -7,16 +7,16 @@ whole are the fitted rates of `rates.json` (`costs.py`).
 from __future__ import annotations
 
 import json
+import os
 from functools import cache
 from math import log10
-from pathlib import Path
 from typing import Any
 
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers.newton_systems.systems import PANELS, MatrixSystem, System
 
-RATES = Path(__file__).with_name("rates.json")
+RATES = os.path.join(os.path.dirname(__file__), "rates.json")
 SWEEP = {"linear": 1.05, "lcp": 1.0, "coulomb": 0.65, "cone": 1.25}  # for each multiply-add of a sweep,
 SWEEP_ROW = 5.0  # and each of its rows
 DENSE, DENSE_ENTRY = 0.03, 3.0  # for each multiply-add of a dense factor, and for each entry of its matrix
@@ -36,7 +36,8 @@ FORMED_START, FORMED = 60e3, 2.0  # of A formed of J and M, and of each of its e
 @cache
 def rates() -> dict[str, Any]:
     """Of `rates.json`, read once."""
-    found: dict[str, Any] = json.loads(RATES.read_text(encoding="utf-8"))
+    with open(RATES, encoding="utf-8") as file:
+        found: dict[str, Any] = json.load(file)
     return found
 
 

@@ -10,6 +10,7 @@ Rows that stand together and reach the same columns share a panel: one list of c
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
+from libc.string cimport memcpy
 
 
 cdef enum:
@@ -103,49 +104,101 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or has no reciprocal."""
-    cdef int32_t k, q, a, b, j, first, count, at, i
-    cdef double inv, f
-    for q in range(lptr[n]):
-        lval[q] = 0.0
+    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or has no reciprocal.
+
+    Two rows of a chain, whose columns are the same but for the upper one's own place, are eliminated together: with the
+    bits of one after the other, and half of what is read and written.
+    """
+    cdef int32_t k, q, a, j, first, count, at
+    cdef double f, g
+    cdef double* l
+    cdef double* u
     for k in range(n):
-        pivot[k] = 0.0
-        inv_pivot[k] = 0.0
         at = lptr[k]
-        for q in range(mptr[k], mptr[k + 1]):
+        first = mptr[k]
+        count = mptr[k + 1] - first - 1
+        if lptr[k + 1] - at == count >= 0 and midx[first + count] == k:     # no fill
+            memcpy(lval + at, mval + first, count * sizeof(double))
+            pivot[k] = inv_pivot[k] = mval[first + count]   # M_kk, until its row is eliminated
+            continue
+        pivot[k] = inv_pivot[k] = 0.0
+        for q in range(at, lptr[k + 1]):
+            lval[q] = 0.0
+        for q in range(first, mptr[k + 1]):
             j = midx[q]
             if j == k:
-                pivot[k] = mval[q]
-                inv_pivot[k] = mval[q]                      # M_kk, until its row is eliminated
+                pivot[k] = inv_pivot[k] = mval[q]
             elif j < k:
                 while lidx[at] != j:
                     at += 1
                 lval[at] = mval[q]
-    for k in range(n - 1, -1, -1):
-        if not pivot[k] > 8.8817841970012523e-16 * inv_pivot[k]:
+    k = n - 1
+    while k >= 0:
+        if not has_reciprocal(pivot, inv_pivot, k):
             return k
-        inv = 1.0 / pivot[k]
-        if not inv <= 1.7976931348623157e308:
-            return k
-        inv_pivot[k] = inv
         first = lptr[k]
-        for a in range(lptr[k + 1] - 1, first - 1, -1):
-            j = lidx[a]
-            f = lval[a] * inv
-            pivot[j] -= f * lval[a]
-            count = a - first
-            at = lptr[j]
-            if lptr[j + 1] - at == count:                   # the same columns
-                for b in range(count):
-                    lval[at + b] -= f * lval[first + b]
+        count = lptr[k + 1] - first
+        l = lval + first
+        if count == 0 or lidx[first + count - 1] != k - 1 or first - lptr[k - 1] != count - 1:
+            for a in range(count - 1, -1, -1):
+                j = lidx[first + a]
+                f = l[a] * inv_pivot[k]
+                pivot[j] -= f * l[a]
+                take_row(lptr, lidx, lval, j, first, a, f, l)
+                l[a] = f
+            k -= 1
+            continue
+        count -= 1                                          # of row k - 1, which row k leaves first
+        u = lval + lptr[k - 1]
+        f = l[count] * inv_pivot[k]
+        pivot[k - 1] -= f * l[count]
+        take_from(u, l, f, count)
+        l[count] = f
+        k -= 1
+        if not has_reciprocal(pivot, inv_pivot, k):
+            return k
+        for a in range(count - 1, -1, -1):
+            j = lidx[first + a]
+            f = l[a] * inv_pivot[k + 1]
+            g = u[a] * inv_pivot[k]
+            pivot[j] = (pivot[j] - f * l[a]) - g * u[a]
+            if lptr[j + 1] - lptr[j] == a:                  # the same columns
+                take_two(lval + lptr[j], l, f, u, g, a)
             else:
-                for b in range(count):
-                    i = lidx[first + b]
-                    while lidx[at] != i:
-                        at += 1
-                    lval[at] -= f * lval[first + b]
-            lval[a] = f
+                take_row(lptr, lidx, lval, j, first, a, f, l)
+                take_row(lptr, lidx, lval, j, first, a, g, u)
+            l[a] = f
+            u[a] = g
+        k -= 1
     return -1
+
+
+cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k) noexcept nogil:
+    # inv_pivot holds M_kk before, 1 / D_k afterwards.
+    if not pivot[k] > 8.8817841970012523e-16 * inv_pivot[k]:
+        return False
+    inv_pivot[k] = 1.0 / pivot[k]
+    return inv_pivot[k] <= 1.7976931348623157e308
+
+
+cdef inline void take_row(const int32_t* lptr, const int32_t* lidx, double* lval, int32_t j, int32_t first,
+                          int32_t count, double f, const double* l) noexcept nogil:
+    """Row j loses f l (count), which stands on the columns from place `first`."""
+    cdef int32_t b, i, at = lptr[j]
+    if lptr[j + 1] - at == count:                           # the same columns
+        take_from(lval + at, l, f, count)
+        return
+    for b in range(count):
+        i = lidx[first + b]
+        while lidx[at] != i:
+            at += 1
+        lval[at] -= f * l[b]
+
+
+cdef inline void take_two(double* x, const double* l, double f, const double* u, double g, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] = (x[i] - f * l[i]) - g * u[i]
 
 
 cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,

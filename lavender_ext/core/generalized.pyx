@@ -1,6 +1,7 @@
 """J and M of generalised coordinates for Python: M's factor, kept, and what the judge and the solvers read of it."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
+from libc.string cimport memcmp
 
 import numpy as np
 
@@ -60,16 +61,12 @@ cdef class Operator:
 
     cdef bint has_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
         cdef const int32_t[::1] own_ptr = self.mass[0], own_idx = self.mass[1]
-        cdef Py_ssize_t i
-        if own_ptr.shape[0] != mptr.shape[0] or own_idx.shape[0] != midx.shape[0]:
+        cdef Py_ssize_t n = mptr.shape[0], nnz = midx.shape[0]
+        if own_ptr.shape[0] != n or own_idx.shape[0] != nnz:
             return False
-        for i in range(mptr.shape[0]):
-            if own_ptr[i] != mptr[i]:
-                return False
-        for i in range(midx.shape[0]):
-            if own_idx[i] != midx[i]:
-                return False
-        return True
+        if memcmp(&own_ptr[0], &mptr[0], n * sizeof(int32_t)) != 0:
+            return False
+        return nnz == 0 or memcmp(&own_idx[0], &midx[0], nnz * sizeof(int32_t)) == 0
 
     cdef tuple find_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
         # L's columns by the elimination of M; the arrays that hold them.

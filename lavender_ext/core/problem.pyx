@@ -519,6 +519,20 @@ cdef class Data:
         cdef double[::1] on = np.empty(self.general.n + 1)
         return entries_of(&self.general, &on[0])
 
+    @property
+    def products_of_a(self):
+        """Multiply-adds of A = Y Y^T, of J and M: of each column of Y the square of its entries."""
+        cdef const generalized_t* g = &self.general
+        cdef double[::1] on = np.zeros(g.n + 1)
+        cdef int32_t b, q
+        cdef double out = 0.0
+        for b in range(g.n_panels):
+            for q in range(g.pcol[b], g.pcol[b + 1]):
+                on[g.cols[q]] += g.prow[b + 1] - g.prow[b]
+        for b in range(g.n):
+            out += on[b] * on[b]
+        return out
+
     def whitened(self):
         """(data, indices, indptr) of Y (m, n) in generalised coordinates; entries that are zero are left out."""
         cdef const generalized_t* g = &self.general

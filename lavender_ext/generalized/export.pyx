@@ -7,6 +7,7 @@ whose coefficients f differ has the rows of its tangents scaled by f_j / f_0, so
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
+from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
@@ -229,46 +230,69 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
 
 
 def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, const double[::1] values,
-          const double[:] x, const double[:] y):
+          const double[:] x, const double[:] y, tuple like):
     """M's rows by first place and length as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
-    Columns ascend to the diagonal entry. None where these are no lower triangle, row behind row.
+    Columns ascend to the diagonal entry. None where these are no lower triangle, row behind row. `like` is (indptr,
+    indices) of such a triangle, which are shared where they are these.
     """
-    cdef int32_t i, q, j, last, n = <int32_t>first.shape[0], nnz = <int32_t>columns.shape[0]
-    cdef double gap = 0.0, big = 0.0, own, size
-    if not n == count.shape[0] == x.shape[0] == y.shape[0] or nnz != values.shape[0]:
-        return None
-    whole, copy, scratch = new(n + 1 + nnz, I4), new(nnz), np.zeros(2 * n + 1)
-    cdef int32_t[::1] at = whole
-    cdef double[::1] value = copy, s = scratch          # M x, |M| |x|
-    at[0] = 0
-    for i in range(n):
-        if first[i] != at[i] or not 0 < count[i] <= nnz - at[i]:
-            return None
-        at[i + 1] = at[i] + count[i]
-        last = -1
-        own = size = 0.0
-        for q in range(at[i], at[i + 1]):
-            j = columns[q]
-            if not last < j <= i:
+    cdef int32_t i, q, j, end, last, n = <int32_t>first.shape[0], nnz = <int32_t>columns.shape[0]
+    cdef double gap = 0.0, big = 0.0, own, size, z, w, term
+    cdef const int32_t[::1] seen_at = like[0], seen = like[1]
+    cdef int32_t[::1] whole
+    cdef const int32_t* at
+    cdef const int32_t* column
+    cdef double* out
+    cdef double* made
+    cdef double* sizes
+    cdef double* v
+    if not n == count.shape[0] == x.shape[0] == y.shape[0] or nnz != values.shape[0] or n == 0:
+        return None if n or nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
+    if not (seen_at.shape[0] == n + 1 and seen.shape[0] == nnz and seen_at[n] == nnz
+            and memcmp(&seen_at[0], &first[0], n * sizeof(int32_t)) == 0
+            and memcmp(&seen[0], &columns[0], nnz * sizeof(int32_t)) == 0 and are_lengths(n, &seen_at[0], &count[0])):
+        like = new(n + 1, I4), np.array(columns, I4)
+        whole = like[0]
+        whole[0] = 0
+        for i in range(n):
+            if first[i] != whole[i] or not 0 < count[i] <= nnz - whole[i]:
                 return None
-            last = j
-            at[n + 1 + q] = j
-            value[q] = values[q]
-            own += values[q] * x[j]
-            size += fabs(values[q] * x[j])
-            s[j] += values[q] * x[i]
-            s[n + j] += fabs(values[q] * x[i])
-        if last != i:
+            whole[i + 1] = whole[i] + count[i]
+            last = -1
+            for q in range(whole[i], whole[i + 1]):
+                if not last < columns[q] <= i:
+                    return None
+                last = columns[q]
+            if last != i:
+                return None
+        if whole[n] != nnz:
             return None
-        s[i] = own                                      # the diagonal entry once
-        s[n + i] = size
-    if at[n] != nnz:
-        return None
+        for made_ in like:
+            made_.setflags(False)
+        seen_at, seen = like
+    at, column = &seen_at[0], &seen[0]
+    copy, scratch = new(nnz), new(3 * n)
+    cdef double[::1] value = copy, s = scratch
+    out, made, sizes, v = &value[0], &s[0], &s[n], &s[2 * n]    # M x, |M| |x|, x
+    memcpy(out, &values[0], nnz * sizeof(double))
     for i in range(n):
-        gap = widest(gap, s[i] - y[i])
-        big = widest(big, s[n + i] + fabs(y[i]))
-    return (whole[:n + 1], whole[n + 1:], copy), gap / big if big > 0.0 else gap
+        own = size = 0.0
+        z = v[i] = x[i]
+        w = fabs(z)
+        end = at[i + 1] - 1
+        for q in range(at[i], end):
+            j = column[q]
+            own += out[q] * v[j]
+            term = fabs(out[q])
+            size += term * fabs(v[j])
+            made[j] += out[q] * z
+            sizes[j] += term * w
+        made[i] = own + out[end] * z
+        sizes[i] = size + fabs(out[end]) * w
+    for i in range(n):
+        gap = widest(gap, made[i] - y[i])
+        big = widest(big, sizes[i] + fabs(y[i]))
+    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
 def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
@@ -279,27 +303,33 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
 
     0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
     """
-    cdef Py_ssize_t i, j, k
-    cdef double term, big = 0.0, gap = 0.0, filled = 0.0
-    scratch = np.zeros((spatial.shape[0], 6))
-    cdef double[:, ::1] made = scratch
-    if not body.shape[0] == axis.shape[0] == v.shape[0] or parent.shape[0] != spatial.shape[0]:
+    cdef Py_ssize_t i, j, k, n = v.shape[0], bodies = spatial.shape[0]
+    cdef double term, z, big = 0.0, gap = 0.0, filled = 0.0
+    if not body.shape[0] == axis.shape[0] == n or parent.shape[0] != bodies or bodies == 0:
         return -1.0, 0.0
-    for i in range(spatial.shape[0]):
-        if not 0 <= parent[i] < spatial.shape[0]:
+    scratch = np.zeros((bodies, 6))
+    cdef double[:, ::1] made_ = scratch
+    cdef double* made = &made_[0, 0]
+    cdef const double* c = &spatial[0, 0]
+    cdef const double* s = &axis[0, 0] if n else NULL
+    cdef const int32_t* of = &body[0] if n else NULL
+    cdef const int32_t* up = &parent[0]
+    for i in range(bodies):
+        if not 0 <= up[i] < bodies:
             return -1.0, 0.0
-    for j in range(v.shape[0]):
-        if not 0 <= body[j] < spatial.shape[0]:
+    for j in range(n):
+        if not 0 <= of[j] < bodies:
             return -1.0, 0.0
+        z = v[j]
         for k in range(6):
-            term = axis[j, k] * v[j]
-            made[body[j], k] += term
+            term = s[6 * j + k] * z
+            made[6 * of[j] + k] += term
             big = widest(big, term)
-            filled = widest(filled, axis[j, k])
-    for i in range(1, spatial.shape[0]):
+            filled = widest(filled, s[6 * j + k])
+    for i in range(1, bodies):
         for k in range(6):
-            gap = widest(gap, made[i, k] + spatial[parent[i], k] - spatial[i, k])
-            big = widest(big, spatial[i, k])
+            gap = widest(gap, made[6 * i + k] + c[6 * up[i] + k] - c[6 * i + k])
+            big = widest(big, c[6 * i + k])
     return (gap if filled != 0.0 else 0.0), big
 
 
@@ -365,6 +395,14 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
+
+
+cdef inline bint are_lengths(int32_t n, const int32_t* at, const int32_t* count) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        if at[i + 1] - at[i] != count[i]:
+            return False
+    return True
 
 
 cdef inline double widest(double so_far, double x) noexcept nogil:

@@ -400,6 +400,23 @@ def test_an_index_that_names_what_is_not_there_is_refused_before_it_is_followed(
                 adapter.jacobian(model, data)
 
 
+@pytest.mark.parametrize("name", ["M_colind", "M_rowadr", "M_rownnz"])
+def test_a_pattern_of_m_that_was_seen_before_is_compared_not_believed(name):
+    model, data = state(jacobian="sparse")
+    first = lv.io.from_mujoco(model, data)
+    again = lv.io.from_mujoco(model, data)
+    assert again.generalized == first.generalized
+    assert again.generalized.operator.mass[1] is first.generalized.operator.mass[1]
+    whole = getattr(model, name)
+    for at in (0, len(whole) // 2, len(whole) - 1):
+        kept = int(whole[at])
+        whole[at] = kept + 1
+        with pytest.raises(lv.InputError, match="M_rowadr"):
+            lv.io.from_mujoco(model, data)
+        whole[at] = kept
+    assert lv.io.from_mujoco(model, data).generalized == first.generalized
+
+
 @pytest.mark.parametrize("name", ["nefc", "ncon", "nJ"])
 @pytest.mark.parametrize("value", [-1, 2**30])
 def test_counts_beyond_the_memory_of_the_data_are_refused(name, value):

@@ -9,10 +9,11 @@ from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from benchmarks.islands import fresh
-from lavender import deadline, registry, suite
+from lavender import deadline, registry, residuals, suite
 from lavender.residuals import judging_time
 from lavender.solvers.auto import Auto
 from lavender.solvers.methods import Candidate, Resumed, setup_time
+from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
 from lavender_ext.small import checked_sweeps
 
@@ -131,7 +132,7 @@ def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
             assert solution.status is lv.Status.TIME_LIMIT and "set up" in solution.message
             assert solution.solver.name == name and not solution.work
             assert solution.residual.relative == least
-    assert asked or name in ("sequential_impulses", "anderson", "nncg")
+    assert asked or name in ("sequential_impulses", "anderson", "nncg", "block_gauss_seidel")
 
 
 @pytest.mark.parametrize("name", [*OWN, "auto"])
@@ -202,6 +203,42 @@ def test_where_the_judge_would_be_late_the_start_goes_back_unjudged(name, clock)
         assert solution.iterations == 0 and "unjudged" in solution.message and str(solution)
 
 
+@pytest.mark.parametrize("name", ["J and M, dense", "matrix, lcp", "bodies, coulomb"])
+def test_the_judge_begins_only_what_he_can_end(name, clock, monkeypatch):
+    """What he sets up fits, his pass behind it does not."""
+    problem = fresh(PROBLEMS[name]())
+    limit = residuals.setup_time(problem) + 0.9 * judging_time(problem)
+    solution = lv.solve(problem, "newton", time_limit=limit)
+    assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+    assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel"])
+def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock):
+    """A was counted, and so nothing begun, for sweeps that never read it."""
+    problem = PROBLEMS["J and M, dense"]()
+    residuals.reference(problem)
+    assert lv.solve(problem, name, time_limit=2.0 * judging_time(problem), max_iter=3).iterations == 3
+    assert "_compressed" not in vars(problem)
+
+
+def test_a_of_j_and_m_is_counted_by_its_products():
+    """Of a sparse J they are few; by rows that share a tree, all of them, forming A was counted 30 times too dear."""
+    rng = np.random.default_rng(0)
+    jac = np.zeros((900, 300))
+    jac[np.arange(900)[:, None], rng.integers(0, 300, (900, 3))] = 1.0
+    mass = np.eye(300) + 1e-3 * (np.eye(300, k=1) + np.eye(300, k=-1))  # one tree
+    cones = lv.Cones.contacts(np.full(300, 0.5), 2)
+    sparse = lv.Problem.from_jacobian(jac, mass, np.ones(300), cones=cones)
+    full = over_velocities(900, 300)
+    for problem in (sparse, full):
+        whole = problem.metric.whitened()
+        columns = np.bincount(whole[1], minlength=300)
+        assert problem.metric.products_of_a >= np.sum(columns.astype(float) ** 2)
+    assert full.metric.products_of_a == 300 * 900**2
+    assert forming(sparse) < forming(full)
+
+
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
 def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeypatch):
@@ -255,6 +292,40 @@ def test_the_limit_of_many_is_of_the_whole_call(clock, monkeypatch):
         assert solutions[0].success
 
 
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, clock):
+    """The judge's time was kept free for each: of 1,000 problems under 0.1 s nothing was solved."""
+    drawn = (FORMS[form](random_contact_problem(seed, "cone", 2, False)) for seed in range(20))
+    small = [fresh(p) for p in drawn if p.m <= registry.SMALL_ROWS for _ in range(50)]
+    without = lv.solve_many(small, threads=threads)
+    within = lv.solve_many([fresh(p) for p in small], time_limit=0.3, threads=threads)
+    assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
+    assert [a.status for a in within] == [b.status for b in without]
+
+
+def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
+    problems = [dense(100, "lcp", seed) for seed in range(4)]
+    first = lv.solve(problems[0])
+
+    def slow(*of, **more):
+        clock.now += 1.0
+        return first
+
+    monkeypatch.setattr(sys.modules["lavender.many"], "solve", slow)
+    starts = [None, None, np.ones(100), None]
+    made = lv.solve_many(problems, time_limit=0.5, impulses=starts)
+    assert made[0] is first or made[0].success
+    for problem, start, late in zip(problems[1:], starts[1:], made[1:], strict=True):
+        assert late.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+        assert np.array_equal(late.impulse, problem.start() if start is None else start)
+        assert (
+            late.residual.relative == lv.residual(problem, late.impulse).relative and "turn" in late.message
+        )
+    with pytest.raises(lv.CapabilityError):
+        lv.solve_many([problems[0], dense(30, "cone")], "direct", time_limit=0.5)
+
+
 def test_the_first_solve_imports_nothing():
     """0.2 to 0.45 s went into it, in the first call of a control loop."""
     code = """
@@ -278,3 +349,24 @@ print(sorted(set(sys.modules) - before))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_package_loads_what_auto_needs_and_a_name_its_own_file():
+    """Files of the others, and what nobody needs, are a quarter of what `import lavender` adds to NumPy."""
+    code = """
+import sys
+import lavender as lv
+
+files = lambda: {name.rpartition(".")[2] for name in sys.modules if name.startswith("lavender.solvers.")}
+print(sorted({"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} & files()), "pathlib" in sys.modules)
+before = set(sys.modules)
+lv.solve(lv.Problem.lcp([[2.0]], [1.0]), "jacobi", time_limit=0.01)
+print(sorted(set(sys.modules) - before))
+print(list(lv.registry.specs())[:3], list(lv.registry.specs())[-1], lv.registry.get("jacobi").own)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    first, second, third = done.stdout.splitlines()
+    assert first == "[] False"
+    assert "lavender.solvers.jacobi" in second and "external" not in second and "lemke" not in second
+    # The order of the table, whoever was asked for first.
+    assert third.startswith("['auto', 'direct', 'newton']") and third.endswith("True")
