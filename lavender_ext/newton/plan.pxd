@@ -18,7 +18,8 @@ from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
-from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
+from lavender_ext.newton.path cimport begin_path, go_path
+from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED, PATH,
                                       PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
                                       take_back, tries_t, unknown_of, with_products)
@@ -270,7 +271,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
     n.at += 1
     if at > 0 and over(n):
-        at = 6
+        at = 7
     if at == 0:
         take(n, n.aside_z, n.best_z)
         begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
@@ -287,7 +288,9 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
             memset(n.trial, 0, n.s.e.m * sizeof(double))
             begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
             pursue(n, 0, FIRST, 2.0 * first_gain())
-    elif at == 5:
+    elif at == 5:                                       # stick and slip that fold the way to a solution
+        begin_path(n)
+    elif at == 6:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
         enter_rounds(n, 0, LIMITLESS)
     else:
@@ -318,6 +321,8 @@ cdef inline void go(newton_t* n) noexcept nogil:
         go_de_saxce(n)
     elif phase == RELAXED:
         go_relaxed(n)
+    elif phase == PATH:
+        go_path(n)
     else:
         go_rounds(n, phase // SECOND)
 

@@ -19,7 +19,7 @@ from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay
 from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport (CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK, newton_start, newton_step)
-from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, POLISH, PROXIMAL, PURSUIT,
+from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
                                       RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
                                       own_index, own_room, proof_of, relative_at)
 from lavender_ext.newton.scaling cimport find_elements
@@ -40,6 +40,7 @@ PHASES = {
     "augmented steps": 1 << POLISH,
     "De Saxce": 1 << DE_SAXCE,
     "relaxation": 1 << RELAXED,
+    "path": 1 << PATH,
 }
 #: What `Solve.counts` counts, as the message of a solution names it.
 COUNTED = (
@@ -52,6 +53,7 @@ COUNTED = (
     "augmented interior point steps",
     "augmented De Saxce steps",
     "augmented steps",
+    "path steps",
 )
 
 
