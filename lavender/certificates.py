@@ -118,7 +118,7 @@ def fighting(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]
 
 
 def _told(problem: Problem, y: FloatArray) -> str:
-    """ "joints 7 and 9 against contact 11", by the blocks' names."""
+    """Who fights, by the blocks' names: "joints 7 and 9 against contact 11"."""
     return " against ".join(
         told for told in (_listed(problem, blocks) for blocks in fighting(problem, y)) if told
     )

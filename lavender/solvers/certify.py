@@ -101,6 +101,8 @@ def _newton(
         return np.inf, None
     solver, impulse = spec.load()(), problem.start()
     claim = solver.run(solver.prepare(problem), impulse, steps, tol, left)
+    if claim.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
     return residual(problem, impulse).relative, claim
 
 

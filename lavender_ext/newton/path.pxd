@@ -37,7 +37,7 @@ cdef enum:                      # where a path stands
     TRYING = 4                  # whether Newton's method ends it
 
 cdef enum:
-    PATH_STEPS = 700            # factorisations of one path at most
+    PATH_STEPS = 1000           # factorisations of one path at most
     FIRST_STEPS = 40            # of them on its first tau
     CORRECTIONS = 5             # factors of one point
     SIMPLIFIED = 4              # steps with one factor
@@ -125,7 +125,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
 
 
 cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
-    """F of z into n.f; with `derived` its small matrices as well, dF / d log tau into n.c and y into n.t1."""
+    """F of z into n.f, with a compliance eps; with `derived` its small matrices as well, dF / d log tau into n.c and y into n.t1."""
     cdef const elements_t* e = n.s.e
     cdef double eps = path_compliance()
     cdef int32_t i, j, k, l, t, q, nr
