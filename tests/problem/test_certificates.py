@@ -236,7 +236,7 @@ def test_who_fights_is_named(name, law, form):
     assert solution.status is lv.Status.INFEASIBLE
     joints, contacts = fighting(problem, solution.certificate)
     assert joints == (0,) and contacts == (1,)  # blocks
-    assert "row 0 against contact 0" in solution.message  # a joint of one row
+    assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
     found = [s for s in lv.diagnose(problem) if s.kind == "conflict"]
     assert len(found) == 1 and found[0].blocks == (0, 1)
 
