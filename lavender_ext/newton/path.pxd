@@ -4,7 +4,7 @@ With p(x) = (x + sqrt(x^2 + 4 tau^2)) / 2 for max(0, x), y = z - s, s = (H + eps
 
     n = p(y_n),   r = a n,   m = r + p(|y_t| - r),   F_n = z_n - n,   F_t = z_t - (r / m) y_t                  (1)
 
-(Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2.) Its solutions from a large tau,
+(Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2), in m with c tau for tau. Its solutions from a large tau,
 where there is one, to tau = 0 are a curve in (z, log tau), on which tau may rise for a while: where contacts that
 carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. So it is followed by its arc
 length (Keller 1977): with F_z b = -F_tau the tangent t = (b, 1) / |(b, 1)|, a step along t and half the change of t,
@@ -14,7 +14,8 @@ then Newton's method on F = 0 across t,
 
 A step is told by what it changes of y_n, |y_t| - r and the direction of y_t, each relative to its size (to tau, where that
 is less). Of one factor, simplified Newton steps follow, which must contract (Deuflhard 2011): a point that is no nearer
-to the curve than that lies on a branch of its own. eps is a compliance: without it, redundant contacts share their load
+to the curve than that lies on a branch of its own. Which c leads to a solution soon nobody knows before: some are tried in turn, each from the
+start. eps is a compliance: without it, redundant contacts share their load
 as tau^2 / z says, which no factor sees.
 """
 from libc.math cimport exp, fabs, log, pow, sqrt
@@ -37,8 +38,8 @@ cdef enum:                      # where a path stands
     TRYING = 4                  # whether Newton's method ends it
 
 cdef enum:
-    PATH_STEPS = 1000           # factorisations of one path at most
-    FIRST_STEPS = 40            # of them on its first tau
+    PATHS = 4                   # with a c of their own
+    FIRST_STEPS = 40            # factorisations on the first tau
     CORRECTIONS = 5             # factors of one point
     SIMPLIFIED = 4              # steps with one factor
     REPEATED = 4                # factors that make a point exact
@@ -46,6 +47,16 @@ cdef enum:
     RETURNS = 3                 # to an earlier point, with points ten times as exact
     APART = 10                  # steps between two such points
     ENDING = 4                  # Newton steps of a trial
+
+
+cdef inline double wide_of(int32_t k) noexcept nogil:
+    """c of the k-th path."""
+    return 3.0 if k == 0 else 10.0 if k == 1 else 1.0 if k == 2 else 0.3
+
+
+cdef inline int32_t steps_of(int32_t k) noexcept nogil:
+    """Factorisations of the k-th path at most."""
+    return 350 if k == 0 else 250 if k == 1 else 500 if k == 2 else 400
 
 
 cdef inline double path_compliance() noexcept nogil:
@@ -86,8 +97,8 @@ cdef inline double smooth_row(const elements_t* e, int32_t j, double z, double s
     return f
 
 
-cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double* f,
-                                double* p, double* rest, double* ft) noexcept nogil:
+cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
+                                double* f, double* p, double* rest, double* ft) noexcept nogil:
     """(1) of one contact, P (nr, nr), I - P without cancellation, and dF / d log tau."""
     cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, which
     cdef double y = z[0] - s[0], normal = plus(y, tau), dn = slope(y, tau), a, r, q, d, root, more, m, fr, across, along, x, own
@@ -106,8 +117,8 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             q += (z[k] - s[k]) * (z[k] - s[k])
         q = sqrt(q)
         d = r - q
-        root = sqrt(d * d + 4.0 * tau * tau)
-        more = plus(-d, tau)                            # m - r
+        root = sqrt(d * d + 4.0 * wide * wide)
+        more = plus(-d, wide)                            # m - r
         m = r + more
         fr = (more + r * (more / root)) / (m * m)       # d(r / m) / dr
         across = more / m
@@ -117,7 +128,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             f[k] = s[k] + across * x if d > 0.0 else z[k] - r / m * x
             p[k * nr] = x * fr * a * dn
             rest[k * nr] = -p[k * nr]
-            ft[k] = -x * (fr * a * rise(y, tau) - r * rise(d, tau) / (m * m))
+            ft[k] = -x * (fr * a * rise(y, tau) - r * rise(d, wide) / (m * m))
             for l in range(first, first + n):
                 own = x * (z[l] - s[l]) / (q * q)
                 rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own
@@ -143,7 +154,7 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
         if e.kind[i] == ROW:
             n.f[j] = smooth_row(e, j, z[j], n.rest[j], tau, p, rest, ft)
         else:
-            smooth_contact(e, i, z + j, n.rest + j, tau, n.f + j, p, rest, ft)
+            smooth_contact(e, i, z + j, n.rest + j, tau, n.path.wide * tau, n.f + j, p, rest, ft)
         if not derived:
             continue
         for k in range(nr):
@@ -165,7 +176,7 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
     """Largest relative change of a distance to the next piece by dz, at the y of the last `smooth`."""
     cdef const elements_t* e = n.s.e
     cdef int32_t i, j, k, first, size, which
-    cdef double worst = 0.0, x, y, dy, r, q, along, square
+    cdef double worst = 0.0, x, y, dy, r, q, along, square, wide = n.path.wide * tau
     cdef double* d = n.hdz
     system_times(&n.s, dz, d)
     for j in range(e.m):
@@ -196,10 +207,10 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
                 square += d[k] * d[k]
             q = sqrt(q)
             along /= q
-            x = fabs(ratio(e, i, which) * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * tau)
+            x = fabs(ratio(e, i, which) * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * wide)
             worst = worst if x <= worst else x
             square -= along * along
-            x = (sqrt(square) if square > 0.0 else 0.0) / (q + r + 2.0 * tau)
+            x = (sqrt(square) if square > 0.0 else 0.0) / (q + r + 2.0 * wide)
             worst = worst if x <= worst else x
     return worst
 
@@ -216,7 +227,7 @@ cdef inline double inner(const double* x, const double* y, int32_t m) noexcept n
 
 
 cdef inline void begin_path(newton_t* n) noexcept nogil:
-    """From z = 0, in vectors that interior points and exchanges have left."""
+    """The next, from z = 0, in vectors that interior points and exchanges have left."""
     cdef path_t* x = &n.path
     cdef int32_t m = n.s.e.m
     x.z, x.t, x.old, x.b = n.ip.z, n.ip.u1, n.ip.u2, n.ip.hz
@@ -227,7 +238,9 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.exact = 3e-3
     x.near = 1e-2
     x.h = 0.5
-    x.last = n.s.factorisations + PATH_STEPS
+    x.last = n.s.factorisations + steps_of(x.paths)
+    x.wide = wide_of(x.paths)
+    x.paths += 1
     x.at = x.points = x.used = x.returns = 0
     if 0.0 < x.size < 1.0 / 0.0:
         enter(n, PATH)

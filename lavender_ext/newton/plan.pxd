@@ -18,7 +18,7 @@ from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
-from lavender_ext.newton.path cimport begin_path, go_path
+from lavender_ext.newton.path cimport PATHS, begin_path, go_path
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED, PATH,
                                       PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
@@ -289,7 +289,9 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
             begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
             pursue(n, 0, FIRST, 2.0 * first_gain())
     elif at == 5:                                       # stick and slip that fold the way to a solution
-        begin_path(n)
+        if n.path.paths < PATHS:
+            n.at = 5
+            begin_path(n)
     elif at == 6:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
         enter_rounds(n, 0, LIMITLESS)
@@ -330,7 +332,7 @@ cdef inline void go(newton_t* n) noexcept nogil:
 cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     """From lam (rows), with problem, system, tol and budget given."""
     cdef int32_t i
-    n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = 0
+    n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = n.path.paths = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

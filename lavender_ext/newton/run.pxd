@@ -162,6 +162,7 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
     double mark_tl[2]
     double mark_h[2]
     double mark_square[2]
+    double wide                 # tau of friction over that of normals
     double size                 # of g
     double start                # first log tau
     double square               # |z|^2 of the tangent's metric
@@ -179,6 +180,7 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
     int32_t shorter             # times in a row
     int32_t used                # factors of the first point, or of one that is repeated
     int32_t returns
+    int32_t paths               # begun
     int32_t last                # factorisations at which it ends
 
 

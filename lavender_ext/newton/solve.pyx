@@ -343,10 +343,10 @@ cdef class Solve:
         system_natural(&self.n.s, &z[0], &s[0], law, eps, &f[0])
         return f_array
 
-    def smooth(self, const double[::1] z, double tau):
-        """F (m,) of path.pxd, and dF / d log tau (m,); its derivative's small matrices into p, einv and v."""
+    def smooth(self, const double[::1] z, double tau, double wide=1.0):
+        """F (m,) of path.pxd with c = wide, and dF / d log tau (m,); its derivative's small matrices into p, einv and v."""
         cdef newton_t* n = &self.n
-        n.s.law = COULOMB
+        n.s.law, n.path.wide = COULOMB, wide
         smooth(n, &z[0], tau, True)
         return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
 

@@ -142,34 +142,34 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
-@given(seed=seeds, decades=st.integers(-3, 1))
+@given(seed=seeds, decades=st.integers(-3, 1), wide=st.sampled_from([0.3, 1.0, 10.0]))
 @settings(max_examples=20)
-def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form, seed, decades):
+def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form, seed, decades, wide):
     problem = random_contact_problem(seed, friction="coulomb", bodies=6, contacts=10)
     system = system_in(problem, form)
     solve, tau = system.solve, 10.0**decades
     m, rng = solve.m, np.random.default_rng(seed)
     z, dz = rng.normal(size=m), rng.normal(size=m)
-    f, ft = solve.smooth(z, tau)
-    f, ft, step = f.copy(), ft.copy(), 1e-5 * tau
+    f, ft = solve.smooth(z, tau, wide)
+    f, ft, step = f.copy(), ft.copy(), 1e-5 * min(1.0, wide) * tau
     matrix = dense_h(problem)[np.ix_(solve.keep, solve.keep)] + COMPLIANCE * np.eye(m)
     p = block_diagonal(system, solve.p)
     slope = dz - p @ dz + p @ (matrix @ dz)
-    ahead, back = (solve.smooth(z + sign * step * dz, tau)[0] for sign in (1.0, -1.0))
+    ahead, back = (solve.smooth(z + sign * step * dz, tau, wide)[0] for sign in (1.0, -1.0))
     # Central differences: third derivatives are up to |y| / tau^2 of a unit, times step^2; rounding over step.
     np.testing.assert_allclose(
         (ahead - back) / (2.0 * step), slope, rtol=0, atol=1e-6 * (1.0 + np.abs(slope).max())
     )
-    ahead, back = (solve.smooth(z, tau * np.exp(sign * 1e-5))[0] for sign in (1.0, -1.0))
+    ahead, back = (solve.smooth(z, tau * np.exp(sign * 1e-5), wide)[0] for sign in (1.0, -1.0))
     np.testing.assert_allclose((ahead - back) / 2e-5, ft, rtol=0, atol=1e-6 * (1.0 + np.abs(ft).max()))
     # I - P + P (H + eps) is solved: on free rows, where that is H + eps, a factor over bodies feels 2^-53 / eps.
-    solve.smooth(z, tau)
+    solve.smooth(z, tau, wide)
     assert solve.factor("natural", COMPLIANCE)
     x = solve.solve("natural", f)
     np.testing.assert_allclose(x - p @ x + p @ (matrix @ x), f, rtol=0, atol=1e-5 * (1.0 + np.abs(x).max()))
     # Each map is within a few tau of what it smooths: p(x) - max(0, x) <= tau.
     exact = solve.natural(z, matrix @ z - solve.g, LAWS["coulomb"], COMPLIANCE)
-    assert np.abs(f - exact).max() <= 4.0 * tau * (1.0 + problem.cones.mu.max())
+    assert np.abs(f - exact).max() <= 4.0 * max(1.0, wide) * tau * (1.0 + problem.cones.mu.max())
 
 
 def newton_without(problem, *phases):
