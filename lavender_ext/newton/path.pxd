@@ -4,19 +4,19 @@ With p(x) = (x + sqrt(x^2 + 4 tau^2)) / 2 for max(0, x), y = z - s, s = (H + eps
 
     n = p(y_n),   r = a n,   m = r + p(|y_t| - r),   F_n = z_n - n,   F_t = z_t - (r / m) y_t                  (1)
 
-(Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2), in m with c tau for tau. Its solutions from a large tau,
-where there is one, to tau = 0 are a curve in (z, log tau), on which tau may rise for a while: where contacts that
-carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. So it is followed by its arc
-length (Keller 1977): with F_z b = -F_tau the tangent t = (b, 1) / |(b, 1)|, a step along t and half the change of t,
-then Newton's method on F = 0 across t,
+(Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2), with c tau for tau in m. Its
+solutions from a large tau, where there is one, to tau = 0 are a curve in (z, log tau), on which tau may rise for a while:
+where contacts that carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. So it is
+followed by its arc length (Keller 1977): with F_z b = -F_tau the tangent t = (b, 1) / |(b, 1)|, a step along t and half
+the change of t, then Newton's method on F = 0 across t,
 
     F_z dz + F_tau dl = -F,   t . (dz, dl) = 0     dz = a + b dl,   F_z a = -F                               (2)
 
 A step is told by what it changes of y_n, |y_t| - r and the direction of y_t, each relative to its size (to tau, where that
-is less). Of one factor, simplified Newton steps follow, which must contract (Deuflhard 2011): a point that is no nearer
-to the curve than that lies on a branch of its own. Which c leads to a solution soon nobody knows before: some are tried in turn, each from the
-start. eps is a compliance: without it, redundant contacts share their load
-as tau^2 / z says, which no factor sees.
+is less). Of one factor, simplified Newton steps follow, which must contract (Deuflhard 2011): a point where they do not is
+not on the curve, however small a step is. Which c leads to a solution soon nobody knows before: some are tried in turn,
+each from the start. eps is a compliance: without it, redundant contacts share their load as tau^2 / z says, which no
+factor sees.
 """
 from libc.math cimport exp, fabs, log, pow, sqrt
 from libc.stdint cimport int32_t
@@ -136,7 +136,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
 
 
 cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
-    """F of z into n.f, with a compliance eps; with `derived` its small matrices as well, dF / d log tau into n.c and y into n.t1."""
+    """F of z into n.f, with a compliance eps; with `derived` its small matrices, dF / d log tau (n.c) and y (n.t1)."""
     cdef const elements_t* e = n.s.e
     cdef double eps = path_compliance()
     cdef int32_t i, j, k, l, t, q, nr
