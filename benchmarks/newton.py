@@ -127,6 +127,7 @@ PARTS: dict[str, Part] = {
     "walks": (coulombs, [_without("pursuit")], {}),
     "De Saxce": (coulombs, [_without("De Saxce")], {}),
     "walk from the cone law": (coulombs, [_without("relaxation")], {}),
+    "path": (coulombs, [_without("path")], {}),
     "augmented steps": (bodies, [_without("augmented steps")], {}),
     # factorisations
     "dense": (matrix, [(systems, "DENSE_ROWS", -1), (systems, "is_full", lambda *_: False)], {}),

@@ -28,6 +28,7 @@ nothing to prove. So b of an empty row may be dust, and equations that are repea
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
@@ -39,13 +40,15 @@ from lavender._arrays import FloatArray
 from lavender.problem import Problem
 from lavender.residuals import reference, relative_of
 
-__all__ = ["Proof", "check_certificate", "prove", "rounded_down"]
+__all__ = ["Proof", "check_certificate", "fighting", "prove", "rounded_down"]
 
 UNIT = 2.0**-53
 FAR = 1e-10  # of b.y: what z may reach, so that the floor of a solution is above 1e-6
 SURE = 1e3  # times its rounding: a sum beyond is known well enough as it comes
 NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
 SIMPLE = 16  # rows of a certificate up to which numbers are looked for that make A^T y zero exactly
+TAKES_PART = 1e-6  # of the largest y in the metric of D: below, a row is not named
+NAMED = 6  # blocks of a kind that are named
 POLISHED = 600  # rows of a certificate up to which it is polished, by dense least squares
 
 
@@ -56,15 +59,17 @@ class Proof:
     y: FloatArray  # (m,), as given, or polished
     impulse_bound: float  # N s, (2): of every solution; inf where none exists, 0 where y says nothing
     reason: str = ""  # why y is no proof that nothing meets the tolerance; empty where it is one
+    fighting: str = ""  # blocks of y, by name, where it is a proof
 
     @property
     def words(self) -> str:
-        """What is proved."""
+        """What is proved, and who fights."""
+        who = f": {self.fighting}" if self.fighting else ""
         if self.impulse_bound == math.inf:
-            return "no solution, proved"
+            return f"no solution, proved{who}"
         return (
             "no solution for data within rounding of yours; for yours every solution has an impulse of at least "
-            f"{rounded_down(self.impulse_bound)} N s"
+            f"{rounded_down(self.impulse_bound)} N s{who}"
         )
 
 
@@ -96,7 +101,43 @@ def prove(problem: Problem, y: Any, tol: float = 0.0) -> Proof:
                 if not again.reason and (found.reason or again.impulse_bound == math.inf):
                     found = again
                     break
-        return found if inner is problem else replace(found, y=problem.cones.stretch * found.y)
+        if inner is not problem:
+            found = replace(found, y=problem.cones.stretch * found.y)
+        return found if found.reason else replace(found, fighting=_told(problem, found.y))
+
+
+def fighting(problem: Problem, y: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Blocks that a direction y (m,) takes part in: joints and bounded rows, and contacts."""
+    size = np.sqrt(problem.d) * np.abs(np.asarray(y, float))
+    rows = np.flatnonzero(size > TAKES_PART * size.max(initial=0.0))
+    contact = problem.cones.contact_rows
+    of = [
+        np.unique([problem.block_of(int(i)) for i in rows[contact[rows] == kind]]) for kind in (False, True)
+    ]
+    return tuple(map(int, of[0])), tuple(map(int, of[1]))
+
+
+def _told(problem: Problem, y: FloatArray) -> str:
+    """Who fights, by the blocks' names: "joints 7 and 9 against contact 11"."""
+    return " against ".join(
+        told for told in (_listed(problem, blocks) for blocks in fighting(problem, y)) if told
+    )
+
+
+def _listed(problem: Problem, blocks: tuple[int, ...]) -> str:
+    names = [problem.row_name(int(problem.cones.ptr[i])).rsplit(", ", 1)[0] for i in blocks]
+    names = list(dict.fromkeys(names))  # a joint's free rows are blocks of their own
+    parts = [re.fullmatch(r"(.*\S) (\d+)", name) for name in names[:NAMED]]
+    kinds = {part[1] for part in parts if part}
+    if len(names) > 1 and all(parts) and len(kinds) == 1:  # "joints 7 and 9"
+        return f"{kinds.pop()}s " + _joined([part[2] for part in parts if part], len(names))
+    return _joined(names[:NAMED], len(names))
+
+
+def _joined(names: list[str], count: int) -> str:
+    if count > len(names):
+        return f"{', '.join(names)} and {count - len(names)} more"
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1]))) if names else ""
 
 
 def _proof(problem: Problem, y: FloatArray, tol: float) -> Proof:

@@ -32,6 +32,7 @@ from lavender.errors import InputError
 from lavender.problem import Problem, check_problem
 from lavender.residuals import residual
 from lavender.rows import Rows
+from lavender.solvers.certify import conflict_of
 
 __all__ = ["Suspicion", "diagnose"]
 
@@ -41,6 +42,8 @@ FAR = 0.25  # -, of the arms: bodies further off each other than another contact
 G = 9.81  # m/s^2
 PUSHED = 30.0  # m/s, of a target that moves bodies apart: 6 cm in a step of 2 ms
 LET = 1000.0  # m/s, of one that lets them approach: over a gap of 2 m in such a step
+CONFLICT = 1000  # rows up to which a proof is asked for that there is no solution
+CONFLICT_TOL = 1e-6  # relative residual that it rules out
 FAST = 30.0, 1e4  # m/s, of a contact's approach before a step; what is faster is told in another unit
 
 
@@ -65,7 +68,8 @@ def diagnose(
     """Look for mistakes in a problem's data, or in the impulses that a solver found for it.
 
     Examines signs and order of normals, bodies and their sizes, masses, order of rows, targets, coefficients, keys and
-    the guess. It solves nothing. A suspicion need not be an error: a hook has normals against its arms, a conveyor has
+    the guess. Of at most 1000 rows, it asks Newton's method for a proof that the convex relaxation has no solution, and
+    names the blocks that fight. A suspicion need not be an error: a hook has normals against its arms, a conveyor has
     targets on tangents. An empty result proves nothing.
 
     Parameters
@@ -312,6 +316,17 @@ def _above(p: Problem) -> Iterator[Suspicion]:
         yield _of(
             p, "normals", reason, np.flatnonzero(p.cones.kind != ROW)[still], along=float(toward.mean())
         )
+
+
+def _conflict(p: Problem) -> Iterator[Suspicion]:
+    if not 0 < p.m <= CONFLICT or not np.isfinite(p.b).all():
+        return
+    found = conflict_of(p, CONFLICT_TOL)
+    if found is not None:
+        law = "Of the convex relaxation, " if p.law == "coulomb" else ""
+        reason = law + found.proof.words + (f"; {found.advice}" if found.advice else "")
+        soft = [p.row_name(i) for i in found.soft_rows]
+        yield _of(p, "conflict", reason, found.blocks, compliance=found.compliance, soft_rows=soft)
 
 
 def _at_rest(r: Rows) -> bool:
@@ -633,5 +648,5 @@ def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
 
 
 _CHECKS: tuple[Callable[[Problem], Iterator[Suspicion]], ...] = (
-    _friction, _keys, _order, _twins, _targets, _speeds, _above, _geometry, _masses, _inverse
+    _friction, _keys, _order, _twins, _targets, _speeds, _above, _geometry, _masses, _inverse, _conflict
 )  # fmt: skip

@@ -1,9 +1,12 @@
-"""A certificate that a problem has no solution, which `auto` looks for if all candidates fail.
+"""A certificate that a problem has no solution, which `auto` looks for if all candidates fail; and who fights.
 
     A^T y <= 0 (= 0 on free rows),  y >= 0 (any sign there),  b.y > 0
 
 On a contact y is along the normal, as Coulomb's law requires, and z = A^T y satisfies z_n + mu |z_t| <= 0. The sum of
 |z_t| replaces its norm: every certificate found this way is valid, but with two tangents a few are not found.
+
+Of Coulomb friction the convex relaxation is asked at last. A y of its that leaves the normals proves nothing for
+Coulomb's law, but tells who fights: with a compliance on the rows of y no such y is left (`conflict_of`).
 
 One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
 another island does not matter.
@@ -11,32 +14,114 @@ another island does not matter.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lavender._arrays import FloatArray
 from lavender._later import sparse as sp
+from lavender.certificates import Proof, fighting, prove
 from lavender.deadline import Deadline
 from lavender.ordering import blocks_of_each
 from lavender.problem import Problem
+from lavender.registry import get
+from lavender.residuals import residual
 from lavender.solution import Claim, Status
 from lavender.solvers.islands import restrict, rows_of
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 
-__all__ = ["certify"]
+__all__ = ["Conflict", "certify", "conflict_of"]
 
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
 )
 LINEAR_PROGRAM = 5e6  # ns that scipy takes for the smallest
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
+RELAXATION_STEPS = 150  # factorisations that the relaxation has for its proof
+SOFT_STEPS = 300  # and a problem with a compliance
+SOFT = 1e-4, 1e-2  # of d: compliances that are tried
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """Rows that ask for what cannot be, of a problem or of its convex relaxation."""
+
+    proof: Proof  # of the relaxation
+    blocks: tuple[int, ...]  # that take part
+    soft_rows: tuple[int, ...]  # whose compliance gives an answer; empty: none of SOFT does
+    compliance: float  # 1/kg, the largest of them
+    soft: str  # their blocks, by name
+
+    @property
+    def advice(self) -> str:
+        """What to do, in words."""
+        if not self.soft_rows:
+            return ""
+        return f"a compliance of {self.compliance:.1g} 1/kg on {self.soft} gives an answer"
+
+
+@np.errstate(all="ignore")  # what overflows is judged
+def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) -> Conflict | None:
+    """Who fights in a problem whose convex relaxation is proved to have no solution; None where it is not."""
+    inner = problem.relaxed("cone")
+    claim = _newton(inner, RELAXATION_STEPS, tol, deadline)[1]
+    if claim is None or claim.certificate is None:
+        return None
+    proof = prove(inner, claim.certificate, tol)
+    if proof.reason:
+        return None
+    joints, contacts = fighting(problem, proof.y)
+    soft, first, last = joints or contacts, problem.cones.ptr[:-1], problem.cones.ptr[1:]
+    rows = np.concatenate([np.arange(first[i], last[i]) for i in soft])
+    told = proof.fighting.split(" against ")[0]
+    for share in SOFT:
+        more = np.zeros(problem.m)
+        more[rows] = share * problem.d[rows]
+        if _newton(_softened(problem, more), SOFT_STEPS, tol, deadline)[0] <= tol:
+            return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
+    return Conflict(proof, joints + contacts, (), 0.0, "")
+
+
+def _softened(problem: Problem, more: FloatArray) -> Problem:
+    """With so much compliance (m,) [1/kg] more."""
+    if problem.matrix is None:
+        assert problem.compliance is not None
+        return replace(problem, compliance=problem.compliance + more)
+    return replace(problem, matrix=(problem.csr + sp.diags_array(more)).tocsr())
+
+
+def _newton(
+    problem: Problem, steps: int, tol: float, deadline: Deadline | None
+) -> tuple[float, Claim | None]:
+    """Relative residual and claim of Newton's method from nothing; inf, None where it does not take the problem."""
+    spec, left = get("newton"), None if deadline is None else deadline.left()
+    if spec.refuses(problem) is not None or (left is not None and left <= 0.0):
+        return np.inf, None
+    solver, impulse = spec.load()(), problem.start()
+    claim = solver.run(solver.prepare(problem), impulse, steps, tol, left)
+    if claim.status is Status.INTERRUPTED:
+        raise KeyboardInterrupt
+    return residual(problem, impulse).relative, claim
 
 
 @np.errstate(all="ignore")  # what overflows is judged
 def certify(log: SolveLog) -> None:
-    """Look for a certificate that a problem without upper bounds has no solution, for any A."""
+    """Look for a certificate that a problem has no solution; under Coulomb's law, else of its relaxation."""
+    _linear_programs(log)
+    problem = log.problem
+    if (
+        log.certificate is None
+        and problem.law == "coulomb"
+        and problem.m <= CERTIFICATE_ROWS
+        and log.best > 1e-6
+    ):
+        log.conflict = conflict_of(problem, log.tol, log.deadline)
+
+
+def _linear_programs(log: SolveLog) -> None:
+    """For a problem without upper bounds, any A."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM + 1e9 * loading("scipy.optimize")):
         return

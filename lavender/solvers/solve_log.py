@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,7 @@ class SolveLog:
         self.iterations = 0
         self.certificate: FloatArray | None = None  # (m,)
         self.direction: FloatArray | None = None  # (m,) one that is none, but bounds the impulses
+        self.conflict: Any = None  # of `certify`: who fights in the convex relaxation, and what lifts it
         self.pace = 0.0  # measured time / counted time, under a time limit; 0: not known
 
     def offer(self, impulse: FloatArray) -> float:
@@ -173,10 +175,19 @@ class SolveLog:
             Status.INTERRUPTED if self.interrupted else self.status,
             self.iterations,
             self.work,
-            "; ".join(filter(None, (message, self.failure))),
+            "; ".join(filter(None, (message, self.failure, *self._fights()))),
             certificate=self.direction if self.certificate is None else self.certificate,
             turns=tuple(self.turns),
         )
+
+    def _fights(self) -> list[str]:
+        """Who fights in the relaxation, where Coulomb's law is not proved to have no solution, and what to do."""
+        if self.conflict is None or self.best <= self.tol:
+            return []
+        told = (
+            [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.words]
+        )
+        return [*told, self.conflict.advice]
 
     # -- islands ---------------------------------------------------------------------------------
 

@@ -5,7 +5,8 @@ decades. Cones: interior points with two weights. What these leave: the augmente
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
 interior point with two shares of phi's derivative, ended by rounds; closed loops of joints through the augmented system;
-rounds from the answer of the convex relaxation, then from nothing; the first rounds for what is left of the budget.
+rounds from the answer of the convex relaxation, then from nothing; paths of smoothed problems, and the first rounds again:
+two paths, a stretch of rounds, two paths, rounds for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -18,7 +19,8 @@ from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
-from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED,
+from lavender_ext.newton.path cimport PATHS, begin_path, go_path
+from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTERIOR, N_COUNTED, N_REFINED, N_RELAXED, PATH,
                                       PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
                                       take_back, tries_t, unknown_of, with_products)
@@ -38,6 +40,7 @@ cdef enum:
     REFINEMENTS = 3             # of a first point,
     MORE_REFINEMENTS = 20       # and with another factor of rows that all hold
     RELAXED_STEPS = 30          # of the convex problem that rounds start from, at most
+    BETWEEN = 500               # factorisations of rounds between two pairs of paths
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
 
 
@@ -270,7 +273,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
     n.at += 1
     if at > 0 and over(n):
-        at = 6
+        at = 9
     if at == 0:
         take(n, n.aside_z, n.best_z)
         begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
@@ -287,8 +290,14 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
             memset(n.trial, 0, n.s.e.m * sizeof(double))
             begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
             pursue(n, 0, FIRST, 2.0 * first_gain())
-    elif at == 5:
+    elif at == 5 or at == 7:                            # stick and slip that fold the way to a solution
+        if n.path.paths < (PATHS // 2 if at == 5 else PATHS):
+            n.at = at
+            begin_path(n)
+    elif at == 6:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
+        enter_rounds(n, 0, BETWEEN)
+    elif at == 8:
         enter_rounds(n, 0, LIMITLESS)
     else:
         leave(n)
@@ -318,6 +327,8 @@ cdef inline void go(newton_t* n) noexcept nogil:
         go_de_saxce(n)
     elif phase == RELAXED:
         go_relaxed(n)
+    elif phase == PATH:
+        go_path(n)
     else:
         go_rounds(n, phase // SECOND)
 
@@ -325,7 +336,7 @@ cdef inline void go(newton_t* n) noexcept nogil:
 cdef inline void newton_start(newton_t* n, const double* lam) noexcept nogil:
     """From lam (rows), with problem, system, tol and budget given."""
     cdef int32_t i
-    n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = 0
+    n.stop = n.asked = n.proven = n.at = n.set_aside = n.depth = n.path.paths = 0
     n.s.augmented = n.s.factorisations = 0
     for i in range(N_COUNTED):
         n.counts[i] = 0

@@ -30,6 +30,7 @@ cdef enum:                      # phases
     POLISH = 7
     DE_SAXCE = 8
     RELAXED = 9
+    PATH = 10                   # path.pxd
     SECOND = 16                  # PROXIMAL + SECOND of the second rounds
 
 cdef enum:                      # what is counted
@@ -42,7 +43,8 @@ cdef enum:                      # what is counted
     N_AUGMENTED_INTERIOR = 6
     N_AUGMENTED_DE_SAXCE = 7
     N_AUGMENTED = 8
-    N_COUNTED = 9
+    N_PATH = 9
+    N_COUNTED = 10
 
 cdef enum:
     DEEP = 8                    # of the stack
@@ -146,6 +148,42 @@ cdef struct tries_t:            # De Saxce's interior point
     int32_t second              # of two shares of phi's derivative
 
 
+cdef struct path_t:             # through smoothed problems, in vectors of other phases
+    double* z                   # the last point,
+    double l                    # log tau there,
+    double* t                   # and the tangent
+    double tl
+    double* old                 # the tangent before
+    double old_l
+    double* b                   # -F_z^-1 F_tau of the last factor
+    double* mark[2]             # earlier points,
+    double* mark_t[2]           # with their tangents
+    double mark_l[2]
+    double mark_tl[2]
+    double mark_h[2]
+    double mark_square[2]
+    double wide                 # tau of friction over that of normals
+    double size                 # of g
+    double start                # first log tau
+    double square               # |z|^2 of the tangent's metric
+    double h                    # length of a step
+    double before               # of the last one
+    double next                 # log tau of the point that is corrected
+    double found                # what its first correction changed
+    double previous             # the last; below 0: it is given up
+    double exact                # corrections below this leave a point on the curve
+    double near                 # relative residual from which Newton steps are tried
+    int32_t at
+    int32_t bends               # the tangent before is known
+    int32_t points
+    int32_t corrected           # factors of this point
+    int32_t shorter             # times in a row
+    int32_t used                # factors of the first point, or of one that is repeated
+    int32_t returns
+    int32_t paths               # begun
+    int32_t last                # factorisations at which it ends
+
+
 cdef struct newton_t:           # may not move once it is furnished
     system_t s
     scaled_t sc
@@ -197,6 +235,7 @@ cdef struct newton_t:           # may not move once it is furnished
     proximal_t rounds[2]        # the first, which go on in the end; any other
     pursuit_t pursuit
     tries_t tries
+    path_t path
 
 
 # -- places in the caller's room -----------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import numpy as np
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
+from lavender_ext.core.block cimport COULOMB
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
@@ -17,9 +18,10 @@ from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay_pattern, order_bodies, order_index,
                                          panel_of, pattern_t)
 from lavender_ext.newton.interior cimport ipm_scale
+from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
 from lavender_ext.newton.plan cimport (CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK, newton_start, newton_step)
-from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, POLISH, PROXIMAL, PURSUIT,
+from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
                                       RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
                                       own_index, own_room, proof_of, relative_at)
 from lavender_ext.newton.scaling cimport find_elements
@@ -40,7 +42,10 @@ PHASES = {
     "augmented steps": 1 << POLISH,
     "De Saxce": 1 << DE_SAXCE,
     "relaxation": 1 << RELAXED,
+    "path": 1 << PATH,
 }
+#: Of s on z, along a path of smoothed problems.
+COMPLIANCE = path_compliance()
 #: What `Solve.counts` counts, as the message of a solution names it.
 COUNTED = (
     "exchanges",
@@ -52,6 +57,7 @@ COUNTED = (
     "augmented interior point steps",
     "augmented De Saxce steps",
     "augmented steps",
+    "path steps",
 )
 
 
@@ -336,6 +342,13 @@ cdef class Solve:
         cdef double[::1] f = f_array
         system_natural(&self.n.s, &z[0], &s[0], law, eps, &f[0])
         return f_array
+
+    def smooth(self, const double[::1] z, double tau, double wide=1.0):
+        """F (m,) of path.pxd with c = wide, and dF / d log tau (m,); its derivative's small matrices into p, einv and v."""
+        cdef newton_t* n = &self.n
+        n.s.law, n.path.wide = COULOMB, wide
+        smooth(n, &z[0], tau, True)
+        return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
 
     def natural_times(self, const double[::1] dz):
         """(I - P) dz + P H dz."""
