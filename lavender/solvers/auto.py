@@ -3,14 +3,14 @@
     the start is a solution     nothing is done
     a small problem             at most 64 rows, or small islands under friction, or cheap velocities: one compiled call
                                 (`small.py`); if that does not solve it, as any other
-    linear                      a matrix: `direct`, else `newton`
-    J and M                     `newton` over velocities, or over rows of A where that is counted to cost less; then the
-                                other of both
-    bounded rows of a matrix    `direct`, for twice the factorisations that `newton` is counted for
-    all of these, and others    sweeps (`anderson`), for SHARE of Newton's cost at most, or until they predict that they will
-                                cost more than it; left out where 100 sweeps are counted to cost more
-                                `newton`, for up to MOST times its cost
-                                both in turn, with doubled work; under friction `nncg` too
+    a matrix                    `direct`: linear to its end, bounded rows for twice the factorisations that `newton` is
+                                counted for
+    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it; not
+                                where 100 sweeps cost more
+    a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
+    Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
+                                rows of A, the cheaper first
+    all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import count
 from math import inf
 
 import numpy as np
@@ -41,11 +40,14 @@ from lavender.solvers.newton import NewtonState
 from lavender.solvers.setup_times import sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Step, Sweeps, setup_time
+from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Relaxation, Step, Sweeps, setup_time
+from lavender_ext.factor import graph
 
 SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
+TURNS = 6  # that all have with doubled work
+FEW = 32.0  # iterations of `nncg` after the relaxation
 SURE = 4.0  # times the counted cost, within which nine in ten end
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
@@ -68,6 +70,8 @@ class Stage:
 class Tree:
     """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
 
+    begun = 0.0  # ns, of sweeps before Newton's method
+
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
 
@@ -89,7 +93,7 @@ class Tree:
         if get("newton").refuses(problem) is not None or self.is_late:
             return found
         for name in ("newton", "newton over rows"):
-            if name == "newton over rows" and not self._rows_may_pay(found.get("newton")):
+            if name == "newton over rows" and (self.is_late or not self._rows_may_pay(found.get("newton"))):
                 continue
             try:
                 found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
@@ -115,26 +119,36 @@ class Tree:
             return False
         return self.deadline.passed(setup_time("newton", self.problem) + 1e-9 * SURE * self.least)
 
+    def is_short(self, newton: float) -> bool:
+        """A limit that Newton's method of this cost [ns] may use up: sweeps tell the pace, and leave something."""
+        return self.deadline.is_set and self.deadline.passed(
+            setup_time("newton", self.problem) + 1e-9 * MOST * SURE * newton
+        )
+
     @property
-    def over_velocities(self) -> bool:
-        """J and M, and room for Newton's method over velocities."""
-        return any(state.general is not None for state in self.states.values())
+    def is_loose(self) -> bool:
+        """Bodies under Coulomb's law, nearly each contact between another pair: sweeps then decide what sticks."""
+        rows = self.problem.rows
+        if rows is None or not rows.n_bodies or self.law != "coulomb":
+            return False
+        return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
-        """The lines, without an end."""
-        problem, law, is_matrix = self.problem, self.law, self.problem.matrix is not None
-        if law == "linear" and is_matrix:
+        """The lines."""
+        if self.problem.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.least, "linear, a matrix")
-        elif problem.generalized is not None and self.over_velocities or law == "linear":
-            yield from self.factorisations(MOST)
-        else:
-            if law == "lcp" and is_matrix and problem.is_symmetric:
-                n = ROUNDS * costs.factorisations(law)
-                yield Stage("direct", n, self.least, "bounded rows of a matrix: twice newton's factorisations")
-            yield from self.sweeps_first()
-            yield from self.factorisations(MOST)
+        if self.problem.matrix is not None and self.law == "lcp" and self.problem.is_symmetric:
+            n = ROUNDS * costs.factorisations(self.law)
+            yield Stage("direct", n, self.least, "bounded rows of a matrix: twice newton's factorisations")
+        yield from self.sweeps_first(self.least)
+        if self.is_loose:
+            why = "a loose pile: the convex relaxation, whose solution is one where contacts stick"
+            yield Stage("relaxation", self.newton / self.sweep, self.newton, why, self.newton / self.sweep)
+            yield Stage("nncg", FEW, FEW * 2.0 * self.sweep, "puts right what slides")
+        yield from self.sweeps_first(self.newton)
+        yield from self.factorisations(MOST)
         # What follows where these fail has its line here.
-        for k in count():
+        for k in range(TURNS):
             yield from self.in_turn(2.0**k)
 
     def factorisations(self, times: float) -> Iterator[Stage]:
@@ -143,16 +157,15 @@ class Tree:
             why = f"{times:g} times its counted cost of {words(state.cost)}"
             yield Stage(name, times * state.steps, times * state.cost, why)
 
-    def sweeps_first(self) -> Iterator[Stage]:
-        """For a share of Newton's cost, at first of what that is at least."""
-        least, begun = costs.SWEEPS * self.sweep, 0.0
-        if self.problem.cones.has_round:
-            return
-        if least <= self.least:
-            begun = SHARE * self.least
-            yield self.sweeps(begun, f"{SHARE:g} of what newton costs at least, {words(self.least)}", self.least)
-        if least <= self.newton < inf and begun < SHARE * self.newton:
-            yield self.sweeps(SHARE * self.newton - begun, f"{SHARE:g} of newton's {words(self.newton)}", self.newton)
+    def sweeps_first(self, newton: float) -> Iterator[Stage]:
+        """For a share of Newton's cost: first of what that is at least, then of what it is counted for."""
+        cost, short = SHARE * newton - self.begun, self.is_short(newton)
+        if short and not self.begun:
+            cost = max(cost, 0.5 * self.deadline.nanoseconds())
+        pays = short or costs.SWEEPS * self.sweep <= newton
+        if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
+            self.begun += cost
+            yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""
@@ -259,11 +272,12 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             if isinstance(step, Sweeps) and not tree_goes_on(log, tree, steps, stage.cost):
                 step.finish()
                 return
-            if isinstance(step, Newton | Direct) and log.ends_late(SURE * once(stage)):
-                step.over = True
+            if isinstance(step, Newton | Direct):
+                set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
+                step.over = log.ends_late(set_up + SURE * once(stage))
         idle = idle + 1 if step.over else 0
         if not step.over:
-            step.least = stage.least
+            step.least, step.cost = stage.least, stage.cost
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
@@ -291,7 +305,8 @@ def make(name: str, log: SolveLog, tree: Tree) -> Step:
         newton = Newton(name, log)
         newton.state = tree.states[name]
         return newton
-    return (Direct if name == "direct" else Iterations)(name, log)
+    kinds: dict[str, type[Step]] = {"direct": Direct, "relaxation": Relaxation}
+    return kinds.get(name, Iterations)(name, log)
 
 
 SPEC = SolverSpec(

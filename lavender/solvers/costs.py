@@ -38,9 +38,9 @@ class Count:
 
 
 def factorisations(law: str) -> float:
-    """How many Newton's method is counted for."""
-    count = RATES["count"]
-    return float(count["rows" if law in ("linear", "lcp") else law])
+    """How many Newton's method is counted for; linear is one."""
+    count = RATES["count"] | {"linear": 1.0, "lcp": RATES["count"]["rows"]}
+    return float(count[law])
 
 
 def newton_cost(count: Count, law: str) -> float:
@@ -53,7 +53,8 @@ def newton_cost(count: Count, law: str) -> float:
 
 def least(problem: Problem) -> Count:
     """What Newton's method costs at least, told without an analysis."""
-    return Count("bodies", 0.0, float(problem.metric.work), float(problem.m))
+    over_velocities = problem.generalized is not None
+    return Count("bodies", 0.0, float(problem.metric.work), 0.0 if over_velocities else float(problem.m))
 
 
 def sweep_cost(problem: Problem) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
 
-__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Step", "Sweeps", "setup_time"]
+__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Relaxation", "Step", "Sweeps", "setup_time"]
 
 #: Solver and options of each step.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -28,8 +29,9 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
+    # The convex relaxation of Coulomb's law; its solution is one of Coulomb's law wherever contacts stick.
+    "relaxation": ("anderson", {}),
     "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
-    "admm": ("admm", {}),
 }
 FIRST = 32  # sweeps before the first prediction of their remaining number
 MOST = 2**30  # iterations of one call
@@ -48,6 +50,8 @@ class Step:
     """A solver on the problem of a log."""
 
     over = False  # it has nothing more to do
+    least = np.inf  # iterations that may be predicted to be left, and it goes on
+    cost = np.inf  # ns, of the next turn as counted
     state: Any = None
     impulse: FloatArray  # (m,) N s
 
@@ -64,7 +68,12 @@ class Step:
             log.failure, self.over = last_words(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
-        log.note(METHODS[self.name][0], claim, before)
+        log.note(self.shown, claim, before)
+
+    @property
+    def shown(self) -> str:
+        """The solver's name in messages."""
+        return METHODS[self.name][0]
 
     def turn(self, n: int) -> Claim:
         """Run and offer what came of it."""
@@ -106,15 +115,13 @@ class Iterations(Step):
     """A solver that continues to the bit: in short runs, for the clock and Ctrl-C."""
 
     def turn(self, n: int) -> Claim:
-        log, done, work = self.log, 0, dict[str, int]()
+        done, work = 0, dict[str, int]()
         if self.state is None:
-            self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
-        each = 2e-9 * sweep_cost(log.problem)
+            self.begin()
+        self.each = 2e-9 * sweep_cost(self.log.problem)
         status = Status.MAX_ITERATIONS
-        while done < n and status is Status.MAX_ITERATIONS and not log.late:
-            left = log.deadline.left()
-            time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
-            claim: Claim = self.solver.run(self.state, self.impulse, min(max(1, int(time / each)), n - done), log.tol, None)
+        while done < n and status is Status.MAX_ITERATIONS and not self.log.late:
+            claim = self.some(done, n)
             done, status = done + claim.iterations, claim.status
             for kind, count in claim.work.items():
                 work[kind] = work.get(kind, 0) + count
@@ -122,9 +129,45 @@ class Iterations(Step):
                 break
         self.offer()
         best = getattr(self.state, "best", (np.inf, None))
-        if best[1] is not None and best[0] < log.best:
-            log.offer(best[1])
+        if best[1] is not None and best[0] < self.log.best:
+            self.log.offer(best[1])
         return Claim(status, done, work)
+
+    def begin(self) -> None:
+        """From where the log is."""
+        self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
+
+    def some(self, done: int, n: int) -> Claim:
+        """As many as end soon, of n of which so many are done."""
+        left = self.log.deadline.left()
+        time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
+        few = min(max(1, int(time / self.each)), n - done)
+        claim: Claim = self.solver.run(self.state, self.impulse, few, self.log.tol, None)
+        return claim
+
+
+class Relaxation(Iterations):
+    """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law."""
+
+    relative = 1.0  # by that law, at the last check
+
+    @property
+    def shown(self) -> str:
+        return "relaxation: anderson"
+
+    def begin(self) -> None:
+        self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
+        self.impulse = self.log.problem.start()
+
+    def some(self, done: int, n: int) -> Claim:
+        """Until a check, which ends them where too many are predicted to be left."""
+        log, before = self.log, self.relative
+        claim = super().some(done, min(n, done + max(done // 2, FIRST)))
+        self.relative = log.offer(self.impulse)
+        left = sweeps_left(claim.iterations, before, self.relative, log.tol)
+        if claim.status is not Status.MAX_ITERATIONS or self.relative <= log.tol or left > self.least:
+            return replace(claim, status=Status.STALLED)
+        return claim
 
 
 class Sweeps(Step):
@@ -132,7 +175,6 @@ class Sweeps(Step):
 
     relative = 1.0  # residual of the last check
     told = 0, 0  # sweeps and restarts of the turns before
-    least = np.inf  # sweeps that they may predict to be left, and go on
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         """Everything that depends on no impulse; A is formed only if that is a small part of the time."""
@@ -150,8 +192,9 @@ class Sweeps(Step):
     def turn(self, n: int) -> Claim:
         before = self.state.done
         try:
-            if self.log.deadline.is_set:
-                self.until(self.log.deadline, n, True)
+            left = self.log.deadline.left()
+            if left is not None:
+                self.until(Deadline(min(left, 1e-9 * self.cost)), n, True)
             else:
                 self.predicted(n)
         finally:

@@ -137,12 +137,16 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     return n
 
 
+cdef enum:
+    ADDED = 5                   # multiply-adds of a factor that one counts for where N is put together
+
+
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
     int32_t wide                # columns of a full island that costs what the costliest does, at most most[0]
     int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
-    double work                 # multiply-adds of the factors of all islands
+    double work                 # multiply-adds of N and of its factors, of all islands
 
 
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
@@ -183,6 +187,8 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     need.wide = need.most[0] if need.crowded else 0
     need.values = 0.0
     need.work = 0.0
+    for i in range(panels):
+        need.work += ADDED * 0.5 * (g.pval[i + 1] - g.pval[i]) * (g.pcol[i + 1] - g.pcol[i])
     for i in range(0 if need.crowded else f.n_islands):
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]

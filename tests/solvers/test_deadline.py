@@ -11,9 +11,9 @@ import lavender as lv
 from benchmarks.islands import fresh
 from lavender import deadline, registry, suite
 from lavender.residuals import judging_time
-from lavender.solvers.auto import Auto
-from lavender.solvers.methods import Candidate, Resumed, setup_time
+from lavender.solvers.auto import Auto, Tree
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
+from lavender.solvers.steps import Direct, Newton, setup_time
 from lavender_ext.small import checked_sweeps
 
 OWN = [name for name, spec in registry.specs().items() if spec.own and not spec.external and name != "auto"]
@@ -64,34 +64,36 @@ PROBLEMS = {
 
 
 def play(monkeypatch, clock, pace, problem):
-    """The clock goes by what sweeps, turns and set-ups of `auto` are counted for, times `pace`."""
-    sweep, turn, iterate, count = checked_sweeps.run, Candidate.run, Resumed.iterate, Candidate.count
+    """The clock goes by what sweeps, steps that factor and analyses of `auto` are counted for, times `pace`."""
+    sweep, newton = checked_sweeps.run, registry.get("newton").load()
+    prepare, quiet = newton.prepare, []
 
     def swept(over, watch, lam, n, *more):
         found = sweep(over, watch, lam, n, *more)
         clock.now += 1e-9 * pace * found[1] * problem.metric.work
         return found
 
-    def turned(self, work, others):
-        before, more = self.spent, turn(self, work, others)
-        if not isinstance(self, Resumed):
-            clock.now += 1e-9 * pace * (self.spent - before)
-        return more
+    def turned(kind):
+        turn = kind.turn
 
-    def iterated(self, n):
-        done = iterate(self, n)
-        clock.now += 1e-9 * pace * done * self.cost.each
-        return done
+        def played(self, n):
+            claim = turn(self, n)
+            quiet.append(1)
+            each = Tree(problem).newton / Tree(problem).states["newton"].steps
+            quiet.clear()
+            clock.now += 1e-9 * pace * max(claim.iterations, 1) * each
+            return claim
 
-    def counted(self):
-        if not self.late:
-            clock.now += pace * setup_time(self.name, self.costs.problem)
-        count(self)
+        return played
+
+    def prepared(self, of):
+        clock.now += 0.0 if quiet else pace * setup_time("newton", of)
+        return prepare(self, of)
 
     monkeypatch.setattr(checked_sweeps, "run", swept)
-    monkeypatch.setattr(Candidate, "run", turned)
-    monkeypatch.setattr(Resumed, "iterate", iterated)
-    monkeypatch.setattr(Candidate, "count", counted)
+    monkeypatch.setattr(Newton, "turn", turned(Newton))
+    monkeypatch.setattr(Direct, "turn", turned(Direct))
+    monkeypatch.setattr(newton, "prepare", prepared)
 
 
 @pytest.mark.parametrize("pace", [0.3, 1.0, 3.0])
