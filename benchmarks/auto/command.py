@@ -25,12 +25,22 @@ __all__ = ["command"]
 
 @click.command("auto")
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
-@click.option("--families", default="wild", show_default=True, help="Families with seeds, commas between them.")
-@click.option("--seeds", default="0:60", show_default=True, metavar="A:B", help="Seeds of the families, B left out.")
+@click.option(
+    "--families", default="wild", show_default=True, help="Families with seeds, commas between them."
+)
+@click.option(
+    "--seeds", default="0:60", show_default=True, metavar="A:B", help="Seeds of the families, B left out."
+)
 @click.option("--limit", default=1.0, show_default=True, metavar="S", help="CPU time of one curve.")
-@click.option("--record", type=click.Path(path_type=Path), help="Record every solver and `auto` into this file.")
-@click.option("--judge", type=click.Path(path_type=Path, exists=True), multiple=True, help="Regret on such records.")
-@click.option("--fit", "recorded", type=click.Path(path_type=Path, exists=True), multiple=True, help="Fit the rates.")
+@click.option(
+    "--record", type=click.Path(path_type=Path), help="Record every solver and `auto` into this file."
+)
+@click.option(
+    "--judge", type=click.Path(path_type=Path, exists=True), multiple=True, help="Regret on such records."
+)
+@click.option(
+    "--fit", "recorded", type=click.Path(path_type=Path, exists=True), multiple=True, help="Fit the rates."
+)
 @click.option("--out", type=click.Path(path_type=Path), help="Write the fitted rates here.")
 def command(
     files: tuple[str, ...], families: str, seeds: str, limit: float, record: Path | None, judge: tuple[Path, ...],
@@ -59,7 +69,9 @@ def command(
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):
         raise InputError(f"--seeds {seeds!r}: A:B is needed, whole numbers with A < B")
     if record is None:
-        raise InputError("nothing to do: --record FILE runs solvers, --judge FILE and --fit FILE read what it wrote")
+        raise InputError(
+            "nothing to do: --record FILE runs solvers, --judge FILE and --fit FILE read what it wrote"
+        )
     names = list(files) or from_seeds(families.replace(",", " ").split(), int(last) - int(first), int(first))
 
     def problems() -> Iterator[tuple[str, Problem]]:

@@ -60,7 +60,9 @@ class Record:
 
     def to(self, level: float) -> tuple[float, float]:
         """(s, iterations) to that level; inf where it was not reached."""
-        return min(((t, n) for n, t, relative in self.points if relative <= level), default=(math.inf, math.inf))
+        return min(
+            ((t, n) for n, t, relative in self.points if relative <= level), default=(math.inf, math.inf)
+        )
 
 
 def read(paths: Iterable[Path]) -> Iterator[Record]:
@@ -75,9 +77,13 @@ def read(paths: Iterable[Path]) -> Iterator[Record]:
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
             try:
                 values = json.loads(line)
-                yield Record(**values | {"points": tuple((int(n), float(t), float(r)) for n, t, r in values["points"])})
+                yield Record(
+                    **values | {"points": tuple((int(n), float(t), float(r)) for n, t, r in values["points"])}
+                )
             except (ValueError, TypeError, KeyError) as error:
-                raise InputError(f"{path}, line {number} is no record ({error}); `--record` writes them") from None
+                raise InputError(
+                    f"{path}, line {number} is no record ({error}); `--record` writes them"
+                ) from None
 
 
 def as_line(record: Record) -> str:

@@ -70,7 +70,9 @@ RULES: dict[str, Rule] = {
     "without the relaxation": without("relaxation"),
     "without `nncg` at the end": without("nncg"),
     "with `admm` at the end": lambda tree: (
-        t for s in tree for t in ((s, replace(s, solver="admm")) if s.solver == "anderson" and s.least == math.inf else (s,))
+        t
+        for s in tree
+        for t in ((s, replace(s, solver="admm")) if s.solver == "anderson" and s.least == math.inf else (s,))
     ),
 }
 
@@ -86,7 +88,11 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule = iter) -> flo
             continue
         before, name = done.get(stage.solver, 0.0), stage.solver
         time, end = curve.to(level)
-        n = _given_up(curve, before, stage, level) if math.isfinite(stage.least) else before + max(stage.iterations, 1.0)
+        n = (
+            _given_up(curve, before, stage, level)
+            if math.isfinite(stage.least)
+            else before + max(stage.iterations, 1.0)
+        )
         solved = n >= end
         now = time if solved else _at(curve, n)
         total += now - spent.get(name, 0.0) + LINE
@@ -164,7 +170,12 @@ def summary(found: list[tuple[float, str, float]]) -> str:
 def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, object]:
     """The twelve rates: medians of counts; of times least squares in the logarithm, at 1e-6."""
     kinds = {"rows": ("linear", "lcp"), "cone": ("cone",), "coulomb": ("coulomb",)}
-    forms, newton, sweeps, counts = ("bodies", "dense", "panels", "velocities"), [], [], {kind: [7.0] for kind in kinds}
+    forms, newton, sweeps, counts = (
+        ("bodies", "dense", "panels", "velocities"),
+        [],
+        [],
+        {kind: [7.0] for kind in kinds},
+    )
     for problem, curves in cases:
         kind = next(kind for kind, laws in kinds.items() if problem.law in laws)
         if "anderson" in curves and len(points := curves["anderson"].points) > 4:
@@ -179,7 +190,9 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, object]:
                 compiled = c.form == "velocities"
                 if not compiled and problem.law != "linear":
                     counts[kind].append(max(n, 1.0))
-                newton.append((kind, 1.0 if problem.law == "linear" else 0.0, max(n, 1.0), compiled, c, 1e9 * time))
+                newton.append(
+                    (kind, 1.0 if problem.law == "linear" else 0.0, max(n, 1.0), compiled, c, 1e9 * time)
+                )
     x, t = (np.array(column, float) for column in zip(*sweeps, strict=True))
     row, entry, cone = _positive(lambda q: x @ q, t, [12.0, 0.5, 1.7])
     count = {kind: float(np.median(found)) for kind, found in counts.items()}
@@ -200,5 +213,7 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, object]:
 
 
 def _positive(model: Callable[[np.ndarray], np.ndarray], time: np.ndarray, start: list[float]) -> list[float]:
-    found = optimize.least_squares(lambda q: np.log(model(np.exp(q))) - np.log(time), np.log(start), loss="soft_l1")
+    found = optimize.least_squares(
+        lambda q: np.log(model(np.exp(q))) - np.log(time), np.log(start), loss="soft_l1"
+    )
     return [float(f"{rate:.3g}") for rate in np.exp(found.x)]

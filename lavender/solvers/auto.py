@@ -285,9 +285,10 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
 
 def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:
     """Whether after work of this cost [ns] anybody who factors would still end in time."""
-    known = tree.newton if "newton" in vars(tree) else tree.least
-    spent = [steps[name].over for name in tree.states if name in steps] if "states" in vars(tree) else [False]
-    return not all(spent) and not log.ends_late(cost + SURE * known)
+    if "states" not in vars(tree):
+        return not log.ends_late(cost + SURE * tree.least)
+    able = [name for name in tree.states if name not in steps or not steps[name].over]
+    return bool(able) and not log.ends_late(cost + SURE * tree.newton)
 
 
 def once(stage: Stage) -> float:

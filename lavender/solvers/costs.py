@@ -19,7 +19,17 @@ from typing import Any
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
 
-__all__ = ["FORMED", "RATES", "SWEEPS", "Count", "factorisations", "formed", "least", "newton_cost", "sweep_cost"]
+__all__ = [
+    "FORMED",
+    "RATES",
+    "SWEEPS",
+    "Count",
+    "factorisations",
+    "formed",
+    "least",
+    "newton_cost",
+    "sweep_cost",
+]
 
 RATES: dict[str, Any] = json.loads(Path(__file__).with_name("rates.json").read_text(encoding="utf-8"))
 FORMED = 10.0  # ns for each entry of an A that is formed of J and M
@@ -60,7 +70,9 @@ def least(problem: Problem) -> Count:
 def sweep_cost(problem: Problem) -> float:
     """(2)."""
     work = float(sweep_work(problem))
-    return float(RATES["sweep row"] * problem.m + RATES["sweep cone" if problem.law == "cone" else "entry"] * work)
+    return float(
+        RATES["sweep row"] * problem.m + RATES["sweep cone" if problem.law == "cone" else "entry"] * work
+    )
 
 
 def formed(problem: Problem) -> Count:

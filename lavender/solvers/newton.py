@@ -76,7 +76,13 @@ class NewtonState:
         if system.form == "velocity":
             return Count("bodies", system.cost, read, float(problem.m))
         made = 0.0 if problem.generalized is None else FORMED * entries_of(problem)
-        return Count("dense" if system.dense else "panels", system.multiply_adds, system.entries, float(problem.m), made)
+        return Count(
+            "dense" if system.dense else "panels",
+            system.multiply_adds,
+            system.entries,
+            float(problem.m),
+            made,
+        )
 
     @property
     def steps(self) -> float:

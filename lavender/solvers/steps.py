@@ -114,6 +114,8 @@ class Direct(Step):
 class Iterations(Step):
     """A solver that continues to the bit: in short runs, for the clock and Ctrl-C."""
 
+    closer = 1.0  # of tol, to which it goes
+
     def turn(self, n: int) -> Claim:
         done, work = 0, dict[str, int]()
         if self.state is None:
@@ -142,13 +144,14 @@ class Iterations(Step):
         left = self.log.deadline.left()
         time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
         few = min(max(1, int(time / self.each)), n - done)
-        claim: Claim = self.solver.run(self.state, self.impulse, few, self.log.tol, None)
+        claim: Claim = self.solver.run(self.state, self.impulse, few, self.closer * self.log.tol, None)
         return claim
 
 
 class Relaxation(Iterations):
     """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law."""
 
+    closer = 0.1
     relative = 1.0  # by that law, at the last check
 
     @property
@@ -193,7 +196,7 @@ class Sweeps(Step):
         before = self.state.done
         try:
             left = self.log.deadline.left()
-            if left is not None:
+            if left is not None and 1e-9 * self.cost > PROBE * left:
                 self.until(Deadline(min(left, 1e-9 * self.cost)), n, True)
             else:
                 self.predicted(n)
@@ -205,12 +208,21 @@ class Sweeps(Step):
         """As many as end in time; `checked`: and are judged in it."""
         log = self.log
         pace = self.state.within(
-            self.impulse, self.relative, n, log.tol, FIRST, deadline.left, self.each, PROBE, CHUNK_TIME, checked
+            self.impulse,
+            self.relative,
+            n,
+            log.tol,
+            FIRST,
+            deadline.left,
+            self.each,
+            PROBE,
+            CHUNK_TIME,
+            checked,
         )
         log.pace = pace / self.each
 
     def predicted(self, n: int) -> None:
-        """Runs of a clock's length; they end where more than `least` are predicted to be left."""
+        """Runs of a length after which the clock may be read; they end where more than `least` are predicted to be left."""
         log, state, end = self.log, self.state, self.state.done + n
         chunk, at, before = max(1, int(CHUNK_TIME / self.each)), state.done, self.relative
         while state.done < end:
@@ -218,7 +230,7 @@ class Sweeps(Step):
             k = min(chunk, due - state.done)
             state.run(self.impulse, self.relative, k, log.tol, k, FIRST, np.inf)
             self.relative = log.take(state.now)
-            if STATUS[state.status] is not Status.MAX_ITERATIONS or self.relative <= log.tol:
+            if STATUS[state.status] is not Status.MAX_ITERATIONS or self.relative <= log.tol or log.late:
                 return
             if state.done >= due:
                 if sweeps_left(due - at, before, self.relative, log.tol) > self.least:

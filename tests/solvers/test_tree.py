@@ -110,7 +110,9 @@ def test_counts_are_what_newton_does(seed):
     assert sparse.count.form == "panels" and 400.0 <= sparse.count.work < 400.0**3 / 3.0
 
 
-@pytest.mark.parametrize("name", ["stack(n=200)", "granularF(n=4)", "pyramidF(k=6)", "wild(seed=24)", "wild(seed=3)"])
+@pytest.mark.parametrize(
+    "name", ["stack(n=200)", "granularF(n=4)", "pyramidF(k=6)", "wild(seed=24)", "wild(seed=3)"]
+)
 def test_the_least_is_below_what_is_counted(name):
     problem = suite.case(name).problem
     reference(problem)
