@@ -180,9 +180,9 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, object]:
         kind = next(kind for kind, laws in kinds.items() if problem.law in laws)
         if "anderson" in curves and len(points := curves["anderson"].points) > 4:
             (n, t, _), (last, end, _) = points[len(points) // 2], points[-1]
-            cone = problem.law == "cone"
-            work = costs.sweep_work(problem)
-            sweeps.append(([problem.m, work * (not cone), work * cone], 1e9 * (end - t) / max(1, last - n)))
+            cone, work = problem.law == "cone", costs.sweep_work(problem)
+            if end - t > LINE * len(points):  # else it is Python's share
+                sweeps.append(([problem.m, work * (not cone), work * cone], 1e9 * (end - t) / max(1, last - n)))
         for name, state in Tree(problem).states.items():
             time, n = curves[name].to(1e-6) if name in curves else (math.inf, math.inf)
             if math.isfinite(time) and problem.m > 20:
