@@ -5,7 +5,7 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
+Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the way of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)

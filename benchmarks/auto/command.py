@@ -58,12 +58,10 @@ def command(
     if judge:
         cases = gathered(judge)
         for operator in ("", *OPERATORS):
-            some = [case for case in cases if operator in ("", case[0].operator)]
+            some = [case for case in cases if operator in ("", case[0].operator) and "auto" in case[1]]
             click.echo(f"{operator or 'all':12} {summary(regrets(some, None))}")
         for name, rule in RULES.items():
             click.echo(f"{name:40} {summary(regrets(cases, rule))}")
-        for regret, case, level in sorted(regrets(cases, None), reverse=True)[:12]:
-            click.echo(f"{regret:8.2f}  {case} to {level:.0e}")
         return
     first, colon, last = seeds.partition(":")
     if not (colon and first.isdecimal() and last.isdecimal() and int(first) < int(last)):

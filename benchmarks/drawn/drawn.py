@@ -6,7 +6,7 @@
                contacts on few velocities), option (convection and diffusion), kernel (dual of a classifier),
                deblur (a convolution, nearly singular), beam (fourth differences)
 
-Which structures are for judging was drawn by lot, below: rates and lines of the tree are tuned on the others and `wild`.
+Which structures are for judging was drawn by lot, below: rates and lines of the tree are tuned on the others.
 """
 
 from __future__ import annotations
@@ -315,7 +315,7 @@ TUNED = frozenset(STRUCTURES) - JUDGED
 
 @family(drawn_tuned={"part": "tuned"}, drawn_judged={"part": "judged"}, drawn_rolling={"part": "rolling"})
 def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
-    """A problem drawn by `seed` of some 8 to `rows` rows, even in the logarithm; `part`: all, tuned or judged structures.
+    """A problem drawn by `seed` of some 8 to `rows` rows; `part`: all, tuned or judged structures.
 
     Or "rolling": worlds to tune on whose contacts resist rolling, and perhaps spin.
     """

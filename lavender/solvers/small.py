@@ -97,7 +97,8 @@ def who(problem: Problem) -> str:
     """Who solves a problem in the compiled call of `auto`, in words; "" where that is not made."""
     if problem.generalized is not None:
         kernel = general.prepare(problem)
-        cost = np.inf if kernel is None else AUTO.limits.cost(problem.metric, kernel.work)[0]
+        limits = AUTO.limits
+        cost = np.inf if kernel is None or limits is None else limits.cost(problem.metric, kernel.work)[0]
         return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= MOST else ""
     small = prepared(problem)
     if small is None:

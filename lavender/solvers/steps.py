@@ -222,7 +222,7 @@ class Sweeps(Step):
         log.pace = pace / self.each
 
     def predicted(self, n: int) -> None:
-        """Runs of a length after which the clock may be read; they end where more than `least` are predicted to be left."""
+        """Between looks at the clock, until more than `least` are predicted to be left."""
         log, state, end = self.log, self.state, self.state.done + n
         chunk, at, before = max(1, int(CHUNK_TIME / self.each)), state.done, self.relative
         while state.done < end:
@@ -230,7 +230,8 @@ class Sweeps(Step):
             k = min(chunk, due - state.done)
             state.run(self.impulse, self.relative, k, log.tol, k, FIRST, np.inf)
             self.relative = log.take(state.now)
-            if STATUS[state.status] is not Status.MAX_ITERATIONS or self.relative <= log.tol or log.late:
+            ended = STATUS[state.status] is not Status.MAX_ITERATIONS
+            if ended or self.relative <= log.tol or log.late:
                 return
             if state.done >= due:
                 if sweeps_left(due - at, before, self.relative, log.tol) > self.least:

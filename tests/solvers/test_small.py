@@ -21,7 +21,6 @@ from benchmarks.islands import forms, fresh, stacks
 from lavender import registry, suite
 from lavender.registry import SMALL_ROWS
 from lavender.solvers.costs import newton_cost
-from lavender.solvers.newton_systems import general
 from lavender.solvers.small import (
     AUTO,
     ISLAND,

@@ -38,14 +38,21 @@ class System:
     form = ""
     cost = 0.0  # multiply-adds of one factorisation, roughly
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
+    dense = False  # A as a full matrix
+    entries = 0.0  # of A
 
     def __init__(self, problem: Problem, solve: Solve) -> None:
         self.problem, self.solve = problem, solve
 
     @property
+    def multiply_adds(self) -> float:
+        """Of one factor."""
+        return self.cost
+
+    @property
     def seconds(self) -> float:
         """What the next factor takes, at that pace."""
-        return self.pace * self.cost
+        return self.pace * self.multiply_adds
 
     def took(self, seconds: float) -> None:
         """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
@@ -108,15 +115,10 @@ class MatrixSystem(System):
 
     @property
     def multiply_adds(self) -> float:
-        """Of one factor; fill is counted before the first number."""
+        """As of all systems; fill is counted before the first number."""
         if not self.dense:
             self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
         return self.cost
-
-    @property
-    def seconds(self) -> float:
-        """As of all systems."""
-        return self.pace * self.multiply_adds
 
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:
