@@ -36,7 +36,7 @@ from lavender.registry import SMALL_ROWS, SolverSpec, get
 from lavender.solution import Claim, Status
 from lavender.solvers import costs
 from lavender.solvers.certify import certify
-from lavender.solvers.newton import NewtonState
+from lavender.solvers.newton import ROWS, NewtonState
 from lavender.solvers.setup_times import sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
@@ -107,6 +107,13 @@ class Tree:
             return False
         return costs.newton_cost(costs.formed(self.problem), self.law) < over.cost
 
+    def add_rows(self) -> None:
+        """Rows of A, where velocities of J and M have failed."""
+        problem, name = self.problem, "newton over rows"
+        over_velocities = self.states and problem.generalized is not None and name not in self.states
+        if over_velocities and problem.m <= ROWS and not problem.cones.has_round and not self.is_late:
+            self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
+
     @cached_property
     def newton(self) -> float:
         """Newton's method, inf where there is none."""
@@ -122,7 +129,7 @@ class Tree:
     def is_short(self, newton: float) -> bool:
         """A limit that Newton's method of this cost [ns] may use up: sweeps tell the pace, and leave something."""
         return self.deadline.is_set and self.deadline.passed(
-            setup_time("newton", self.problem) + 1e-9 * MOST * SURE * newton
+            setup_time("newton", self.problem) + 1e-9 * 2.0 * SURE * newton
         )
 
     @property
@@ -148,6 +155,7 @@ class Tree:
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(MOST)
         # What follows where these fail has its line here.
+        self.add_rows()
         for k in range(TURNS):
             yield from self.in_turn(2.0**k)
 
@@ -162,7 +170,7 @@ class Tree:
         cost, short = SHARE * newton - self.begun, self.is_short(newton)
         if short and not self.begun:
             cost = max(cost, 0.5 * self.deadline.nanoseconds())
-        pays = short or costs.SWEEPS * self.sweep <= newton
+        pays = short or self.is_loose or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)

@@ -5,7 +5,7 @@
 
 m rows; e multiply-adds of a sweep or entries of A, which one step reads; w multiply-adds of one factorisation and its
 solution, as the solver's own analysis tells them (`NewtonState.count`); n factorisations, by law. Over generalised
-velocities all is compiled: no start, and nothing for a row. No clock is read: the same problem has the same counts on
+velocities all is compiled: no start, nothing for a row, and n is STEPS times as large. No clock is read: the same problem has the same counts on
 every machine. The rates are the twelve numbers of `rates.json`, which `python -m benchmarks auto --fit` writes.
 """
 
@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 RATES: dict[str, Any] = json.loads(Path(__file__).with_name("rates.json").read_text(encoding="utf-8"))
+STEPS = 4.0  # over generalised velocities for each factorisation elsewhere
 FORMED = 10.0  # ns for each entry of an A that is formed of J and M
 SWEEPS = 100.0  # that a problem is counted to take: Newton's method comes first where its cost is less
 
@@ -57,8 +58,8 @@ def newton_cost(count: Count, law: str) -> float:
     """(1)."""
     r = RATES
     each = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
-    start = r["start"] if count.rows else 0.0
-    return float(start + count.set_up + factorisations(law) * each)
+    start, steps = (r["start"], 1.0) if count.rows else (0.0, STEPS)
+    return float(start + count.set_up + steps * factorisations(law) * each)
 
 
 def least(problem: Problem) -> Count:

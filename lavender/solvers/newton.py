@@ -35,7 +35,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status, counted
-from lavender.solvers.costs import FORMED, Count, factorisations, newton_cost
+from lavender.solvers.costs import FORMED, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.setup_times import entries_of, over_bodies, over_rows, over_velocities
@@ -87,8 +87,8 @@ class NewtonState:
     @property
     def steps(self) -> float:
         """Iterations that it is counted to take: over velocities each is one of an island."""
-        islands = 1 if self.general is None else max(1, self.general.islands)
-        return factorisations(self.problem.law) * islands
+        steps = 1.0 if self.general is None else STEPS * max(1, self.general.islands)
+        return factorisations(self.problem.law) * steps
 
     @property
     def cost(self) -> float:

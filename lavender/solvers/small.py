@@ -21,7 +21,7 @@ from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn, counted
-from lavender.solvers.costs import RATES, factorisations, sweep_cost
+from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming, over_velocities
@@ -40,7 +40,7 @@ MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities u
 
 def limits(most: float) -> Limits:
     """Limits of the compiled calls over generalised velocities: rates, room, and the most counted cost [ns]."""
-    count = (factorisations(law) for law in ("lcp", "coulomb", "cone"))
+    count = (STEPS * factorisations(law) for law in ("lcp", "coulomb", "cone"))
     return Limits(np.array([RATES["entry"], RATES["work"]["velocities"], *count, general.ROOM, most]))
 
 
