@@ -27,7 +27,7 @@ from lavender_ext.small import checked_sweeps
 @pytest.fixture(autouse=True)
 def rates(monkeypatch):
     """Those of one fit: which line comes first is a matter of rates, how lines follow is not."""
-    work = {"bodies": 0.2, "dense": 0.025, "panels": 0.5, "velocities": 0.2}
+    work = {"bodies": 0.2, "dense": 0.025, "panels": 0.5, "velocities": 0.05}
     count = {"rows": 7.0, "cone": 14.0, "coulomb": 12.0}
     made = {"start": 84e3, "row": 300.0, "entry": 0.45, "work": work, "count": count}
     monkeypatch.setattr(costs, "RATES", made | {"sweep row": 12.0, "sweep cone": 1.7})
@@ -53,7 +53,6 @@ FIRST = {
     "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
     "linear, J and M": (lambda: over_velocities(None), ["newton"]),
     "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton over rows", "newton"]),
-    "J and M, many rows": (lambda: over_velocities("coulomb", 1200, 20), ["newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
     "the cone law": (
