@@ -3,8 +3,8 @@
     the start is a solution     nothing is done
     a small problem             at most 64 rows, or small islands under friction, or cheap velocities: one compiled call
                                 (`small.py`); if that does not solve it, as any other
-    a matrix                    `direct`: linear to its end, bounded rows for twice the factorisations that `newton` is
-                                counted for
+    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for twice the factorisations
+                                that `newton` is counted for
     sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it; not
                                 where 100 sweeps cost more
     a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
@@ -48,6 +48,7 @@ MOST = 10.0  # times its counted cost, that Newton's method has before both go i
 ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 FEW = 32.0  # iterations of `nncg` after the relaxation
+BAND = 100  # half bandwidth up to which `direct` comes first
 SURE = 4.0  # times the counted cost, within which nine in ten end
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
@@ -133,6 +134,14 @@ class Tree:
         )
 
     @property
+    def is_narrow(self) -> bool:
+        """Bounded rows of a symmetric matrix, given as such, of a narrow band: a factor costs little."""
+        p = self.problem
+        if p.matrix is None or self.law != "lcp" or len(p._compressed[1]) > (2.0 * BAND + 1.0) * p.m:
+            return False
+        return max(p.bandwidth) <= BAND and bool(p.is_symmetric)
+
+    @property
     def is_loose(self) -> bool:
         """Bodies under Coulomb's law, nearly each contact between another pair: sweeps then decide what sticks."""
         rows = self.problem.rows
@@ -144,9 +153,9 @@ class Tree:
         """The lines."""
         if self.problem.matrix is not None and self.law == "linear":
             yield Stage("direct", inf, self.least, "linear, a matrix")
-        if self.problem.matrix is not None and self.law == "lcp" and self.problem.is_symmetric:
+        if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
-            yield Stage("direct", n, self.least, "bounded rows of a matrix: twice newton's factorisations")
+            yield Stage("direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations")
         yield from self.sweeps_first(self.least)
         if self.is_loose:
             why = "a loose pile: the convex relaxation, whose solution is one where contacts stick"
