@@ -155,7 +155,9 @@ class Tree:
             yield Stage("direct", inf, self.least, "linear, a matrix")
         if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
-            yield Stage("direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations")
+            yield Stage(
+                "direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations"
+            )
         yield from self.sweeps_first(self.least)
         if self.is_loose:
             why = "a loose pile: the convex relaxation, whose solution is one where contacts stick"

@@ -207,18 +207,8 @@ class Sweeps(Step):
     def until(self, deadline: Deadline, n: int, checked: bool) -> None:
         """As many as end in time; `checked`: and are judged in it."""
         log = self.log
-        pace = self.state.within(
-            self.impulse,
-            self.relative,
-            n,
-            log.tol,
-            FIRST,
-            deadline.left,
-            self.each,
-            PROBE,
-            CHUNK_TIME,
-            checked,
-        )
+        room = self.each, PROBE, CHUNK_TIME, checked
+        pace = self.state.within(self.impulse, self.relative, n, log.tol, FIRST, deadline.left, *room)
         log.pace = pace / self.each
 
     def predicted(self, n: int) -> None:
