@@ -171,7 +171,8 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
     def model(q: Any) -> Any:
         start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))
         steps = (
-            (costs.STEPS * count[n] if n in count else n) * (each * c.rows + entry * c.entries + work[c.form] * c.work)
+            (costs.STEPS * count[n] if n in count else n)
+            * (each * c.rows + entry * c.entries + work[c.form] * c.work)
             for c, _, n in newton
         )
         return np.array(

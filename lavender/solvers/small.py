@@ -52,7 +52,7 @@ def call_ends_within(problem: Problem, seconds: float | None) -> bool:
     if seconds is None or problem.m <= SMALL_ROWS:
         return True
     if problem.generalized is not None:
-        return 4e-9 * MOST <= QUARTER * seconds
+        return QUARTER * seconds >= 4e-9 * MOST
     if problem.law in ("linear", "lcp"):
         return False
     cost = SPLIT * problem.m + 1e9 * forming(problem) + SWEPT * sweep_cost(problem)

@@ -14,7 +14,8 @@ cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
     `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. `work`:
-    multiply-adds of N and one factor of each island. Where N of an island has more than `most` values (`fits`) there is no room, and no `run`.
+    multiply-adds of N and one factor of each island. Where N of an island has more than `most` values (`fits`) there is no
+    room, and no `run`.
     """
     cdef flow_t f
     cdef Data data
