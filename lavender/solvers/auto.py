@@ -47,7 +47,7 @@ SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
-FEW = 32.0  # iterations of `nncg` after the relaxation
+FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
 BAND = 100  # half bandwidth up to which `direct` comes first
 SURE = 4.0  # times the counted cost, within which nine in ten end
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
@@ -134,6 +134,12 @@ class Tree:
         )
 
     @property
+    def may_fill(self) -> bool:
+        """A matrix of few entries without a narrow band."""
+        p = self.problem
+        return len(p._compressed[1]) < 0.05 * p.m**2 and max(p.bandwidth) > BAND
+
+    @property
     def is_narrow(self) -> bool:
         """Bounded rows of a symmetric matrix, given as such, of a narrow band: a factor costs little."""
         p = self.problem
@@ -152,6 +158,8 @@ class Tree:
     def __iter__(self) -> Iterator[Stage]:
         """The lines."""
         if self.problem.matrix is not None and self.law == "linear":
+            if self.may_fill:
+                yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
         if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
