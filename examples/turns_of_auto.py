@@ -1,7 +1,7 @@
 """One solve of auto: who has the turns, and what each brings.
 
-A pile under Coulomb's law, 14,046 rows. The plan is printed first: candidates and what each is expected to cost,
-counted. Then it is solved; the figure shows the least residual after each turn.
+A pile under Coulomb's law, 14,046 rows. The way through the tree is printed first, with the costs that it compares.
+Then it is solved; the figure shows the least residual after each turn.
 
     python examples/turns_of_auto.py [FIGURE.png]
 """
@@ -19,7 +19,7 @@ def problem():
 
 
 def main(path="turns_of_auto.png"):
-    """Print the plan and the turns, and draw them."""
+    """Print the way and the turns, and draw them."""
     import matplotlib.pyplot as plt
 
     pile = problem()

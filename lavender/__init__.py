@@ -5,7 +5,7 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `solve_qp`, `prepare` (for steps), `available`, `known`, `explain` (plan of `auto`)
+Solving    `solve`, `solve_many`, `solve_qp`, `prepare` (for steps), `available`, `known`, `explain` (the way of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
@@ -172,6 +172,6 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
+for _name in ("auto", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
     get(_name)  # with the package: the first solve may have a time limit
 lavender._starting.end()

@@ -1,9 +1,7 @@
-"""What `auto` loses against the best of our own solvers, and the rates of its cost model.
+"""What `auto` loses against the best of its solvers, what each line of its tree gains, and the rates of its counts.
 
-regret    `auto` beside every other solver of ours, timed in turn
-curves    what each candidate of `auto` does alone, turn by turn
-replay    the schedule of `auto` on such curves, by other rates too
-rates     least squares of the rates on such curves
+record    what each solver does alone, turn by turn, and `auto` beside them, in one run
+replay    the tree on such records, with a line put in or taken out
 """
 
 from benchmarks.auto.command import command

@@ -1,123 +1,198 @@
-"""The schedule of `auto` on recorded curves: what a solve would have taken, by other rates too, without solving.
+"""The tree of `auto` on records: what a solve would have taken, with a line put in or taken out; the fit of its rates.
 
-The candidates are those of `lavender/solvers/methods.py`, with a curve in place of a solver; turns, remainders and
-their order are made by the same code. Beside the curves' own times a call and each turn cost what Python takes.
+    regret = (t + SHIFT) / (least t of all solvers + SHIFT)
+
+The lines are made by the tree itself; in place of solvers stand their curves. A call and each line cost Python's share.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from types import SimpleNamespace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice
 from typing import Any
 
-from benchmarks.auto.curves import LEVELS, Curve
-from benchmarks.auto.regret import SHIFT
-from lavender import registry
-from lavender.deadline import NEVER
-from lavender.solution import Claim, Status
-from lavender.solvers.costs import METHODS, Costs, candidates
-from lavender.solvers.methods import FIRST, Candidate
-from lavender.solvers.schedule import race
-from lavender.solvers.structure import Structure
+import numpy as np
+from scipy import optimize
+
+from benchmarks.auto.record import LEVELS, Record
+from lavender.problem import Problem
+from lavender.registry import SMALL_ROWS
+from lavender.solvers import costs
+from lavender.solvers.auto import MOST, SHARE, Stage, Tree
+from lavender.solvers.small import who
+from lavender.solvers.steps import FIRST
 from lavender_ext.small.checked_sweeps import sweeps_left
 
-__all__ = ["CALL", "TURN", "regret", "replayed"]
+__all__ = ["RULES", "fit", "regrets", "replayed", "summary"]
 
-# s that Python takes for a solve by any of them, for what `auto` counts before, and for each turn and look
-CALL, COUNTED, TURN = 35e-6, 45e-6, 20e-6
+SHIFT = 50e-6  # s: below it the difference of two solvers is Python's share
+CALL, LINE = 35e-6, 20e-6  # s that Python takes for a solve, and for each line
 LOST = 100.0  # times the best, that a solve which does not end counts for
+Curves = Mapping[str, Record]
+Rule = Callable[[Tree], Iterator[Stage]]
 
 
-class Replayed(Candidate):
-    """A candidate whose turns are read off a curve, to `level`."""
-
-    def __init__(self, name: str, log: Any, costs: Any, curve: Curve, level: float) -> None:
-        super().__init__(name, log, costs, registry.get(METHODS[name][0]))
-        self.tape: Any = log
-        self.curve, self.level = curve, level
-        self.is_finite = not self.spec.resumable
-        self.done, self.seconds, self.relative, self.rest_of = 0, 0.0, 1.0, math.inf
-
-    def at(self, n: int) -> tuple[float, float]:
-        """CPU time [s] and residual after n iterations, between the points of the curve."""
-        before = (0, self.curve.setup, 1.0)
-        for point in self.curve.points:
-            if point[0] > n:
-                if self.is_finite or point[0] == before[0]:  # a run is cut, its residual unknown
-                    return point[1] * n / max(point[0], 1), 1.0
-                share = (n - before[0]) / (point[0] - before[0])
-                return before[1] + share * (point[1] - before[1]), before[2]
-            before = point
-        return before[1], before[2]
-
-    def turn(self, n: int) -> Claim:
-        end = self.curve.iterations(self.level)
-        last = self.curve.points[-1][0] if self.curve.points else 0
-        begun = self.done
-        spent = self.at(begun)[0] if begun else 0.0
-        total, now = begun + n, begun
-        while now < total:
-            now = min(total, now + max(now // 2, FIRST)) if self.name == "anderson" else total
-            self.tape.seconds += TURN
-            if now >= end or now > last:
-                break
-            if self.name == "anderson" and self._gives_way(now):
-                break
-        solved = now >= end
-        seconds = self.curve.time(self.level) if solved else self.at(now)[0]
-        self.tape.seconds += seconds - spent
-        self.tape.solved = self.tape.solved or solved
-        self.done = now
-        stuck = not solved and now > last
-        return Claim(Status.STALLED if stuck else Status.MAX_ITERATIONS, now - begun)
-
-    def _gives_way(self, now: int) -> bool:
-        before, at = self.relative, self.done
-        self.relative = self.at(now)[1]
-        self.rest_of = sweeps_left(now - at, before, self.relative, self.level) * self.cost.each
-        self.done = now
-        return self.rest_of > self.others
-
-    def promise(self) -> float:
-        return self.rest_of if self.name == "anderson" else 0.0
+def without(name: str) -> Rule:
+    """The tree without a solver, but for linear matrices."""
+    return lambda tree: (s for s in tree if s.solver != name or s.iterations == math.inf)
 
 
-def replayed(
-    structure: Structure, curves: Mapping[str, Curve], level: float, rates: Mapping[str, Any] | None = None
-) -> float:
-    """What `auto` would take to `level` [s], by these rates; inf where no candidate gets there.
-
-    Parameters
-    ----------
-    structure : of the problem
-    curves : candidate -> its curve
-    rates : as in `rates.json`, which is read if None
-    """
-    log = SimpleNamespace(
-        problem=structure.problem, deadline=NEVER, left=2**31, best=1.0, seconds=CALL + COUNTED, solved=False,
-        ends_late=lambda cost: False, note=lambda *what: None,
-    )  # fmt: skip
-    costs = Costs(structure.problem, level, rates, structure)
-    found: list[Candidate] = []
-    for name in candidates(structure):
-        over = name == "newton" and structure.problem.generalized is not None
-        curve = curves.get("newton over velocities" if over else name)
-        if curve is not None and curve.points:
-            found.append(Replayed(name, log, costs, curve, level))
-    race(list(found), lambda: log.solved)
-    return log.seconds if log.solved else math.inf
+def two_lines(tree: Tree) -> Iterator[Stage]:
+    """Sweeps for a share of Newton's cost, Newton, both in turn; J and M: Newton; linear matrices: `direct`."""
+    count = costs.factorisations(tree.law)
+    if tree.law == "linear" and tree.problem.matrix is not None:
+        yield Stage("direct", math.inf, 0.0, "")
+    elif tree.problem.generalized is None and tree.law != "linear":
+        yield Stage("anderson", SHARE * tree.newton / tree.sweep, 0.0, "")
+    for k in range(20):
+        yield Stage("newton", MOST * 2**k * count, 0.0, "")
+        yield Stage("anderson", MOST * 2**k * tree.newton / tree.sweep, 0.0, "")
 
 
-def regret(
-    cases: Iterable[tuple[Structure, Mapping[str, Curve]]], rates: Mapping[str, Any] | None = None
-) -> list[float]:
-    """(t + SHIFT) / (t_best + SHIFT) of each case and level that somebody ended, replayed by these rates."""
+def sweeps_first(tree: Tree) -> Iterator[Stage]:
+    """Sweeps first even where 100 of them cost more than Newton's method."""
+    if tree.newton < costs.SWEEPS * tree.sweep and tree.law != "linear":
+        yield tree.sweeps(SHARE * tree.newton, "", tree.newton)
+    yield from tree
+
+
+def with_admm(tree: Tree) -> Iterator[Stage]:
+    """`admm` after the sweeps of each turn."""
+    for stage in tree:
+        yield stage
+        if stage.solver == "anderson" and stage.least == math.inf:
+            yield replace(stage, solver="admm")
+
+
+RULES: dict[str, Rule] = {
+    "the tree": iter,
+    "the two-line rule": two_lines,
+    "without `direct` on bounded rows": without("direct"),
+    "without rows of A over J and M": without("newton over rows"),
+    "without the prediction of sweeps": lambda tree: (replace(s, least=math.inf) for s in tree),
+    "sweeps first even if 100 cost more": sweeps_first,
+    "without the relaxation": without("relaxation"),
+    "without `nncg`": without("nncg"),
+    "with `admm` at the end": with_admm,
+}
+
+
+def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
+    """What the lines of this rule would take to `level` [s]; inf where none gets there."""
+    total, at = CALL, dict[str, tuple[float, float]]()  # iterations and s of each solver so far
+    for stage in islice(rule(tree), 60):
+        curve, (before, spent) = curves.get(stage.solver), at.get(stage.solver, (0.0, 0.0))
+        if curve is None or not curve.points or before >= curve.points[-1][0]:
+            continue
+        time, end = curve.to(level)
+        n = before + max(1.0, stage.iterations)
+        if math.isfinite(stage.least):
+            n = given_up(curve, before, stage, level)
+        known = ((0, curve.setup, 1.0), *curve.points)
+        now = time if n >= end else float(np.interp(n, [k for k, _, _ in known], [t for _, t, _ in known]))
+        total += now - spent + LINE
+        if n >= end:
+            return total
+        at[stage.solver] = n, now
+    return math.inf
+
+
+def given_up(curve: Record, before: float, stage: Stage, level: float) -> float:
+    """Iterations at which more than `stage.least` are predicted to be left, or all of the stage."""
+
+    def residual(n: float) -> float:
+        return min((relative for k, _, relative in curve.points if k <= n), default=1.0)
+
+    now, last = before, residual(before)
+    while now < before + stage.iterations:
+        step = min(max(now // 2, FIRST), before + stage.iterations - now)
+        now, relative = now + step, residual(now + step)
+        if relative <= level or sweeps_left(step, last, relative, level) > stage.least:
+            break
+        last = relative
+    return now
+
+
+def regrets(cases: Iterable[tuple[Problem, Curves]], rule: Rule | None) -> list[tuple[float, str, float]]:
+    """(regret, case, level) where somebody gets there: of `auto` as it ran, or of a rule, replayed; inf: lost."""
     found = []
-    for structure, curves in cases:
+    for problem, curves in cases:
+        if rule is not None and (problem.m <= SMALL_ROWS or who(problem)):
+            continue  # one compiled call: nothing to choose
         for level in LEVELS:
-            best = CALL + min(curve.time(level) for curve in curves.values())
+            best = min(curve.to(level)[0] for curve in curves.values())
             if math.isfinite(best):
-                t = min(replayed(structure, curves, level, rates), LOST * best)
-                found.append((t + SHIFT) / (best + SHIFT))
+                t = (
+                    curves["auto"].to(level)[0]
+                    if rule is None
+                    else replayed(Tree(problem), curves, level, rule)
+                )
+                extra = SHIFT + (0.0 if rule is None else CALL)
+                found.append(((t + SHIFT) / (best + extra), next(iter(curves.values())).case, level))
     return found
+
+
+def summary(found: list[tuple[float, str, float]]) -> str:
+    """How many, geometric mean (with what is lost), 95 %, worst, unsolved."""
+    every = np.array([regret for regret, _, _ in found])
+    some = every[np.isfinite(every)]
+    if not len(some):
+        return f"{len(found)}: none solved"
+    mean, lost = (np.exp(np.log(x).mean()) for x in (some, np.minimum(every, LOST)))
+    high = f"95 % {np.quantile(some, 0.95):.2f}  worst {some.max():.1f}  unsolved {len(every) - len(some)}"
+    return f"{len(every):4d}  mean {mean:.2f} ({lost:.2f} with the unsolved as {LOST:.0f})  {high}"
+
+
+def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
+    """The twelve rates: medians of counts; of times least squares in the logarithm, to 1e-6."""
+    forms, kinds = ("bodies", "dense", "panels", "velocities"), ("rows", "cone", "coulomb")
+    newton, sweeps, counts = list[Any](), list[Any](), {kind: [7.0] for kind in kinds}
+    for problem, curves in cases:
+        kind = problem.law if problem.law in kinds else "rows"
+        points = curves["anderson"].points if "anderson" in curves else []
+        if len(points) > 4:
+            (n, t, _), (last, end, _) = points[len(points) // 2], points[-1]
+            cone, work = problem.law == "cone", costs.sweep_work(problem)
+            if end - t > LINE * len(points):  # else it is Python's share
+                sweeps.append((problem.m, work * (not cone), work * cone, 1e9 * (end - t) / max(1, last - n)))
+        for name, state in Tree(problem).states.items():
+            time, n = curves[name].to(1e-6) if name in curves else (math.inf, math.inf)
+            if math.isfinite(time) and problem.m > 20:
+                compiled, linear = state.general is not None, problem.law == "linear"
+                if not compiled and not linear:
+                    counts[kind].append(max(n, 1.0))
+                newton.append((state.count, 1e9 * time, 1.0 if linear else kind if compiled else max(n, 1.0)))
+    x = np.array(sweeps, float)
+    row, entry, cone_entry = positive(lambda q: x[:, :3] @ q, x[:, 3], [12.0, 0.5, 1.7])
+    count: dict[Any, float] = {kind: float(np.median(found)) for kind, found in counts.items()}
+
+    def model(q: Any) -> Any:
+        start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))
+        steps = (
+            (costs.STEPS * count[n] if n in count else n)
+            * (each * c.rows + entry * c.entries + work[c.form] * c.work)
+            for c, _, n in newton
+        )
+        return np.array(
+            [start * (c.rows > 0) + c.set_up + s for (c, _, _), s in zip(newton, steps, strict=True)]
+        )
+
+    start, each, *work = positive(
+        model, np.array([t for _, t, _ in newton]), [8e4, 300.0, 0.2, 0.03, 0.5, 0.2]
+    )
+    rates = {
+        "start": start,
+        "row": each,
+        "entry": entry,
+        "work": dict(zip(forms, work, strict=True)),
+        "count": count,
+    }
+    return rates | {"sweep row": row, "sweep cone": cone_entry}
+
+
+def positive(model: Callable[[Any], Any], time: Any, start: list[float]) -> list[float]:
+    """Rates above 0 by least squares of log(model / time), to three digits."""
+    found = optimize.least_squares(lambda q: np.log(model(np.exp(q)) / time), np.log(start), loss="soft_l1")
+    return [float(f"{rate:.3g}") for rate in np.exp(found.x)]

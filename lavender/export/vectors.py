@@ -27,7 +27,7 @@ from lavender.export.view import METHODS, OTHER_BITS, NotTaken, choices, takes, 
 from lavender.report import tables
 from lavender.report.moved import working
 from lavender.report.verdict import verdict
-from lavender.solvers.costs import METHODS as CANDIDATES
+from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.driver.driver import Driver
 from lavender_ext.newton.solve import OUTCOMES
 

@@ -89,13 +89,6 @@ def permuted_band(problem: Problem, order: IntArray) -> int:
     return int(np.abs(row - place[a.indices]).max(initial=0))
 
 
-def filled_cost(problem: Problem) -> float:
-    """Of one factor of A by panels [ns], by its fill, which is counted anew."""
-    indptr, indices, _ = _mirrored(problem)
-    panels = SparsePanels(indptr, indices, not problem.is_symmetric, WIDE)
-    return PANELS + PANELS_ENTRY * len(indices) + PANELS_WORK * panels.work
-
-
 class Factor(Protocol):
     """Factorisation of A_FF + shift D_FF for changing free sets."""
 

@@ -27,7 +27,6 @@ from lavender.problem import Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import reference
 from lavender.solution import Claim, Status
-from lavender.solvers import weights
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
@@ -38,6 +37,7 @@ from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
 
+_FORMED_START, _FORMED = 60e-6, 2e-9  # s of A formed of J and M, and of each of its entries
 _PANELS, _BODIES = 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
@@ -187,7 +187,7 @@ def _opening(problem: Problem) -> float:
         entries = 24 * problem.m if _is_over_bodies(problem) else int(problem._meetings)
     formed = 0.0
     if problem.generalized is not None:
-        formed = 1e-9 * (weights.FORMED_START + weights.FORMED * float(problem.metric.entries_of_a))
+        formed = _FORMED_START + _FORMED * float(problem.metric.entries_of_a)
     return _ENTRY * entries + formed
 
 

@@ -1,43 +1,218 @@
-"""Chooses and combines other solvers, by their expected costs.
+"""Chooses and combines other solvers: this tree, by two counted costs (`costs.py`).
 
-    small problems   one compiled call, which solves most of them (`small.py`)
-    others           the candidates of a table, each with a cost that is counted from the problem's structure and fitted
-                     rates (`costs.py`); repeatedly, the candidate with the least expected remaining cost gets a turn
-                     (`schedule.py`)
+    the start is a solution     nothing is done
+    a small problem             at most 64 rows, or small islands under friction, or cheap velocities: one compiled call
+                                (`small.py`); if that does not solve it, as any other
+    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for twice the factorisations
+                                that `newton` is counted for
+    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it; not
+                                where 100 sweeps cost more
+    a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
+    Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
+                                rows of A, the cheaper first
+    all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`
+    at last                     a certificate that there is no solution (`certify.py`)
 
-Costs are counted, never timed, so the same problem is solved in the same way on every machine. The clock only ends a
-solve under a time limit, and shortens its turns. The result is the best impulse of all turns. If a problem remains
-unsolved, `auto` looks for a certificate that it has no solution. `Solution.turns` lists what ran.
+Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
+problem is solved in the same way on every machine. Under a time limit the tree is the same: whoever factors begins only
+if SURE times the counted cost is left, and sweeps keep the time in which nobody else would end.
+`Solution.turns` lists what ran, `lavender.explain` what would run.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from math import inf
 
 import numpy as np
 
 from lavender._arrays import FloatArray
-from lavender.deadline import Deadline
+from lavender._derived import cached_property
+from lavender.deadline import NEVER, Deadline
 from lavender.errors import BREAKDOWN, last_words
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SMALL_ROWS, SolverSpec
+from lavender.registry import SMALL_ROWS, SolverSpec, get
 from lavender.solution import Claim, Status
+from lavender.solvers import costs
 from lavender.solvers.certify import certify
-from lavender.solvers.costs import Costs, Plan, candidates
-from lavender.solvers.methods import Candidate, Sweeps, in_short_time, make
-from lavender.solvers.schedule import race
+from lavender.solvers.newton import ROWS, NewtonState
 from lavender.solvers.setup_times import sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.structure import Structure
+from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Relaxation, Step, Sweeps, setup_time
+from lavender_ext.factor import graph
 
+SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
+MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
+ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
+TURNS = 6  # that all have with doubled work
+FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
+BAND = 100  # half bandwidth up to which `direct` comes first
+SURE = 4.0  # times the counted cost, within which nine in ten end
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
-# which rows are free. Under limits of 1 and 10 ms, residuals from stale guesses are then 1.8 and 1.3 times smaller. The
-# value is arbitrary: half or twice as much changes nothing.
+# which rows are free.
 STALE = 1e3
-NOTHING_TOLD = Claim(Status.MAX_ITERATIONS, 0)
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
+NOTHING_TOLD = Claim(Status.MAX_ITERATIONS, 0)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One line of the tree."""
+
+    solver: str  # of METHODS
+    iterations: float  # at most
+    cost: float  # ns, of these as counted
+    why: str
+    least: float = inf  # sweeps that may be predicted to be left
+
+
+class Tree:
+    """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
+
+    begun = 0.0  # ns, of sweeps before Newton's method
+
+    def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
+        self.problem, self.law, self.deadline = problem, problem.law, deadline
+
+    @cached_property
+    def sweep(self) -> float:
+        """One sweep."""
+        return costs.sweep_cost(self.problem)
+
+    @cached_property
+    def least(self) -> float:
+        """Newton's method at least, told without its analysis."""
+        return costs.newton_cost(costs.least(self.problem), self.law)
+
+    @cached_property
+    def states(self) -> dict[str, NewtonState]:
+        """Newton's method after its analysis, the cheaper form first; none where it takes no form or has no time."""
+        found: dict[str, NewtonState] = {}
+        problem = self.problem
+        if get("newton").refuses(problem) is not None or self.is_late:
+            return found
+        for name in ("newton", "newton over rows"):
+            if name == "newton over rows" and (self.is_late or not self._rows_may_pay(found.get("newton"))):
+                continue
+            try:
+                found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
+            except BREAKDOWN:
+                continue
+        return dict(sorted(found.items(), key=lambda pair: pair[1].cost))
+
+    def _rows_may_pay(self, over: NewtonState | None) -> bool:
+        """Whether rows of an A that is formed of J and M are counted to cost less than velocities, at least."""
+        if over is None or over.general is None or self.problem.cones.has_round:
+            return False
+        return costs.newton_cost(costs.formed(self.problem), self.law) < over.cost
+
+    def add_rows(self) -> None:
+        """Rows of A, where velocities of J and M have failed."""
+        problem, name = self.problem, "newton over rows"
+        over_velocities = self.states and problem.generalized is not None and name not in self.states
+        if over_velocities and problem.m <= ROWS and not problem.cones.has_round and not self.is_late:
+            self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
+
+    @cached_property
+    def newton(self) -> float:
+        """Newton's method, inf where there is none."""
+        return min((state.cost for state in self.states.values()), default=inf)
+
+    @property
+    def is_late(self) -> bool:
+        """Nobody who factors would end in time."""
+        if not self.deadline.is_set:
+            return False
+        return self.deadline.passed(setup_time("newton", self.problem) + 1e-9 * SURE * self.least)
+
+    def is_short(self, newton: float) -> bool:
+        """A limit that Newton's method of this cost [ns] may use up: sweeps tell the pace, and leave something."""
+        return self.deadline.is_set and self.deadline.passed(
+            setup_time("newton", self.problem) + 1e-9 * 3.0 * SURE * newton
+        )
+
+    @property
+    def may_fill(self) -> bool:
+        """A matrix of few entries without a narrow band."""
+        p = self.problem
+        return len(p._compressed[1]) < 0.05 * p.m**2 and max(p.bandwidth) > BAND
+
+    @property
+    def is_narrow(self) -> bool:
+        """Bounded rows of a symmetric matrix, given as such, of a narrow band: a factor costs little."""
+        p = self.problem
+        if p.matrix is None or self.law != "lcp" or len(p._compressed[1]) > (2.0 * BAND + 1.0) * p.m:
+            return False
+        return max(p.bandwidth) <= BAND and bool(p.is_symmetric)
+
+    @property
+    def is_loose(self) -> bool:
+        """Bodies under Coulomb's law, nearly each contact between another pair: sweeps then decide what sticks."""
+        rows = self.problem.rows
+        if rows is None or not rows.n_bodies or self.law != "coulomb":
+            return False
+        return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
+
+    def __iter__(self) -> Iterator[Stage]:
+        """The lines."""
+        if self.problem.matrix is not None and self.law == "linear":
+            if self.may_fill:
+                yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
+            yield Stage("direct", inf, self.least, "linear, a matrix")
+        if self.is_narrow:
+            n = ROUNDS * costs.factorisations(self.law)
+            yield Stage(
+                "direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations"
+            )
+        yield from self.sweeps_first(self.least)
+        if self.is_loose:
+            why = "a loose pile: the convex relaxation, whose solution is one where contacts stick"
+            yield Stage("relaxation", self.newton / self.sweep, self.newton, why, self.newton / self.sweep)
+            yield Stage("nncg", FEW, FEW * 2.0 * self.sweep, "puts right what slides")
+        yield from self.sweeps_first(self.newton)
+        yield from self.factorisations(MOST)
+        # What follows where these fail has its line here.
+        self.add_rows()
+        for k in range(TURNS):
+            yield from self.in_turn(2.0**k)
+
+    def factorisations(self, times: float) -> Iterator[Stage]:
+        """Newton's method for so many times its counted cost."""
+        for name, state in self.states.items():
+            why = f"{times:g} times its counted cost of {words(state.cost)}"
+            yield Stage(name, times * state.steps, times * state.cost, why)
+
+    def sweeps_first(self, newton: float) -> Iterator[Stage]:
+        """For a share of Newton's cost: first of what that is at least, then of what it is counted for."""
+        cost, short = SHARE * newton - self.begun, self.is_short(newton)
+        if short and not self.begun:
+            cost = max(cost, 0.5 * self.deadline.nanoseconds())
+        pays = short or self.is_loose or costs.SWEEPS * self.sweep <= newton
+        if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
+            self.begun += cost
+            yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)
+
+    def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
+        """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""
+        return Stage("anderson", cost / self.sweep, cost, why, most / self.sweep)
+
+    def in_turn(self, times: float) -> Iterator[Stage]:
+        """All, with so many times the work of Newton's method before."""
+        cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
+        why = f"in turn, {times * MOST:g} times newton's cost"
+        if not self.problem.cones.has_round:
+            yield self.sweeps(cost, why)
+        yield from self.factorisations(times * MOST)
+        if self.law in ("coulomb", "cone"):
+            yield Stage("nncg", 0.5 * cost / self.sweep, cost, why)
+
+
+def words(ns: float) -> str:
+    """A time."""
+    unit, word = (1e9, "s") if ns >= 1e9 else (1e6, "ms") if ns >= 1e6 else (1e3, "us")
+    return f"{ns / unit:.3g} {word}"
 
 
 @dataclass
@@ -50,34 +225,20 @@ class State:
 
 @dataclass(frozen=True)
 class Auto:
-    """Chooses and combines other solvers; the solution's message and `turns` name them.
-
-    Parameters
-    ----------
-    plan : Plan or its data, optional
-        Result of `lavender.explain` for a problem of the same structure, whose costs are used instead of counting anew.
-    """
-
-    plan: Any = None
-
-    def __post_init__(self) -> None:
-        if self.plan is not None:
-            object.__setattr__(self, "plan", Plan.of(self.plan))
+    """Chooses and combines other solvers; the solution's message and `turns` name them."""
 
     def prepare(self, problem: Problem) -> State:
-        if self.plan is not None:
-            self.plan.check(problem)
         return State(problem)
 
     def update(self, state: State, problem: Problem) -> State:
-        return self.prepare(problem)
+        return State(problem)
 
     def run(
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem, state.log = state.problem, None
         deadline = Deadline(time_limit)
-        if max_iter >= ONE_CALL and _has_call(problem, deadline):
+        if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
             made = AUTO.solve(problem, impulse, tol, share * deadline.nanoseconds())
             if made is not None and made[0].relative <= tol:
@@ -87,12 +248,12 @@ class Auto:
                     return claim
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        costs = sweeps = None
-        if deadline.is_set and self.plan is None and not problem.cones.has_round:
+        tree, sweeps = Tree(problem, deadline), None
+        if deadline.is_set and not problem.cones.has_round:
             if deadline.passed(sweeping(problem)):
                 return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
-            costs = Costs(problem)
-            sweeps = in_short_time(costs, deadline)
+            if tree.is_late:
+                sweeps = Sweeps(problem, deadline)
         log = SolveLog(problem, tol, max_iter, deadline, None if sweeps is None else sweeps.state.data)
         log.offer(impulse)
         if log.best > 1.0:
@@ -100,8 +261,8 @@ class Auto:
             log.offer(problem.start())  # doing nothing is better
         state.log = log
         try:
-            if max_iter > 0 and log.best > tol:
-                solve(log, self.plan, sweeps, None if costs is None else costs.structure)
+            if max_iter > 0 and log.best > tol and not log.done():
+                solve(log, tree, sweeps)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
         except BREAKDOWN as error:
@@ -119,29 +280,61 @@ class Auto:
         return log.claim()
 
 
-def _has_call(problem: Problem, deadline: Deadline) -> bool:
-    """Whether the compiled call is made: of more rows only if it is counted to end in a quarter of the time left."""
-    left = deadline.left()
-    return left is None or problem.m <= SMALL_ROWS or call_ends_within(problem, QUARTER * left)
-
-
-def solve(
-    log: SolveLog, plan: Plan | None = None, sweeps: Sweeps | None = None, structure: Structure | None = None
-) -> None:
-    """To the end, by a plan where one is given; `sweeps`, `structure`: what is set up for a time limit."""
-    if log.done() if sweeps is None else not sweeps.run_first(log):
+@np.errstate(all="ignore")  # what overflows is judged
+def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
+    """The lines of the tree, until one solves the problem or none has more to do; `sweeps` that are set up."""
+    if sweeps is not None:
+        sweeps.begin(log)
+        sweeps.finish()
         return
-    with np.errstate(all="ignore"):  # what overflows is judged
-        others(log, plan, structure, [] if sweeps is None else [sweeps])
-
-
-def others(log: SolveLog, plan: Plan | None, structure: Structure | None, begun: list[Candidate]) -> None:
-    """All candidates, of which one may have begun, and at last the certificate."""
-    costs = Costs(log.problem, log.tol, structure=structure, plan=plan)
-    names = tuple(name for name, _ in plan.candidates) if plan else candidates(costs.structure, log.deadline)
-    race(list(make(log, costs, names, None if plan is None else plan.first, begun)), log.done)
+    steps: dict[str, Step] = {}
+    idle = 0  # lines in a row that had nothing to do
+    for stage in tree:
+        if log.done() or idle > len(METHODS):
+            break
+        step = steps.get(stage.solver)
+        if step is None:
+            step = steps[stage.solver] = make(stage.solver, log, tree)
+        if log.deadline.is_set and not step.over:
+            if isinstance(step, Sweeps) and not tree_goes_on(log, tree, steps, stage.cost):
+                step.finish()
+                return
+            if isinstance(step, Newton | Direct):
+                set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
+                step.over = log.ends_late(set_up + SURE * once(stage))
+        idle = idle + 1 if step.over else 0
+        if not step.over:
+            step.least, step.cost = stage.least, stage.cost
+            step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
+
+
+def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:
+    """Whether after work of this cost [ns] anybody who factors would still end in time."""
+    if "states" not in vars(tree):
+        return not log.ends_late(cost + SURE * tree.least)
+    able = [name for name in tree.states if name not in steps or not steps[name].over]
+    return bool(able) and not log.ends_late(cost + SURE * tree.newton)
+
+
+def once(stage: Stage) -> float:
+    """What whoever factors is counted to take [ns], without what it may take more."""
+    return stage.cost if stage.solver == "direct" else stage.cost / MOST
+
+
+def make(name: str, log: SolveLog, tree: Tree) -> Step:
+    """The step of this name."""
+    if name == "anderson":
+        sweeps = Sweeps(log.problem, log.deadline)
+        sweeps.begin(log)
+        return sweeps
+    if name.startswith("newton"):
+        newton = Newton(name, log)
+        newton.state = tree.states[name]
+        return newton
+    kinds: dict[str, type[Step]] = {"direct": Direct, "relaxation": Relaxation}
+    return kinds.get(name, Iterations)(name, log)
 
 
 SPEC = SolverSpec(
@@ -156,6 +349,5 @@ SPEC = SolverSpec(
     resumable=False,
     delegates=True,
     max_iter=1_000_000,
-    options={"plan": "result of lavender.explain, whose costs are used; default: counted anew"},
-    summary="chooses and combines other solvers by expected cost",
+    summary="chooses and combines other solvers by counted cost",
 )

@@ -116,12 +116,6 @@ class Direct:
             run.put_best()
 
 
-class Impatient(Direct):
-    """For the first call by `auto`: if pivoting is stuck, or one shift is singular, it ends at once with STALLED."""
-
-    patience: ClassVar[bool] = False
-
-
 @dataclass(frozen=True)
 class Enough(Direct):
     """For calls by `auto` with free rows only: a solution that meets the tolerance is not refined."""

@@ -36,9 +36,10 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status, counted
+from lavender.solvers.costs import FORMED, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.setup_times import over_bodies, over_rows, over_velocities
+from lavender.solvers.setup_times import entries_of, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.newton.solve import COUNTED, OUTCOMES
@@ -63,6 +64,37 @@ class NewtonState:
     system: System | None  # None where nothing moves
     general: Any = None  # lavender_ext.generalized.newton.Newton, in generalised coordinates
     begun: bool = False  # by `turn`
+
+    @property
+    def count(self) -> Count:
+        """One step: what is factored, by the analysis, and what is read beside it."""
+        problem, system = self.problem, self.system
+        read = float(problem.metric.work)
+        if self.general is not None:
+            return Count("velocities", self.general.work, read, 0.0)
+        if system is None:
+            return Count("dense", 0.0, 0.0, float(problem.m))
+        if system.form == "velocity":
+            return Count("bodies", system.cost, read, float(problem.m))
+        made = 0.0 if problem.generalized is None else FORMED * entries_of(problem)
+        return Count(
+            "dense" if system.dense else "panels",
+            system.multiply_adds,
+            system.entries,
+            float(problem.m),
+            made,
+        )
+
+    @property
+    def steps(self) -> float:
+        """Iterations that it is counted to take: over velocities each is one of an island."""
+        steps = 1.0 if self.general is None else STEPS * max(1, self.general.islands)
+        return factorisations(self.problem.law) * steps
+
+    @property
+    def cost(self) -> float:
+        """What it is counted to take to the end [ns]."""
+        return newton_cost(self.count, self.problem.law)
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,12 @@ from lavender.solvers._factor import (
     choose,
     permuted_band,
 )
-from lavender.solvers.weights import dense_factor, sparse_factor
 from lavender_ext.pivot.direct import Pivoting
 
 # s for each multiply-add of a dense factor, and for each nonzero of a sparse one, with as many times more as it has
 # thousands of rows: what a first factor is refused by where the time is short.
 DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
+FLOP, ENTRY = 0.03, 3.0  # ns for each multiply-add of a dense factor, and for each entry of its matrix
 SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
 SWEEPS, MOST_SWEEPS = 2, 24  # symmetric sweeps of Gauss-Seidel that guess the free rows, at least and at most
 SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs takes a nanosecond
@@ -99,9 +99,9 @@ class PivotState:
         if self.outside is None:
             return SWEEPS
         m, data = self.problem.m, self.problem.csr_data
-        factor = dense_factor(m)
+        factor = FLOP * float(m) ** 3 / 3.0 + ENTRY * float(m) ** 2
         if self.is_sparse:
-            factor = min(factor, sparse_factor(self.problem.csr.nnz, m))
+            factor = min(factor, 100.0 * self.problem.csr.nnz * (1.0 + m / SPARSE_ROWS))
         return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
 
     def too_late_to_sweep(self, deadline: Deadline) -> bool:

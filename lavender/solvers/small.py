@@ -21,11 +21,10 @@ from lavender.problem import Problem
 from lavender.registry import SMALL_ROWS
 from lavender.residuals import judged, reference
 from lavender.solution import Claim, Status, Turn, counted
+from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import reads_whitened
-from lavender.solvers.weights import READ, SIXTH, decades, of_law, rates, sweep_cost
 from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first
 
@@ -34,53 +33,30 @@ WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # The most rows of an island: up to these, dense factors cost less than sweeps and factors of all islands together.
 ISLAND = 150
 SWEPT = 32  # the most sweeps of a part before its first factorisation
-QUARTER = 0.25  # of the time left, that islands may take, and that counted costs of velocities may
+QUARTER = 0.25  # of the time left, that islands may take
 SPLIT = 200.0  # ns for each row of what tells islands apart
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
-def velocities_cost(problem: Problem, largest: int) -> float:
-    """Newton over generalised velocities, `largest` of them in one island [ns]; `is_cheap` of the compiled call."""
-    v = rates()["velocities"]
-    factor = v["work"] * general.factor_flops(problem, largest)
-    read = v["entry"] * float(problem.metric.work)
-    return float(READ * read + of_law(v["count"], problem.law) * (v["step"] + read + factor))
+def limits(most: float) -> Limits:
+    """Limits of the compiled calls over generalised velocities: rates, room, and the most counted cost [ns]."""
+    count = (STEPS * factorisations(law) for law in ("lcp", "coulomb", "cone"))
+    return Limits(np.array([RATES["entry"], RATES["work"]["velocities"], *count, general.ROOM, most]))
 
 
-def others_cost(problem: Problem, tol: float) -> float:
-    """The least of what sweeps cost and, on bounded rows, exchanges at least [ns]; of the compiled call as well."""
-    r, m, data = rates(), problem.m, problem.metric
-    a, d = r["anderson"], r["direct"]
-    each = a["row"] * m + of_law(a["work"], problem.law) * data.work
-    sweeps = float(a["start"] + decades(tol) * a["count"] * each)
-    if problem.law not in ("linear", "lcp"):
-        return sweeps
-    formed = data.entries_of_a if reads_whitened(problem) else 0.0
-    return min(sweeps, float(d["start"] + d["count"] * d["row"] * m + r["formed"] * formed))
+def call_ends_within(problem: Problem, seconds: float | None) -> bool:
+    """Whether the compiled call is made: of more than a few rows, which may return nothing, if it is counted to end.
 
-
-def limits(most: float, rows: float = inf) -> Limits:
-    """Limits of the compiled call: the most counted cost [ns], and of more than `rows` rows no more than others'."""
-    r = rates()
-    v, a, d = r["velocities"], r["anderson"], r["direct"]
-    count = (of_law(v["count"], law) for law in ("lcp", "coulomb", "cone"))
-    work = (of_law(a["work"], law) for law in ("coulomb", "cone"))
-    others = [a["start"], a["row"], *work, a["count"], SIXTH]
-    exchanges = [d["start"], d["count"] * d["row"], r["formed"]]
-    return Limits(np.array([
-        v["step"], v["entry"], v["work"], READ, *count, general.ROOM, most, rows, *others, *exchanges,
-    ]))  # fmt: skip
-
-
-def call_ends_within(problem: Problem, seconds: float) -> bool:
-    """Whether the compiled call of more than a few rows, which may return nothing, is counted to take no longer."""
+    It may take a quarter of the time that is left; over velocities four times what its gate lets in.
+    """
+    if seconds is None or problem.m <= SMALL_ROWS:
+        return True
     if problem.generalized is not None:
-        cost = velocities_cost(problem, problem.generalized.nv)
-    elif problem.law in ("linear", "lcp"):
+        return QUARTER * seconds >= 4e-9 * MOST
+    if problem.law in ("linear", "lcp"):
         return False
-    else:
-        cost = SPLIT * problem.m + 1e9 * forming(problem) + SWEPT * sweep_cost(problem)
-    return 1e-9 * cost <= seconds
+    cost = SPLIT * problem.m + 1e9 * forming(problem) + SWEPT * sweep_cost(problem)
+    return 1e-9 * cost <= QUARTER * seconds
 
 
 def prepared(problem: Problem) -> Any:
@@ -115,6 +91,22 @@ def _make(problem: Problem) -> Small | None:
     symmetric = problem.is_symmetric
     band = max(problem.bandwidth) if symmetric else problem.m - 1
     return Bounded(data, start, problem.csr_data, band, law == "linear", symmetric)
+
+
+def who(problem: Problem) -> str:
+    """Who solves a problem in the compiled call of `auto`, in words; "" where that is not made."""
+    if problem.generalized is not None:
+        kernel = general.prepare(problem)
+        limits = AUTO.limits
+        cost = np.inf if kernel is None or limits is None else limits.cost(problem.metric, kernel.work)[0]
+        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= MOST else ""
+    small = prepared(problem)
+    if small is None:
+        return ""
+    if small.pivots:
+        return "direct (block pivots), then lemke where these do not end"
+    count = islands(problem)[0] if problem.m > SMALL_ROWS else 1
+    return "sweeps (anderson), then newton" + (f", on each of {count} islands" if count > 1 else "")
 
 
 @dataclass(frozen=True)
@@ -255,6 +247,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(MOST, SMALL_ROWS), True, True)
+AUTO = SmallCall("auto", limits(MOST), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", limits(MOST), False)

@@ -137,11 +137,16 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     return n
 
 
+cdef enum:
+    ADDED = 5                   # multiply-adds of a factor that one counts for where N is put together
+
+
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
     int32_t wide                # columns of a full island that costs what the costliest does, at most most[0]
     int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
+    double work                 # multiply-adds of N and of its factors, of all islands
 
 
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
@@ -156,7 +161,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     """Islands of a problem, in w (`marks_of`), and where L of each has entries."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size, wide
-    cdef double values
+    cdef double values, work
     cdef const int32_t* lptr
     f.p = p[0]
     f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
@@ -181,6 +186,9 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.lidx = w + at + f.cptr[f.n_islands] + 1
     need.wide = need.most[0] if need.crowded else 0
     need.values = 0.0
+    need.work = 0.0
+    for i in range(panels):
+        need.work += ADDED * 0.5 * (g.pval[i + 1] - g.pval[i]) * (g.pcol[i + 1] - g.pcol[i])
     for i in range(0 if need.crowded else f.n_islands):
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
@@ -188,8 +196,11 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
         wide = size
         if f.law == COULOMB:                            # whole, since its own N lacks symmetry
             values = <double>size * size
+            need.work += values * size / 3.0
         elif size > 0:
-            wide = <int32_t>ceil(sqrt(6.0 * factor_work(size, lptr, f.lidx) / size))
+            work = factor_work(size, lptr, f.lidx)
+            wide = <int32_t>ceil(sqrt(6.0 * work / size))
+            need.work += work
         if values > need.values:
             need.values = values
         if size > wide > need.wide:

@@ -13,13 +13,15 @@ ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": 
 cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
-    `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. Where N of an
-    island has more than `most` values (`fits`) there is no room, and no `run`.
+    `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. `work`:
+    multiply-adds of N and one factor of each island. Where N of an island has more than `most` values (`fits`) there is no
+    room, and no `run`.
     """
     cdef flow_t f
     cdef Data data
     cdef list keep
     cdef readonly int largest
+    cdef readonly double work
     cdef readonly bint fits
 
     def __init__(self, Data p, double most):
@@ -33,7 +35,7 @@ cdef class Newton:
             if not need.crowded or <double>per * p.general.n > most:
                 break
             per *= 2
-        self.largest = need.wide
+        self.largest, self.work = need.wide, need.work
         self.fits = not need.crowded and need.values <= most
         if not self.fits:
             return

@@ -6,7 +6,7 @@ asked for, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t
-from libc.math cimport INFINITY, fabs, log10, sqrt
+from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
+from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
@@ -32,26 +32,14 @@ cdef enum:
     AT_A_TIME = 256             # problems between two checks for Ctrl-C
 
 
-cdef struct limits_t:           # as `velocities_cost` of lavender/solvers/small.py, ns
-    double step                 # each iteration, as if all islands had theirs at once,
+cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double entry                # each multiply-add of a sweep, and
-    double work                 # of a factor
-    double read                 # sweeps before the first iteration
-    double bounded              # iterations by law
+    double work                 # of a factor,
+    double bounded              # factorisations by law
     double coulomb
     double cone
     double values               # of one island's N
-    double most                 # what all may cost to be asked at all; and of more than
-    double rows                 # rows no more than the others, `others_cost`:
-    double start                # sweeps, each row and, in its friction's law, multiply-add of one, their number for
-    double row                  # `decades` decades;
-    double swept
-    double swept_cone
-    double sweeps
-    double decades
-    double exchanges            # on bounded rows what exchanges take at least: once, each row, and entry of A formed
-    double exchanged
-    double formed
+    double most                 # what all may cost to be asked at all
 
 
 cdef struct job_t:
@@ -77,35 +65,25 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
 
 
-cdef inline double others_cost(const job_t* j, const limits_t* l, double tol, double sweep, double* w) noexcept nogil:
-    """What others cost; w (n) is scratch."""
-    cdef double m = j.p.n_rows, swept = l.swept, least, least_exchanges, entries
-    if has_friction(&j.p) and j.p.law != COULOMB:
-        swept = l.swept_cone
-    least = l.start - log10(min(max(tol, 1e-16), 0.1)) / l.decades * l.sweeps * (l.row * m + swept * sweep)
-    if has_friction(&j.p):
-        return least
-    least_exchanges = l.exchanges + l.exchanged * m
-    entries = entries_of(&j.g, w)
-    if sweep - 4.0 * m < entries:                       # else sweeps form A as well
-        least_exchanges += l.formed * entries
-    return min(least, least_exchanges)
+cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+    """One factor of each island, of so many multiply-adds in all [ns]."""
+    return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
 
 
-cdef inline bint is_cheap(job_t* j, const limits_t* l, double tol, double largest, double* w, int32_t* steps) noexcept nogil:
-    """Is it? No more steps then than `most` is for, counted as if each were of the costliest island."""
-    cdef double flops = j.g.n * (largest * largest) / 6.0, count = l.bounded, each, fit
-    cdef double sweep = 2.0 * j.g.pval[j.g.n_panels] + 4.0 * j.p.n_rows
-    if has_friction(&j.p):
-        count = l.cone
-        if j.p.law == COULOMB:
-            count, flops = l.coulomb, 2.0 * flops
-    each = l.step + l.entry * sweep + l.work * flops
-    fit = (j.most - l.entry * l.read * sweep) / each
+cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
+    cdef double count = l.bounded
+    if has_friction(p):
+        count = l.coulomb if p.law == COULOMB else l.cone
+    return count * step_cost(p, g, l, work)
+
+
+cdef inline bint is_cheap(job_t* j, const limits_t* l, double work, int32_t* steps) noexcept nogil:
+    """Is it? No more steps then than `most` of the job is for, counted as if each were of all islands."""
+    cdef double fit = j.most / step_cost(&j.p, &j.g, l, work)
     if fit < steps[0]:
         j.spent, steps[0] = True, <int32_t>max(fit, 0.0)
-    cdef double cost = l.entry * l.read * sweep + count * each
-    return cost <= l.most and (j.p.n_rows <= l.rows or cost <= others_cost(j, l, tol, sweep, w))
+    return cost_of(&j.p, &j.g, l, work) <= l.most
 
 
 cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
@@ -146,7 +124,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     settle(&f, &j.p, &j.g, per, room.index, &need)
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
-    if need.crowded or need.values > limits.values or not is_cheap(j, limits, tol, need.wide, room.real, &steps):
+    if need.crowded or need.values > limits.values or not is_cheap(j, limits, need.work, &steps):
         j.spent = False
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
@@ -215,11 +193,20 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (19,)."""
+    """Of the numbers of a `limits_t` (7,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
+
+    def cost(self, Data p, double work):
+        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and of a step."""
+        return cost_of(&p.blocks, &p.general, &self.at, work), step_cost(&p.blocks, &p.general, &self.at, work)
+
+    @property
+    def most(self):
+        """What it may cost to be asked at all [ns]."""
+        return self.at.most
 
 
 def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):

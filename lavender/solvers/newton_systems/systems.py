@@ -38,14 +38,21 @@ class System:
     form = ""
     cost = 0.0  # multiply-adds of one factorisation, roughly
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
+    dense = False  # A as a full matrix
+    entries = 0.0  # of A
 
     def __init__(self, problem: Problem, solve: Solve) -> None:
         self.problem, self.solve = problem, solve
 
     @property
+    def multiply_adds(self) -> float:
+        """Of one factor."""
+        return self.cost
+
+    @property
     def seconds(self) -> float:
         """What the next factor takes, at that pace."""
-        return self.pace * self.cost
+        return self.pace * self.multiply_adds
 
     def took(self, seconds: float) -> None:
         """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
@@ -89,7 +96,8 @@ class MatrixSystem(System):
         self.dense = m <= DENSE_ROWS or (
             is_full(a.nnz, m, solve.has_friction and problem.law == "cone") and m <= DENSE_LIMIT
         )
-        # Of a sparse factor by its fill, which grows with the size: nanoseconds, as `weights.py` has them.
+        self.entries = float(a.nnz)
+        # Of a sparse factor at first by its size, since fill grows with that.
         self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
@@ -106,11 +114,11 @@ class MatrixSystem(System):
             solve.ask(self.sparse)
 
     @property
-    def seconds(self) -> float:
+    def multiply_adds(self) -> float:
         """As of all systems; fill is counted before the first number."""
         if not self.dense:
             self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
-        return self.pace * self.cost
+        return self.cost
 
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:

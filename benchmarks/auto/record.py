@@ -1,0 +1,151 @@
+"""What each solver does alone on a problem, turn by turn, and `auto` beside them, in one run.
+
+    points     (iterations, CPU time [s] with the set-up, least relative residual)
+
+A solver that goes on where it stopped has one curve; one that does not, and `auto`, a run from the beginning for each
+level.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+import lavender as lv
+from lavender import registry
+from lavender.bench.running.timing import one_thread
+from lavender.problem import Problem
+from lavender.residuals import judged, reference
+from lavender.solution import Status
+
+__all__ = ["LEVELS", "SOLVERS", "Record", "as_line", "read", "records"]
+
+LEVELS = (1e-3, 1e-6, 1e-9)
+GROWTH = 0.25  # of the iterations so far, between two points of a curve
+SHORT = 0.03  # s of CPU time below which a run is made three times
+FAR, LEAST = 12.0, 0.05  # times the least time to the middle level, and s, after which a solver is given up
+NNCG = {"order": "symmetric", "restart": "against"}
+SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "anderson": ("anderson", {}),
+    "nncg": ("nncg", NNCG),
+    "relaxation": ("anderson", {}),
+    "newton": ("newton", {}),
+    "newton over rows": ("newton", {"form": "impulse"}),
+    "direct": ("direct", {}),
+    "admm": ("admm", {}),
+    "auto": ("auto", {}),
+}
+Points = list[tuple[int, float, float]]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One solver on one problem."""
+
+    case: str
+    rows: int
+    law: str
+    operator: str
+    solver: str  # of SOLVERS
+    setup: float  # s
+    points: Points
+    told: str  # its last message
+
+    def to(self, level: float) -> tuple[float, float]:
+        """(s, iterations) to that level; inf where it was not reached."""
+        return min(
+            ((t, n) for n, t, relative in self.points if relative <= level), default=(math.inf, math.inf)
+        )
+
+
+def read(paths: Iterable[Path]) -> Iterator[Record]:
+    """What `as_line` made, line by line."""
+    for path in paths:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            yield Record(**json.loads(line))
+
+
+def as_line(record: Record) -> str:
+    """As JSON."""
+    return json.dumps(asdict(record)) + "\n"
+
+
+def takes(problem: Problem, name: str) -> bool:
+    """Whether the solver is one for this problem, and not another's twin on it."""
+    if name == "relaxation":
+        return problem.law == "coulomb"
+    if name == "newton over rows" and (problem.generalized is None or problem.cones.has_round):
+        return False
+    return registry.get(SOLVERS[name][0]).refuses(problem) is None
+
+
+def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> Iterator[Record]:
+    """All solvers on each problem, one after the other; `time_limit`: s of CPU time of one curve."""
+    for case, problem in cases:
+        least = math.inf
+        for name in SOLVERS:
+            if not problem.m or not takes(problem, name):
+                continue
+            run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
+            limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else 3.0 * time_limit
+            found = [run(problem, name, limit)]
+            if found[0][1] and found[0][1][-1][1] < SHORT:
+                found += [run(problem, name, limit) for _ in range(2)]
+            runs = zip(*(points for _, points, _ in found), strict=False)
+            points = [(some[0][0], min(t for _, t, _ in some), some[0][2]) for some in runs]
+            setup = min(setup for setup, _, _ in found)
+            made = Record(case, problem.m, problem.law, problem.operator, name, setup, points, found[0][2])
+            least = min(least, made.to(LEVELS[1])[0])
+            yield made
+
+
+@np.errstate(all="ignore")
+def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points, str]:
+    """One curve; what judges its points takes no time of it."""
+    fresh = replace(problem.disk, copy=False)
+    reference(fresh)
+    solved = fresh.relaxed("cone") if name == "relaxation" else fresh
+    solver: Any = registry.get(SOLVERS[name][0]).load()(**SOLVERS[name][1])
+    lam, points, best = fresh.start(), Points(), math.inf
+    tol = LEVELS[-1] * (1.0 if solved is fresh else 0.1)
+    with one_thread():
+        begun = process_time()
+        state = solver.prepare(solved)
+        spent = setup = process_time() - begun
+        while True:
+            done = points[-1][0] if points else 0
+            begun = process_time()
+            claim = solver.run(state, lam, max(1, math.ceil(GROWTH * done)), tol, None)
+            spent += process_time() - begun
+            best = min(best, judged(fresh, lam.copy()).relative) if np.isfinite(lam).all() else best
+            points.append((done + claim.iterations, spent, best))
+            ended = claim.status is not Status.MAX_ITERATIONS or claim.iterations < 1
+            if ended or best <= LEVELS[-1] or spent > limit:
+                return setup, points, claim.status.name
+
+
+def repeated(problem: Problem, name: str, limit: float) -> tuple[float, Points, str]:
+    """One run from the beginning for each level."""
+    points, setup, told, most = Points(), 0.0, "", 0.0
+    for level in LEVELS:
+        fresh = replace(problem.disk, copy=False)
+        reference(fresh)
+        with one_thread():
+            begun = process_time()
+            prepared = lv.prepare(fresh, SOLVERS[name][0], **SOLVERS[name][1])
+            setup = process_time() - begun
+            found = prepared.solve(tol=level, time_limit=limit)
+            most = max(most, process_time() - begun)
+        proven = found.status in (Status.FLOOR, Status.INFEASIBLE) and not found.contradicted
+        points.append((found.iterations, most, min(found.residual.relative, level if proven else math.inf)))
+        told = found.message or found.status.name
+        if points[-1][2] > level or most > limit:
+            break
+    return setup, points, told

@@ -1,0 +1,255 @@
+"""The solvers of `auto` as its tree runs them: so many iterations, then more from where they stopped."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender.deadline import CHUNK_TIME, NEVER, Deadline
+from lavender.errors import BREAKDOWN, last_words
+from lavender.problem import Problem
+from lavender.registry import get
+from lavender.solution import Claim, Status
+from lavender.solvers._accelerated import operator
+from lavender.solvers.costs import sweep_cost
+from lavender.solvers.direct import Enough
+from lavender.solvers.setup_times import forming
+from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.sweeping import STATUS
+from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
+
+__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Relaxation", "Step", "Sweeps", "setup_time"]
+
+#: Solver and options of each step.
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "anderson": ("anderson", {}),
+    "newton": ("newton", {}),
+    "newton over rows": ("newton", {"form": "impulse"}),
+    "direct": ("direct", {}),
+    # The convex relaxation of Coulomb's law; its solution is one of Coulomb's law wherever contacts stick.
+    "relaxation": ("anderson", {}),
+    "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
+}
+FIRST = 32  # sweeps before the first prediction of their remaining number
+MOST = 2**30  # iterations of one call
+PROBE = 0.5  # share of the time left that iterations of unknown pace may take
+FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
+
+
+def setup_time(name: str, problem: Problem) -> float:
+    """What a step sets up before its first iteration takes [s]; 0: next to nothing."""
+    solver, options = METHODS[name]
+    asked = getattr(get(solver).load()(**options), "setup_time", None)
+    return 0.0 if asked is None else float(asked(problem))
+
+
+class Step:
+    """A solver on the problem of a log."""
+
+    over = False  # it has nothing more to do
+    least = np.inf  # iterations that may be predicted to be left, and it goes on
+    cost = np.inf  # ns, of the next turn as counted
+    state: Any = None
+    impulse: FloatArray  # (m,) N s
+
+    def __init__(self, name: str, log: SolveLog) -> None:
+        self.name, self.log = name, log
+        self.solver: Any = get(METHODS[name][0]).load()(**METHODS[name][1])
+
+    def run(self, n: float) -> None:
+        """At most n iterations, offered to the log."""
+        log, before = self.log, self.log.best
+        try:
+            claim = self.turn(int(min(max(n, 1.0), log.left, MOST)))
+        except BREAKDOWN as error:
+            log.failure, self.over = last_words(error), True
+            claim = Claim(Status.NUMERICAL_ERROR, 0)
+        self.over = self.over or claim.status is not Status.MAX_ITERATIONS
+        log.note(self.shown, claim, before)
+
+    @property
+    def shown(self) -> str:
+        """The solver's name in messages."""
+        return METHODS[self.name][0]
+
+    def turn(self, n: int) -> Claim:
+        """Run and offer what came of it."""
+        raise NotImplementedError
+
+    def offer(self) -> None:
+        """The iterate, to the log."""
+        if np.isfinite(self.impulse).all():
+            self.log.offer(self.impulse)
+
+
+class Newton(Step):
+    """From the state whose factor was counted."""
+
+    def turn(self, n: int) -> Claim:
+        log = self.log
+        if not self.state.begun:
+            self.impulse = log.impulse.copy()
+        claim: Claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
+        self.offer()
+        return claim
+
+
+class Direct(Step):
+    """A linear system is solved no closer than tol."""
+
+    def turn(self, n: int) -> Claim:
+        log = self.log
+        if self.state is None:
+            if log.problem.law == "linear":
+                self.solver = Enough()
+            self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
+        claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
+        self.offer()
+        return claim
+
+
+class Iterations(Step):
+    """A solver that continues to the bit: in short runs, for the clock and Ctrl-C."""
+
+    closer = 1.0  # of tol, to which it goes
+
+    def turn(self, n: int) -> Claim:
+        done, work = 0, dict[str, int]()
+        if self.state is None:
+            self.begin()
+        self.each = 2e-9 * sweep_cost(self.log.problem)
+        status = Status.MAX_ITERATIONS
+        while done < n and status is Status.MAX_ITERATIONS and not self.log.late:
+            claim = self.some(done, n)
+            done, status = done + claim.iterations, claim.status
+            for kind, count in claim.work.items():
+                work[kind] = work.get(kind, 0) + count
+            if claim.iterations < 1:
+                break
+        self.offer()
+        best = getattr(self.state, "best", (np.inf, None))
+        if best[1] is not None and best[0] < self.log.best:
+            self.log.offer(best[1])
+        return Claim(status, done, work)
+
+    def begin(self) -> None:
+        """From where the log is."""
+        self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
+
+    def some(self, done: int, n: int) -> Claim:
+        """As many as end soon, of n of which so many are done."""
+        left = self.log.deadline.left()
+        time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
+        few = min(max(1, int(time / self.each)), n - done)
+        claim: Claim = self.solver.run(self.state, self.impulse, few, self.closer * self.log.tol, None)
+        return claim
+
+
+class Relaxation(Iterations):
+    """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law."""
+
+    closer = 0.1
+    relative = 1.0  # by that law, at the last check
+
+    @property
+    def shown(self) -> str:
+        return "relaxation: anderson"
+
+    def begin(self) -> None:
+        self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
+        self.impulse = self.log.problem.start()
+
+    def some(self, done: int, n: int) -> Claim:
+        """Until a check, which ends them where too many are predicted to be left."""
+        log, before = self.log, self.relative
+        claim = super().some(done, min(n, done + max(done // 2, FIRST)))
+        self.relative = log.offer(self.impulse)
+        left = sweeps_left(claim.iterations, before, self.relative, log.tol)
+        if claim.status is not Status.MAX_ITERATIONS or self.relative <= log.tol or left > self.least:
+            return replace(claim, status=Status.STALLED)
+        return claim
+
+
+class Sweeps(Step):
+    """Accelerated sweeps whose checks predict how many are left (`lavender_ext/small/checked_sweeps.pyx`)."""
+
+    relative = 1.0  # residual of the last check
+    told = 0, 0  # sweeps and restarts of the turns before
+
+    def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
+        """Everything that depends on no impulse; A is formed only if that is a small part of the time."""
+        self.name, self.each = "anderson", 1e-9 * sweep_cost(problem)
+        split = 0 if problem.rows is None else problem.rows.n_joints
+        late = deadline.is_set and deadline.passed(FORMING * forming(problem))
+        over = problem.metric if late else operator(problem)
+        self.state = CheckedSweeps(problem.metric, over, problem.law == "cone", split)
+
+    def begin(self, log: SolveLog) -> None:
+        """From where the log is, or from a given start that is worse than doing nothing."""
+        self.log, self.relative = log, log.best
+        self.impulse = log.impulse.copy() if log.given is None else log.given
+
+    def turn(self, n: int) -> Claim:
+        before = self.state.done
+        try:
+            left = self.log.deadline.left()
+            if left is not None and 1e-9 * self.cost > PROBE * left:
+                self.until(Deadline(min(left, 1e-9 * self.cost)), n, True)
+            else:
+                self.predicted(n)
+        finally:
+            claim = self.taken(before)
+        return claim
+
+    def until(self, deadline: Deadline, n: int, checked: bool) -> None:
+        """As many as end in time; `checked`: and are judged in it."""
+        log = self.log
+        room = self.each, PROBE, CHUNK_TIME, checked
+        pace = self.state.within(self.impulse, self.relative, n, log.tol, FIRST, deadline.left, *room)
+        log.pace = pace / self.each
+
+    def predicted(self, n: int) -> None:
+        """Between looks at the clock, until more than `least` are predicted to be left."""
+        log, state, end = self.log, self.state, self.state.done + n
+        chunk, at, before = max(1, int(CHUNK_TIME / self.each)), state.done, self.relative
+        while state.done < end:
+            due = min(end, at + max(at // 2, FIRST))
+            k = min(chunk, due - state.done)
+            state.run(self.impulse, self.relative, k, log.tol, k, FIRST, np.inf)
+            self.relative = log.take(state.now)
+            ended = STATUS[state.status] is not Status.MAX_ITERATIONS
+            if ended or self.relative <= log.tol or log.late:
+                return
+            if state.done >= due:
+                if sweeps_left(due - at, before, self.relative, log.tol) > self.least:
+                    return
+                at, before = due, self.relative
+
+    def taken(self, before: int) -> Claim:
+        """Offer the result of the sweeps since `before`."""
+        log, state = self.log, self.state
+        if state.best is not None:
+            log.take(state.best)
+        self.relative = log.best if state.now is None else state.now.relative
+        if state.watch.best_relative < log.best:
+            log.offer(state.watch.best[1])
+        told, self.told = self.told, (state.sweeps, state.restarts)
+        work = {"sweeps": state.sweeps - told[0], "restarts": state.restarts - told[1]}
+        return Claim(STATUS[state.status], state.done - before, work)
+
+    def finish(self) -> None:
+        """With all of the time that is left; the last are judged when the clock has stopped."""
+        log, begun, before = self.log, self.state.done, self.log.best
+
+        def end() -> None:
+            log.by = log.problem.metric
+            claim = self.taken(begun)
+            log.offer(self.impulse)
+            log.timed_out = claim.iterations < log.left
+            log.note(self.name, claim, before)
+
+        log.end = end
+        self.until(log.deadline, min(log.left, MOST), False)
