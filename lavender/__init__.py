@@ -5,7 +5,8 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
+Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
+Solving    `solve`, `prepare` (for repeated steps), `available`, `known`, `explain` (the plan of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `diagnose` (mistakes in the data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
 Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other simulators)
@@ -50,10 +51,11 @@ from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
     from lavender import bench, engine, io, motion, phenomena, report, scene, suite
+    from lavender.batch import Batch
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.io import load
-    from lavender.many import solve_many
+    from lavender.many import Residuals, Solutions, residual_many, solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.plan import Plan, explain
     from lavender.scene import Scene
@@ -61,14 +63,17 @@ if TYPE_CHECKING:
 
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
+    "Batch": "lavender.batch",
     "CrossCheck": "lavender.check",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
     "Plan": "lavender.plan",
+    "Residuals": "lavender.many",
     "SOLVER_FIELDS": "lavender.engine",
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
     "Snapshot": "lavender.engine",
+    "Solutions": "lavender.many",
     "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
@@ -83,6 +88,7 @@ _LATER = {
     "phenomena": "lavender.phenomena",
     "report": "lavender.report",
     "scene": "lavender.scene",
+    "residual_many": "lavender.many",
     "solve_many": "lavender.many",
     "suite": "lavender.suite",
 }
@@ -96,6 +102,7 @@ __all__ = [
     "ROUND",
     "ROW",
     "SOLVER_FIELDS",
+    "Batch",
     "CapabilityError",
     "Claim",
     "Cones",
@@ -110,11 +117,13 @@ __all__ = [
     "Problem",
     "Redundancy",
     "Residual",
+    "Residuals",
     "Rows",
     "Scene",
     "Simulation",
     "Snapshot",
     "Solution",
+    "Solutions",
     "SolveFailed",
     "SolverSpec",
     "SolverUnavailable",
@@ -142,6 +151,7 @@ __all__ = [
     "register",
     "report",
     "residual",
+    "residual_many",
     "scene",
     "solve",
     "solve_many",
