@@ -107,7 +107,9 @@ def from_efc(
     counted = np.arange(m) < count[:, None]
     off = np.argwhere(counted & ~(stiff > 0.0) & np.isfinite(stiff))
     if len(off):
-        raise InputError(f"efc_D of world {off[0][0]}, row {off[0][1]} is {stiff[tuple(off[0])]:g}; above 0 is needed")
+        raise InputError(
+            f"efc_D of world {off[0][0]}, row {off[0][1]} is {stiff[tuple(off[0])]:g}; above 0 is needed"
+        )
     precision = precision_of(jac, np.asarray(M), np.asarray(qvel))
     if qfrc_smooth is not None:
         _check_mass(np.asarray(M), smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv)), precision)
@@ -159,7 +161,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
         raise InputError(f"model is a {type(model).__name__}; a mujoco.MjModel is needed")
     word = mj.mjtIntegrator(model.opt.integrator).name.removeprefix("mjINT_").lower()
     if word not in map(str.lower, single.OF_M):
-        raise CapabilityError(f"integrator={word!r} puts damping into M; {', '.join(map(repr, single.OF_M))} have M itself")
+        raise CapabilityError(
+            f"integrator={word!r} puts damping into M; {', '.join(map(repr, single.OF_M))} have M itself"
+        )
     if mj.mj_isSparse(model):
         import copy
 
@@ -184,7 +188,14 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
             mj.mj_setState(model, data, given[i], kinds[size])
             mj.mj_forward(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            parts = (data.efc_J, data.efc_D, data.efc_aref, data.efc_force, data.efc_type, data.efc_frictionloss)
+            parts = (
+                data.efc_J,
+                data.efc_D,
+                data.efc_aref,
+                data.efc_force,
+                data.efc_type,
+                data.efc_frictionloss,
+            )
             arrays = [x.copy() for x in parts]
             if elliptic and data.ncon:
                 c = data.contact
@@ -212,11 +223,11 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
     world = np.repeat(np.arange(n), count)
     contacts = None
     if elliptic:
-        held = [(i, x) for i, x in enumerate(found) if len(x) > 6]
-        address = [np.where(x[6] < 0, -1, x[6] + ptr[i]) for i, x in held] or [np.zeros(0, int)]
-        dim = [x[7] for _, x in held] or [np.zeros(0, int)]
-        rub = [x[8] for _, x in held] or [np.zeros((0, 5))]
-        contacts = (np.zeros(sum(map(len, dim)), int), *(np.concatenate(x) for x in (address, dim, rub)))
+        held = [x for x in found if len(x) > 6]
+        begin = np.repeat(ptr[:-1], [len(x[6]) if len(x) > 6 else 0 for x in found])
+        parts = [np.concatenate([x[k] for x in held]) if held else np.zeros((0, 5)) for k in (6, 7, 8)]
+        address = np.where(parts[0] < 0, -1, parts[0] + begin) if held else np.zeros(0, int)
+        contacts = (np.zeros(len(address), int), address, parts[1].reshape(len(address)), parts[2])
     cones, scale = _blocks(of[None], loss[None], np.ones((1, len(of)), bool), contacts, dt)
     goal = dt * aref + np.einsum("ij,ij->i", jac, before[world])
     soft, lam = 1.0 / stiff, dt * force
@@ -228,7 +239,16 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
     whole = np.zeros((n, nv, nv))
     whole[:, row, model.M_colind] = mass
     whole[:, model.M_colind, row] = mass
-    batch = Batch(jac, whole, before + dt * smooth, target=goal, cones=cones, compliance=soft, friction="cone", row_ptr=ptr)
+    batch = Batch(
+        jac,
+        whole,
+        before + dt * smooth,
+        target=goal,
+        cones=cones,
+        compliance=soft,
+        friction="cone",
+        row_ptr=ptr,
+    )
     return Imported(batch, lam)
 
 
@@ -240,14 +260,12 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
     if len(bad):
         i = bad[0]
         raise CapabilityError(
-            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size; these data are "
-            "not those of M (an integrator that puts damping into it, or arrays of another step)"
+            f"world {i}: M qacc_smooth differs from qfrc_smooth by {gap[i] / size[i]:.1e} of their size; these data "
+            "are not those of M (an integrator that puts damping into it, or arrays of another step)"
         )
 
 
-def _blocks(
-    of: Any, loss: Any, counted: Any, contacts: Any, dt: float
-) -> tuple[Cones, FloatArray | None]:
+def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple[Cones, FloatArray | None]:
     """Blocks of all rows that count, one world after the other, and the factor of each row (n, m), None: 1."""
     n, m = of.shape
     begins, kind, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
@@ -262,8 +280,9 @@ def _blocks(
         here = here[elliptic[world[here], address[here]] & (dim[here] > 1)]
         world, address, dim, rub = world[here], address[here], dim[here], rub[here].astype(float)
         if np.sum(dim) != np.count_nonzero(elliptic):
+            rows = np.count_nonzero(elliptic)
             raise InputError(
-                f"efc_type has {np.count_nonzero(elliptic)} rows of elliptic contacts, contacts name {np.sum(dim)} of them"
+                f"efc_type has {rows} rows of elliptic contacts, contacts name {np.sum(dim)} of them"
             )
         kind[world, address], mu[world, address] = np.where(dim > 3, ROUND, CONTACT), rub[:, 0]
         factor = np.ones((n, m))
@@ -281,4 +300,6 @@ def _blocks(
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
     kinds = np.where(kind[counted][first] == 0, ROW, kind[counted][first]).astype(np.int32)
-    return Cones(ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[counted][first], patch_radius=none), scale
+    return Cones(
+        ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[counted][first], patch_radius=none
+    ), scale

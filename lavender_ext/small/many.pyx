@@ -1,4 +1,4 @@
-"""Problems in generalised coordinates, one or many, one after the other without the interpreter: prepare, solve, judge.
+"""Problems in generalised coordinates, one or many, without the interpreter: lay out, prepare, solve, judge.
 
 The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. What
 does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
@@ -349,7 +349,7 @@ cdef class Worlds:
         cdef const double[::1] wide
         cdef const float[::1] narrow
         cdef int32_t i
-        self.w.blocks, self.w.blocks.law, self.w.asymmetry = blocks.at, law, asymmetry
+        self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
         self.keep += [blocks, *arrays]
@@ -470,7 +470,7 @@ cdef class Worlds:
         if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
                 and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
             code, x = READY, room.real
-            if self.cold:
+            if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
             begin(&j, x)
             judge_job(&j, x)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
+from mujoco_scene import mj, scene
 
 import lavender as lv
 from lavender.io import mujoco as single
-
-from mujoco_scene import mj, scene
 
 
 def states_of(model, n, steps=40, seed=0):
@@ -28,7 +27,9 @@ def forwarded(model, state):
 
 
 @pytest.mark.parametrize("jacobian", ["dense", "sparse"])
-@pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)])
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)]
+)
 def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
     model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim, jacobian=jacobian))
     states = states_of(model, 6)
@@ -71,7 +72,10 @@ def stacked(model, states, dtype):
             parts = (i, d.contact.efc_address[c], d.contact.dim[c], d.contact.friction[c])
             for held, x in zip(contacts, parts, strict=True):
                 held.append(x)
-    each = {name: np.array([getattr(d, name) for d in datas]).astype(dtype) for name in ("qvel", "qacc_smooth", "qfrc_smooth")}
+    each = {
+        name: np.array([getattr(d, name) for d in datas]).astype(dtype)
+        for name in ("qvel", "qacc_smooth", "qfrc_smooth")
+    }
     return {
         "efc_J": jac, "efc_type": of, **rows, "M": mass.astype(dtype), **each, "timestep": model.opt.timestep,
         "nefc": [d.nefc for d in datas], "contacts": tuple(np.array(x) for x in contacts),
@@ -100,14 +104,15 @@ def test_arrays_that_do_not_fit_say_so():
     given = stacked(model, states_of(model, 3), np.float32)
     with pytest.raises(lv.InputError, match="contacts= is needed"):
         lv.io.from_efc(**given | {"contacts": None})
+    stiff, mass = given["efc_D"].copy(), given["M"].copy()
+    stiff[1, 2] = 0.0
+    mass[2] *= 1.01
     with pytest.raises(lv.InputError, match="efc_D of world 1, row 2"):
-        stiff = given["efc_D"].copy()
-        stiff[1, 2] = 0.0
         lv.io.from_efc(**given | {"efc_D": stiff})
     with pytest.raises(lv.CapabilityError, match="world 2: M qacc_smooth"):
-        mass = given["M"].copy()
-        mass[2] *= 1.01
         lv.io.from_efc(**given | {"M": mass})
+    with pytest.raises(lv.InputError, match="contacts name"):
+        lv.io.from_efc(**given | {"contacts": tuple(x[:-1] for x in given["contacts"])})
     with pytest.raises(lv.InputError, match="numbers each"):
         lv.io.from_mujoco_many(model, np.zeros((2, 3)))
     with pytest.raises(lv.InputError, match="MjModel is needed"):
