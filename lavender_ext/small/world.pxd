@@ -64,65 +64,72 @@ cdef struct desk_t:             # of one thread
     double* free
 
 
-cdef inline double number(const void* x, bint narrow, int64_t i) noexcept nogil:
-    return <double>(<const float*>x)[i] if narrow else (<const double*>x)[i]
-
-
 cdef inline void widen(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
     cdef int32_t i
+    cdef const float* x = <const float*>w.array[which] + first
     if w.narrow[which]:
         for i in range(n):
-            out[i] = (<const float*>w.array[which])[first + i]
+            out[i] = x[i]
     else:
         memcpy(out, <const double*>w.array[which] + first, n * sizeof(double))
 
 
-cdef inline int32_t rows_of(const worlds_t* w, int64_t first, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
+cdef inline const double* widened(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n, int64_t* row,
+                                  double* out) noexcept nogil:
+    """A matrix (m, n) where it stands, or from float32 into out (m n); row: numbers from one row to the next."""
+    cdef int32_t i
+    if not row[0]:
+        row[0] = n
+    if not w.narrow[which]:
+        return <const double*>w.array[which] + first
+    for i in range(m):
+        widen(w, which, first + i * row[0], n, out + <int64_t>i * n)
+    row[0] = n
+    return out
+
+
+cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
                             double* val) noexcept nogil:
     """J in compressed rows; its entries."""
-    cdef int64_t row = w.jac_row if w.jac_row else n
     cdef int32_t i, j, q = 0
-    cdef double x
     ptr[0] = 0
     for i in range(m):
         for j in range(n):
-            x = number(w.array[0], w.narrow[0], first + j)
-            if x != 0.0:
+            if a[j] != 0.0:
                 idx[q] = j
-                val[q] = x
+                val[q] = a[j]
                 q += 1
-        first += row
+        a += row
         ptr[i + 1] = q
     return q
 
 
-cdef inline int32_t triangle_of(const worlds_t* w, int64_t first, int32_t n, int32_t* ptr, int32_t* idx,
+cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, int32_t n, int32_t* ptr, int32_t* idx,
                                 double* val) noexcept nogil:
     """The lower triangle of M with its diagonal in compressed rows; its entries, -1 where M is not symmetric."""
-    cdef int64_t row = w.mass_row if w.mass_row else n
-    cdef const void* m = w.array[1]
-    cdef bint narrow = w.narrow[1]
+    cdef const double* own = a
+    cdef const double* other
     cdef int32_t i, j, q = 0
-    cdef double x, y, gap, s
+    cdef double gap, s
     ptr[0] = 0
     for i in range(n):
+        other = a + i
         for j in range(i):
-            x = number(m, narrow, first + i * row + j)
-            y = number(m, narrow, first + j * row + i)
-            if x == 0.0 and y == 0.0:
-                continue
-            idx[q] = j
-            val[q] = x
-            q += 1
-            if x != y:
-                gap = fabs(x - y)
-                s = number(m, narrow, first + i * row + i) * number(m, narrow, first + j * row + j)
-                if not (gap / sqrt(s) if s > 0.0 else gap) <= w.asymmetry:
-                    return -1
+            if own[j] != 0.0 or other[0] != 0.0:
+                idx[q] = j
+                val[q] = own[j]
+                q += 1
+                if own[j] != other[0]:
+                    gap = fabs(own[j] - other[0])
+                    s = own[i] * a[j * (row + 1)]
+                    if not (gap / sqrt(s) if s > 0.0 else gap) <= allowed:
+                        return -1
+            other += row
         idx[q] = i
-        val[q] = number(m, narrow, first + i * row + i)
+        val[q] = own[i]
         q += 1
         ptr[i + 1] = q
+        own += row
     return q
 
 
@@ -161,22 +168,27 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     """World i on the desk; READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
-    cdef int64_t whole = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2
+    cdef int64_t whole = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
+    cdef int64_t numbers = whole + 2 * half + 4 * n + 2 * m + k + 1, wide = whole if m > n else <int64_t>n * n
+    cdef const double* a
     cdef int32_t* ptr
     cdef int32_t* idx
     cdef double* x
     cdef double* b
-    if n >= MESH or not has_room(&d.room, m + 1 + whole + n + 1 + half + k + 1, whole + 2 * half + 4 * n + 2 * m + k + 1):
+    if n >= MESH or not has_room(&d.room, m + 1 + whole + n + 1 + half + k + 1, numbers + wide):
         return LEFT
     ptr, x = d.room.index, d.room.real
     idx = ptr + m + 1
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
-    entries = rows_of(w, at[JAC], m, n, ptr, idx, x)
+    a = widened(w, 0, at[JAC], m, n, &row, x + numbers)
+    entries = rows_of(a, row, m, n, ptr, idx, x)
     if not are_numbers(x, entries):
         return BAD
     ptr, x = idx + whole, x + whole
     idx = ptr + n + 1
-    entries = triangle_of(w, at[MASS], n, ptr, idx, x)
+    row = w.mass_row
+    a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
+    entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
     if entries < 0 or not are_numbers(x, entries):
         return BAD
     d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
