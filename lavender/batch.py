@@ -7,7 +7,6 @@ Arrays are read where they stand, in float32 or float64: what is made of one wor
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, overload
 
 import numpy as np
@@ -122,7 +121,7 @@ class Batch(Sequence[Problem]):
             raise InputError(
                 f"J has shape {jac.shape}; stacked it is (n, m, nv), ragged (rows, nv) with row_ptr"
             )
-        self._n, self.friction, self.mu_given = n, friction, mu is not None
+        self._n, self.friction = n, friction
         self.precision = precision_of(*(np.asarray(x) for x in (jac, mass, free)))
         self.at = at = np.zeros((n, len(PLACE)), np.int64)
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
@@ -217,7 +216,7 @@ class Batch(Sequence[Problem]):
     def _of_makers(cls, n: int, m: int, friction: str, precision: str) -> Batch:
         made: Batch = object.__new__(cls)
         made._n, made.friction, made.precision, made._arrays = n, friction, precision, None
-        made.shape, made.velocity_shape, made.mu_given = (n, m), (0,), False
+        made.shape, made.velocity_shape = (n, m), (0,)
         made.at = np.zeros((n, len(PLACE)), np.int64)
         made.at[:, PLACE["rows"]], made.at[:, PLACE["row"]] = m, m * np.arange(n)
         return made
@@ -289,7 +288,7 @@ class Batch(Sequence[Problem]):
         i = range(self._n)[i]
         if self._make is not None:
             return self._make(i)
-        jac, mass, free, target, soft, mu = (_part for _part in map(partial(self._part, i), range(6)))
+        jac, mass, free, target, soft, mu = (self._part(i, which) for which in range(6))
         own = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
         return Problem.from_jacobian(
             jac, mass, free, target=target, cones=own, compliance=soft, friction=self.friction,

@@ -385,10 +385,6 @@ cdef class Worlds:
             if self.code_at[i] == READY:
                 remember(&self.jobs[i], data[i])
 
-    def begin(self):
-        """From the first world again."""
-        self.taken = 0
-
     cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, job_t* j) noexcept nogil:
         """World i for `solve_job` or for the judge."""
         cdef const int64_t* at = self.w.at + i * PLACES
