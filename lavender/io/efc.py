@@ -28,6 +28,7 @@ from lavender.io import mujoco as single
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]
 
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7  # numbers of mjtConstraint; all others push only
+OF_ROWS = ("efc_J", "efc_D", "efc_aref", "efc_force", "efc_type", "efc_frictionloss", "efc_vel")
 CHUNK = 2**21  # entries of J that are widened at once
 # M a0 beside the smooth force, of their size: 64 roundings, in float64 and in float32, where factors are rounded, too.
 ROUNDING = {"float64": single.ROUNDING, "float32": 2.0**-14}
@@ -188,15 +189,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
             mj.mj_setState(model, data, given[i], kinds[size])
             mj.mj_forward(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            parts = (
-                data.efc_J,
-                data.efc_D,
-                data.efc_aref,
-                data.efc_force,
-                data.efc_type,
-                data.efc_frictionloss,
-            )
-            arrays = [x.copy() for x in parts]
+            arrays = [getattr(data, name).copy() for name in OF_ROWS]
             if elliptic and data.ncon:
                 c = data.contact
                 arrays += [c.efc_address.copy(), c.dim.copy(), c.friction.copy()]
@@ -216,20 +209,19 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
     n, nv, dt = len(found), model.nv, float(model.opt.timestep)
     count = np.array([len(x[1]) for x in found], np.int64)
     ptr = np.concatenate([[0], np.cumsum(count)])
-    jac, stiff, aref, force, of, loss = (
-        np.concatenate([x[k].ravel() for x in found]) if n else np.zeros(0) for k in range(6)
+    jac, stiff, aref, force, of, loss, velocity = (
+        np.concatenate([x[k].ravel() for x in found]) if n else np.zeros(0) for k in range(len(OF_ROWS))
     )
     jac = jac.reshape(-1, nv)
-    world = np.repeat(np.arange(n), count)
     contacts = None
     if elliptic:
-        held = [x for x in found if len(x) > 6]
-        begin = np.repeat(ptr[:-1], [len(x[6]) if len(x) > 6 else 0 for x in found])
-        parts = [np.concatenate([x[k] for x in held]) if held else np.zeros((0, 5)) for k in (6, 7, 8)]
+        held = [x for x in found if len(x) > len(OF_ROWS)]
+        begin = np.repeat(ptr[:-1], [len(x[7]) if len(x) > len(OF_ROWS) else 0 for x in found])
+        parts = [np.concatenate([x[k] for x in held]) if held else np.zeros((0, 5)) for k in (7, 8, 9)]
         address = np.where(parts[0] < 0, -1, parts[0] + begin) if held else np.zeros(0, int)
         contacts = (np.zeros(len(address), int), address, parts[1].reshape(len(address)), parts[2])
     cones, scale = _blocks(of[None], loss[None], np.ones((1, len(of)), bool), contacts, dt)
-    goal = dt * aref + np.einsum("ij,ij->i", jac, before[world])
+    goal = dt * aref + velocity
     soft, lam = 1.0 / stiff, dt * force
     if scale is not None:
         s = scale[0]
