@@ -5,7 +5,8 @@
     solution.impulse, solution.residual.relative    # [N s], [-]
 
 Problems   `Problem`, `Cones` (bounds and friction), `Rows` (bodies), `Generalized` (J and M), `load`
-Solving    `solve`, `solve_many`, `solve_qp`, `prepare` (for steps), `available`, `known`, `explain` (the way of `auto`)
+Worlds     `Batch` (many problems in arrays), `solve_many`, `residual_many`
+Solving    `solve`, `solve_qp`, `prepare` (for repeated steps), `available`, `known`, `explain` (the way of `auto`)
 Results    `Solution`, `residual` (judge any impulse), `prove` (an exact solution near by), `diagnose` (mistakes in the
            data), `motion_error`, `redundancy`
 Engine     `Scene`, `Simulation`
@@ -51,10 +52,11 @@ from lavender.solve import prepare, solve
 
 if TYPE_CHECKING:
     from lavender import bench, engine, io, motion, phenomena, report, scene, suite
+    from lavender.batch import Batch
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.io import load
-    from lavender.many import solve_many
+    from lavender.many import Residuals, Solutions, residual_many, solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
     from lavender.plan import Plan, explain
     from lavender.proof import Enclosure, prove
@@ -64,14 +66,17 @@ if TYPE_CHECKING:
 
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
+    "Batch": "lavender.batch",
     "CrossCheck": "lavender.check",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
     "Plan": "lavender.plan",
+    "Residuals": "lavender.many",
     "SOLVER_FIELDS": "lavender.engine",
     "Scene": "lavender.scene",
     "Simulation": "lavender.engine",
     "Snapshot": "lavender.engine",
+    "Solutions": "lavender.many",
     "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
@@ -88,6 +93,7 @@ _LATER = {
     "prove": "lavender.proof",
     "report": "lavender.report",
     "scene": "lavender.scene",
+    "residual_many": "lavender.many",
     "solve_many": "lavender.many",
     "solve_qp": "lavender.quadratic",
     "suite": "lavender.suite",
@@ -102,6 +108,7 @@ __all__ = [
     "ROUND",
     "ROW",
     "SOLVER_FIELDS",
+    "Batch",
     "CapabilityError",
     "Claim",
     "Cones",
@@ -118,11 +125,13 @@ __all__ = [
     "QPSolution",
     "Redundancy",
     "Residual",
+    "Residuals",
     "Rows",
     "Scene",
     "Simulation",
     "Snapshot",
     "Solution",
+    "Solutions",
     "SolveFailed",
     "SolverSpec",
     "SolverUnavailable",
@@ -151,6 +160,7 @@ __all__ = [
     "register",
     "report",
     "residual",
+    "residual_many",
     "scene",
     "solve",
     "solve_many",

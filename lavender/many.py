@@ -1,191 +1,524 @@
-"""Many problems in one call: the results of `solve` on each, with the same bits.
+"""Many problems in one call: the results of `solve` on each, with the same bits, in arrays.
 
-Problems in generalised coordinates are solved in one compiled loop without the interpreter, small problems by one
-compiled call each. Problems that these do not solve, and all others, are solved one by one. The descriptive fields of
-a solution (claim, counts, names) are made when they are first read.
+One compiled loop takes one world after the other, by an atomic counter, from the arrays of a `Batch` or from problems
+in generalised coordinates. What it does not solve, and every other problem, is handed back to the thread that took it
+and goes the way of a single solve. A `Solution` is made when it is first asked for.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from threading import Timer
 from time import perf_counter
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 
-from lavender._arrays import whole_number
+from lavender._arrays import FloatArray, as_array, number, whole_number
+from lavender._derived import cached_property
+from lavender.batch import Batch
 from lavender.deadline import NEVER, Deadline
-from lavender.errors import InputError
+from lavender.errors import InputError, LavenderError
 from lavender.loop import LEAST
-from lavender.problem import Problem
+from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.registry import SolverSpec, get
+from lavender.residuals import AT_REST, ENOUGH, Residual, judged, judging_time, residual, verdict_of
 from lavender.solution import Solution, Status, uninterrupted
-from lavender.solve import check_budget, check_taken, rest_of, seconds_of, solve, unjudged
-from lavender_ext.small.many import Batch
+from lavender.solve import COUNTED, check_budget, rest_of, seconds_of, solve
+from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds
 
-__all__ = ["solve_many"]
+__all__ = ["Residuals", "Solutions", "residual_many", "solve_many"]
 
-LATE = 4e-5  # s, of a problem whose turn comes too late
-BATCHED = 0.1  # s left of a limit from which one compiled loop is asked: a problem in it takes a tenth of that at most
-NO_TURN = "the time limit was over before its turn: the start, unjudged"
+DONE_ALL = -1  # of `Hand`: there are no more worlds
+ERRORS = ("raise", "status")
+LATE = 1e-5  # s, that the judge is given for a world whose turn comes too late
+STATUS = np.array(list(Status), object)
+NUMBER_OF = {status: i for i, status in enumerate(Status)}
+
+
+class _Many:
+    """n worlds, and what the judge found of them."""
+
+    def __init__(self, given: Any, starts: Any, cold: bool) -> None:
+        """Of a batch, or of problems; starts: flat impulses [N s] of the batch, or (m,) or None of each problem."""
+        self.problems: Sequence[Problem] = given
+        self.faults: dict[int, LavenderError] = {}
+        if isinstance(given, Batch):
+            place, self._sizes, self._first = given.at, given.at[:, PLACE["rows"]], given.at[:, PLACE["row"]]
+            self._impulse = np.zeros(int(np.prod(given.shape))) if cold else starts
+            self._velocity: FloatArray | None = np.zeros(int(np.prod(given.velocity_shape)))
+            self._worlds: Worlds = given.worlds(self._impulse, self._velocity, cold)
+            return
+        self._sizes = np.array([p.m for p in given], np.int64)
+        place = np.zeros((len(given), len(PLACE)), np.int64)
+        place[:, PLACE["rows"]], self._first = self._sizes, np.cumsum(self._sizes) - self._sizes
+        place[:, PLACE["row"]] = self._first
+        self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
+        self._worlds = Worlds(place, self._impulse, np.zeros(0), cold)
+        together = (
+            type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse for p in given
+        )
+        self._data = [p.derived.view if ours else None for p, ours in zip(given, together, strict=True)]
+        self._worlds.of_objects(self._data, starts)
+
+    @property
+    def relative(self) -> FloatArray:
+        """(n,) relative residual, NaN of a world that is bad."""
+        return self._numbers("relative")
+
+    @property
+    def energy(self) -> FloatArray:
+        """(n,) sqrt J, of the error."""
+        return self._numbers("energy")
+
+    @property
+    def velocity_error(self) -> FloatArray:
+        """(n,) m/s, of the worst row."""
+        return self._numbers("speed")
+
+    @property
+    def floor(self) -> FloatArray:
+        """(n,) relative residual that rounding alone costs."""
+        return self._numbers("floor")
+
+    @property
+    def worst_row(self) -> np.ndarray:
+        """(n,) row of the largest velocity error, counted in its world; -1 where there is none."""
+        worst: np.ndarray = self._worlds.worst[:-1]
+        return worst
+
+    def _numbers(self, which: str) -> FloatArray:
+        found: FloatArray = self._worlds.numbers[NUMBER[which], :-1]
+        return found
+
+    def _rows(self, i: int) -> slice:
+        return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
+
+    def _keep(self, i: int, found: Residual) -> None:
+        """What the judge found of a world that the loop left."""
+        known = {
+            "relative": found.relative, "energy": found.energy, "speed": found.velocity, "floor": found.floor,
+            "start_energy": found.energy_start, "start_speed": found.velocity_start,
+        }  # fmt: skip
+        for name, x in known.items():
+            self._worlds.numbers[NUMBER[name], i] = x
+        self._worlds.worst[i] = found.worst_row
+
+    def __len__(self) -> int:
+        return len(self.problems)
+
+    def _at(self, i: Any) -> int:
+        i = range(len(self))[i]
+        if i in self.faults:
+            raise self.faults[i]
+        return i
+
+    def _run(
+        self, turn: Callable[[Hand], int], alone: Callable[[int], None], threads: int, errors: str
+    ) -> None:
+        """All worlds by `turn`; those that it leaves by `alone`; what is bad by its number in `faults`."""
+        stop = bytearray(1)  # not 0: nothing more is begun
+
+        def single(i: int) -> None:
+            try:
+                alone(i)
+            except LavenderError as error:
+                self.faults[i] = self._fault(i, error)
+                stop[0] |= errors == "raise"
+
+        def work(_: int) -> None:
+            hand = Hand(self._worlds, stop)
+            while (i := turn(hand)) != DONE_ALL:
+                if i >= 0:
+                    single(i)
+
+        threads = min(threads, len(self))
+        if threads < 2:
+            work(0)
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                try:
+                    list(pool.map(work, range(threads)))
+                finally:
+                    stop[0] = 1  # of Ctrl-C the other threads hear nothing
+        stop[0] = 0
+        for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
+            single(i)  # which finds the words
+        if self.faults and errors == "raise":
+            raise self.faults[min(self.faults)]
+        for i in self.faults:
+            self._worlds.numbers[:, i] = np.nan
+
+    def _fault(self, i: int, error: LavenderError) -> LavenderError:
+        if isinstance(self.problems, Batch) and isinstance(error, InputError):
+            return InputError(f"world {i}: {error}")
+        return error
+
+
+class Solutions(_Many, Sequence[Solution]):
+    """Results of `solve_many`, in arrays; `many[i]` is the `Solution` of world i.
+
+    Parameters
+    ----------
+    impulse : N s
+        Of a stacked batch (n, m), 0 beyond the rows of a world that has fewer; else of all rows, where `ptr` says which
+        world they are of.
+    status : (n,) of Status
+        REFUSED where the data of a world are no problem's.
+    relative, energy, velocity_error, floor : (n,)
+        Of the judge: -, sqrt J, m/s, -. NaN of a world that is REFUSED.
+    worst_row, iterations : (n,) int
+    tol : float, -
+    faults : dict
+        What is wrong with the worlds that are REFUSED, by their numbers.
+    """
+
+    def __init__(self, given: Any, starts: Any, cold: bool, tol: float, spec: SolverSpec) -> None:
+        super().__init__(given, starts, cold)
+        self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
+        self._kept: dict[int, Solution] = {}
+        self._seconds = 0.0  # share of each
+        # Of a batch the loop writes over the starts.
+        self._given = None if cold or not isinstance(given, Batch) else starts.copy()
+
+    @property
+    def impulse(self) -> FloatArray:
+        """See the class."""
+        return (
+            self._impulse.reshape(self.problems.shape) if isinstance(self.problems, Batch) else self._impulse
+        )
+
+    @cached_property
+    def velocity(self) -> FloatArray:
+        """v+ [m/s, rad/s]: of a stacked batch (n, nv); else of all worlds one after the other, none of a matrix."""
+        if isinstance(self.problems, Batch):
+            return self._velocity.reshape(self.problems.velocity_shape)  # type: ignore[union-attr]
+        of = [(p, i) for i, p in enumerate(self.problems) if p.matrix is None and i not in self.faults]
+        return np.concatenate(
+            [np.zeros(0), *(p.velocity(self._impulse[self._rows(i)]).ravel() for p, i in of)]
+        )
+
+    @cached_property
+    def status(self) -> np.ndarray:
+        """See the class."""
+        code = self._worlds.code[:-1]
+        out = np.where(code == CODE["late"], NUMBER_OF[Status.TIME_LIMIT], NUMBER_OF[Status.CONVERGED])
+        for i, solution in self._kept.items():
+            out[i] = NUMBER_OF[solution.status]
+        for i in self.faults:
+            out[i] = NUMBER_OF[Status.REFUSED]
+        return STATUS[out]
+
+    @property
+    def iterations(self) -> np.ndarray:
+        """(n,) in the solver's own unit."""
+        counts: np.ndarray = self._worlds.counts[:-1, 0]
+        return counts
+
+    @property
+    def success(self) -> np.ndarray:
+        """(n,) bool: the judge's relative residual is at most `tol`."""
+        return self.relative <= self.tol
+
+    @property
+    def ptr(self) -> np.ndarray:
+        """(n + 1,) first row of each world where `impulse` is flat, then the number of rows."""
+        return np.append(self._first, self._impulse.size)
+
+    def start(self, i: int) -> Any:
+        """The start (m,) [N s] of world i, None of one without."""
+        if isinstance(self.problems, Batch):
+            return None if self._given is None else self._given[self._rows(i)]
+        return self._starts[i]
+
+    def keep(self, i: int, found: Solution) -> None:
+        """The solution of a world that the loop left."""
+        self._kept[i] = found
+        self._impulse[self._rows(i)] = found.impulse
+        _Many._keep(self, i, found.residual)
+        self._worlds.counts[i, 0] = found.iterations
+        problem = found.residual._problem
+        if self._velocity is not None and self._velocity.size and problem.matrix is None:
+            v = problem.velocity(found.impulse).ravel()
+            first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
+            self._velocity[first : first + len(v)] = v
+
+    @overload
+    def __getitem__(self, i: int) -> Solution: ...
+    @overload
+    def __getitem__(self, i: slice) -> list[Solution]: ...
+    def __getitem__(self, i: Any) -> Any:
+        if isinstance(i, slice):
+            return [self[j] for j in range(*i.indices(len(self)))]
+        i = self._at(i)
+        if i not in self._kept:
+            self._kept[i] = self._solution(i)
+        return self._kept[i]
+
+    def _solution(self, i: int) -> Solution:
+        """Of a world that the loop ended."""
+        if not self._sizes[i]:
+            return solve(self.problems[i], self._spec.name, tol=self.tol)
+        impulse, late = self._impulse[self._rows(i)].copy(), self._worlds.code[i] == CODE["late"]
+        impulse.setflags(write=False)
+        status = Status.TIME_LIMIT if late else Status.CONVERGED
+        return Solution.late(impulse, status, self.tol, self._seconds, (self._rest, (i, impulse, status)))
+
+    def _rest(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
+        problem = self.problems[i]
+        found = judged(problem, impulse)
+        counts = None if status is Status.TIME_LIMIT else tuple(self._worlds.counts[i].tolist())
+        return rest_of(problem, self._spec, found, counts, self.start(i), status)
+
+    def __repr__(self) -> str:
+        return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self.success.sum())} to {self.tol:g}>"
+
+
+class Residuals(_Many):
+    """Verdicts of `residual_many`, in arrays; `errors[i]` is the `Residual` of world i.
+
+    Parameters
+    ----------
+    relative, energy, velocity_error, floor : (n,)
+        As of `Solutions`; the floor is that of `precision`.
+    worst_row : (n,) int
+    precision : {"float64", "float32"} or sequence of them
+    threshold : float, m/s
+    faults : dict
+        What is wrong with the worlds whose data are no problem's, by their numbers.
+    """
+
+    def __init__(self, given: Any, starts: Any, precision: Sequence[str], threshold: float) -> None:
+        super().__init__(given, starts, False)
+        self.precision, self.threshold = precision, threshold
+        if not isinstance(given, Batch):
+            self._impulse[:] = np.concatenate([np.zeros(0), *starts])
+        self._nothing: dict[int, bool] = {}  # of worlds that the loop left
+
+    @cached_property
+    def verdict(self) -> np.ndarray:
+        """(n,) as `Residual.verdict`: "at its floor", "close enough", "stopped early", "wrong"; "" of a bad world."""
+        nothing = (self._numbers("start_relative") < 0.5) | (self._numbers("start_speed") < AT_REST)
+        for i, known in self._nothing.items():
+            nothing[i] = known
+        names = "relative", "floor", "energy", "speed", "rhs_energy"
+        each = zip(
+            *(self._numbers(name).tolist() for name in names), nothing.tolist(), self.precision, strict=True
+        )
+        words = [verdict_of(*x, self.threshold) for x in each]  # type: ignore[call-arg]
+        for i in self.faults:
+            words[i] = ""
+        return np.array(words, "U13")
+
+    @property
+    def excess(self) -> FloatArray:
+        """(n,) relative residual over its floor."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(self.relative == 0.0, 0.0, self.relative / self.floor)
+
+    def keep(self, i: int, found: Residual) -> None:
+        """The residual of a world that the loop left."""
+        _Many._keep(self, i, found)
+        self._nothing[i] = found.nothing_to_do
+        self._worlds.numbers[NUMBER["rhs_energy"], i] = found.energy_rhs
+
+    def __getitem__(self, i: int) -> Residual:
+        i = self._at(i)
+        return residual(self.problems[i], self._impulse[self._rows(i)], self.precision[i], self.threshold)
+
+    def __repr__(self) -> str:
+        words, counts = np.unique(self.verdict, return_counts=True)
+        told = ", ".join(f"{n} {word or 'bad'}" for word, n in zip(words, counts, strict=True))
+        return f"<Residuals of {len(self)} worlds: {told}>"
 
 
 def solve_many(
-    problems: Iterable[Problem],
+    problems: Batch | Iterable[Problem],
     solver: str = "auto",
     *,
+    impulse: Any = None,
     impulses: Sequence[Any] | None = None,
     threads: int = 1,
     tol: float = 1e-6,
     max_iter: int | None = None,
     time_limit: float | None = None,
+    errors: str = "raise",
     **options: Any,
-) -> list[Solution]:
+) -> Solutions:
     """Solve many problems, with the bits of `solve` on each for any number of threads.
 
     Parameters
     ----------
-    problems : iterable of Problem
+    problems : Batch, or iterable of Problem
     solver : str
+    impulse : N s, optional
+        Of a batch, in the shape of its impulses: warm starts. Default: from doing nothing.
     impulses : sequence of (m,) N s, optional
-        Warm start of each problem, None for a problem without one; default: as `solve`.
+        Of problems: warm start of each, None for one without; default: as `solve`.
     threads : int
-        Problems solved at the same time.
+        Worlds solved at the same time; each thread takes the next one that nobody has.
     tol, max_iter, **options
         As `solve`.
     time_limit : float, optional, s
-        Limit of the whole call on the wall clock. Problems take their turns in order, each with all of the time left;
-        those whose turn comes too late keep their start, unjudged until their residual is read. Below 0.1 s all are
-        solved one by one, without the compiled loop.
+        Limit of the whole call on the wall clock. Worlds take their turns in order, each with all of the time left;
+        those whose turn comes too late keep their start, judged, with status TIME_LIMIT.
+    errors : {"raise", "status"}
+        Of a world whose data are refused (NaN, an M that is not definite, a negative mu): raise what is wrong with the
+        first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
 
     Returns
     -------
-    list of Solution
-        In the order of the problems.
+    Solutions
+        In the order of the worlds: arrays, and `many[i]` a `Solution`.
 
     Raises
     ------
     InputError
-        `threads` is not a whole number from 1, `impulses` has another length than `problems`, `impulse` was given, or
-        as `solve`.
+        `threads` is not a whole number from 1, starts do not fit the problems, or as `solve`.
     UnknownName, CapabilityError, SolverUnavailable
-        As `solve`, for the first problem that is refused.
+        As `solve`, for the first world that is refused.
     KeyboardInterrupt
-        Ctrl-C; a thread ends the problem that it has in hand.
+        Ctrl-C; a thread ends the world that it has in hand.
     """
+    given = _given(problems, errors)
+    threads = whole_number("threads", threads, 1, None)
+    spec, limit = get(solver), seconds_of(time_limit)
+    deadline = NEVER if limit == np.inf else Deadline(limit)
+    check_budget(spec, tol, max_iter)
+    starts = _starts(given, impulse, impulses)
+    made = Solutions(given, starts, starts is None, tol, spec)
+    # What the results of those to come take is kept free.
+    if deadline.is_set:
+        deadline.keep(
+            LATE * len(given)
+            if isinstance(given, Batch)
+            else sum(LATE if data else judging_time(p) for p, data in zip(given, made._data, strict=True))
+        )
+    more = {"tol": tol, "max_iter": max_iter, **options}
+    # What `solve` would ask of one compiled call.
+    together = spec.own and spec.small is not None and not options and max_iter is None
+    together = together and isinstance(tol, float) and 0.0 < tol < np.inf
+    limits = spec.small.limits if together and spec.small is not None else None
+
+    def turn(hand: Hand) -> int:
+        if not deadline.is_set:
+            return int(hand.solve(tol, limits))
+        if deadline.passed(0.0):
+            return int(hand.judge(False, True))
+        return int(hand.solve(tol, limits, COUNTED * (deadline.left(LEAST) or LEAST)))
+
+    def alone(i: int) -> None:
+        problem, start = given[i], made.start(i)
+        if made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
+            # The same steps need not be done again.
+            at = problem._start if start is None else start
+            problem.derived.vain = (spec.name, tol, np.ascontiguousarray(at, float).tobytes())
+        found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
+        made.keep(i, found if "callback" in options else uninterrupted(found))
+
+    begin = perf_counter()
+    made._run(turn, alone, threads, errors)
+    made._seconds = (perf_counter() - begin) / max(1, len(given))
+    if not isinstance(given, Batch):
+        made._worlds.remember(made._data)
+    return made
+
+
+def residual_many(
+    problems: Batch | Iterable[Problem],
+    impulses: Any,
+    *,
+    precision: str | None = None,
+    threshold: float = ENOUGH,
+    threads: int = 1,
+    errors: str = "raise",
+) -> Residuals:
+    """The judge alone, on impulses from anywhere: an error and a verdict for each world.
+
+    Parameters
+    ----------
+    problems : Batch, or iterable of Problem
+    impulses : N s
+        In the shape of the batch's impulses; of problems a sequence of (m,). Entries may be infinite or NaN.
+    precision : {"float64", "float32"}, optional
+        In which the impulses were computed; default: that of each problem.
+    threshold : float, m/s
+        As `residual`.
+    threads : int
+    errors : {"raise", "status"}
+        As `solve_many`; the verdict of a bad world is empty.
+
+    Returns
+    -------
+    Residuals
+        With the numbers of `residual` on each, to the bit.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, an unknown precision, a negative threshold, or a world that is bad.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> J, M, v_free = np.ones((3, 1, 1)), np.ones((3, 1, 1)), -np.ones((3, 1))  # 1 kg falls by 1 m/s
+    >>> batch = lv.Batch(J, M, v_free, cones=lv.Cones.contacts(0.0, tangents=0))
+    >>> found = lv.residual_many(batch, [[1.0], [0.9], [0.0]])  # N s
+    >>> found.verdict.tolist(), found.velocity_error.round(6).tolist()
+    (['at its floor', 'stopped early', 'wrong'], [0.0, 0.1, 1.0])
+    """
+    given = _given(problems, errors)
+    if precision not in (None, *PRECISIONS):
+        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
+    threshold = number("threshold", threshold, low=0.0)
+    threads = whole_number("threads", threads, 1, None)
+    if isinstance(given, Batch):
+        starts: Any = given.impulses("impulses", impulses, finite=False)
+        words = len(given) * [given.precision if precision is None else precision]
+    else:
+        if len(impulses) != len(given):
+            raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
+        starts = [
+            as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
+            for i, (p, x) in enumerate(zip(given, impulses, strict=True))
+        ]
+        words = [p.precision if precision is None else precision for p in given]
+    made = Residuals(given, starts, words, threshold)
+    single = isinstance(given, Batch) and "float32" in words
+
+    def alone(i: int) -> None:
+        made.keep(i, residual(given[i], made._impulse[made._rows(i)], words[i], threshold))
+
+    made._run(lambda hand: int(hand.judge(single)), alone, threads, errors)
+    return made
+
+
+def _given(problems: Any, errors: str) -> Any:
+    """A batch, or a list of problems."""
+    if errors not in ERRORS:
+        raise InputError(f"errors is {errors!r}; {' or '.join(map(repr, ERRORS))} is needed")
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
+    if isinstance(problems, Batch):
+        return problems
     given = list(problems)
-    threads = whole_number("threads", threads, 1, None)
-    if "impulse" in options:
+    for problem in given:
+        check_problem(problem)
+    return given
+
+
+def _starts(given: Any, impulse: Any, impulses: Any) -> Any:
+    """Flat impulses of a batch, or of each problem (m,) or None; None: doing nothing everywhere."""
+    if isinstance(given, Batch):
+        if impulses is not None:
+            raise InputError(
+                "impulses are of a list of problems; give impulse=, one array of the whole batch"
+            )
+        return None if impulse is None else given.impulses("impulse", impulse)
+    if impulse is not None:
         raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
     if impulses is not None and len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
-    starts = [None] * len(given) if impulses is None else list(impulses)
-    made: list[Solution | None] = [None] * len(given)
-    spec = get(solver)
-    limit = seconds_of(time_limit)
-    deadline = NEVER if limit == np.inf else Deadline(limit)
-    check_budget(spec, tol, max_iter)
-    deadline.keep(LATE * len(given))  # for those whose turn comes too late
-    more = {"tol": tol, "max_iter": max_iter, **options}
-    # What `solve` would ask of one compiled call.
-    together = spec.own and spec.small is not None and spec.small.limits is not None and not options
-    together = together and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
-    together = together and (not deadline.is_set or not deadline.passed(BATCHED))
-    at = [
-        i
-        for i, p in enumerate(given)
-        if type(p) is Problem and p.generalized is not None and not p.cones.has_ellipse
-    ]
-
-    stop, full = bytearray(1), bytearray(1)  # not 0: nothing more is begun, or nothing more in a batch
-    left = deadline.left(LEAST)
-    alarm = Timer(left, full.__setitem__, (0, 1)) if together and at and left is not None else None
-
-    def batch(part: list[int]) -> None:
-        _batch(given, starts, part, tol, spec, made, full)
-
-    def alone(i: int) -> None:
-        if stop[0]:
-            return
-        deadline.keep(-LATE)
-        if deadline.passed():
-            check_taken(given[i], spec)
-            made[i] = unjudged(given[i], spec, options, starts[i], tol, NO_TURN)
-            return
-        found = solve(given[i], solver, impulse=starts[i], time_limit=deadline.left(LEAST), **more)
-        made[i] = found if "callback" in options else uninterrupted(found)
-
-    if alarm is not None:
-        alarm.daemon = True
-        alarm.start()
-    parts = [at[k::threads] for k in range(min(threads, len(at)))] if together else []
-    try:
-        if threads == 1:
-            for part in parts:
-                batch(part)
-            for i, solution in enumerate(made):
-                if solution is None:
-                    alone(i)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                try:
-                    list(pool.map(batch, parts))
-                    list(pool.map(alone, [i for i, solution in enumerate(made) if solution is None]))
-                finally:
-                    stop[0] = full[0] = 1  # of Ctrl-C the other threads hear nothing
-    finally:
-        if alarm is not None:
-            alarm.cancel()
-    return [solution for solution in made if solution is not None]
-
-
-def _batch(
-    problems: list[Problem],
-    starts: list[Any],
-    at: list[int],
-    tol: float,
-    spec: SolverSpec,
-    made: list[Solution | None],
-    stop: bytearray,
-) -> None:
-    """Into `made` the solutions of those of the problems `at` that the compiled loop ends, with their share of time."""
-    begin = perf_counter()
-    views, given = [], []
-    for i in at:
-        if stop[0]:
-            return
-        p, start = problems[i], starts[i]
-        views.append(p.derived.view)
-        given.append(p.guess if start is None else p.impulse_array(start))
-    assert spec.small is not None
-    work = Batch(views, given, tol, spec.small.limits, stop)
-    seconds = (perf_counter() - begin) / max(1, len(at))
-    common = _Solved(
-        batch=work, problems=[problems[i] for i in at], spec=spec, tol=tol, seconds=seconds, given=given
-    )
-    work.hand_out(Solution, _solution, common, at, made)
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """What the solutions of a batch are made of."""
-
-    batch: Batch
-    problems: list[Problem]
-    spec: SolverSpec
-    tol: float
-    seconds: float  # share of each
-    given: list[Any]  # starts
-
-
-def _solution(common: _Solved, i: int) -> dict[str, Any]:
-    """All fields of the solution of problem i, which converged."""
-    judged, counts = common.batch.judged(i)
-    made = {"impulse": judged.impulse, "status": Status.CONVERGED, "tol": common.tol, "setup_time": 0.0}
-    rest = rest_of(common.problems[i], common.spec, judged, counts, common.given[i])
-    return made | {"solve_time": common.seconds} | rest
+    each = [None] * len(given) if impulses is None else impulses
+    return [p.guess if x is None else p.impulse_array(x) for p, x in zip(given, each, strict=True)]

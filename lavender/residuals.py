@@ -45,9 +45,7 @@ from typing import Any
 import numpy as np
 
 from lavender._arrays import ArrayLike, FloatArray, as_array, number, read_only
-from lavender._later import sparse as sp
 from lavender.errors import InputError
-from lavender.generalized import Generalized
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender_ext.judge import measure
 
@@ -60,7 +58,6 @@ UNIT32 = 2.0**-24  # u of float32: half its spacing at 1
 RESULT, PASS = 1e-4, 1.5e-9  # s of one result, and for each multiply-add of the judge's pass
 WHITENED, READ = 4e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of it, or of a matrix
 OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
-CHUNK = 2**22  # numbers of J M^-1 that are formed at once: 32 MB
 
 at_floor = (
     measure.at_floor
@@ -133,15 +130,12 @@ class Residual:
         times: there it is a root of squares that has each number at its worst, sqrt(3) standard deviations, and many
         rows have a largest one; rounding the data alone can come near what doing nothing is off.
         """
-        if self.rounding is None:
-            return at_floor(self.relative, self.floor)
-        return self.rounds and self.relative < 1.0
+        return _at_floor(self.relative, self.floor, self.precision)
 
     @property
     def rounds(self) -> bool:
         """Rounding explains the residual, whatever it is beside doing nothing."""
-        factor = 2.0 if self.rounding is None else 4.0
-        return self.relative <= factor * self.floor < math.inf
+        return _rounds(self.relative, self.floor, self.precision)
 
     @property
     def verdict(self) -> str:
@@ -151,14 +145,10 @@ class Residual:
         finite, or as far off as doing nothing. A residual tells no mistake that is smaller from an early stop: another
         mu, say, leaves the same error.
         """
-        if self.at_floor:
-            return AT_FLOOR
-        if self.nothing_to_do and self.rounds:
-            # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
-            return AT_FLOOR if self.energy <= measure.rhs_norms(self._problem.disk.metric)[0] else WRONG
-        if self.velocity <= self.threshold:
-            return CLOSE
-        return EARLY if self.relative < 1.0 else WRONG
+        return verdict_of(
+            self.relative, self.floor, self.energy, self.velocity, self.energy_rhs, self.nothing_to_do,
+            self.precision, self.threshold,
+        )  # fmt: skip
 
     @property
     def verdict_in_words(self) -> str:
@@ -176,6 +166,11 @@ class Residual:
     def nothing_to_do(self) -> bool:
         """Doing nothing is right (see `nothing_to_do`): neither solved nor failed, read `energy` and `velocity`."""
         return nothing_to_do(self._problem)
+
+    @property
+    def energy_rhs(self) -> float:
+        """The energy norm of b [sqrt J]."""
+        return float(measure.rhs_norms(self._problem.disk.metric)[0])
 
     @property
     def worst_name(self) -> str:
@@ -196,6 +191,39 @@ class Residual:
         if self.rounding is None:
             return text
         return f"{text} of {self.precision} ({self.rounding}): {self.verdict_in_words}"
+
+
+def _rounds(relative: float, floor: float, precision: str) -> bool:
+    """`Residual.rounds`, of numbers."""
+    return relative <= (2.0 if precision == "float64" else 4.0) * floor < math.inf
+
+
+def _at_floor(relative: float, floor: float, precision: str) -> bool:
+    """`Residual.at_floor`, of numbers."""
+    if precision == "float64":
+        return bool(at_floor(relative, floor))
+    return _rounds(relative, floor, precision) and relative < 1.0
+
+
+def verdict_of(
+    relative: float,
+    floor: float,
+    energy: float,
+    velocity: float,
+    energy_rhs: float,
+    nothing: bool,
+    precision: str,
+    threshold: float,
+) -> str:
+    """`Residual.verdict`, of numbers; nothing: doing nothing is right; energy_rhs [sqrt J] is the norm of b."""
+    if _at_floor(relative, floor, precision):
+        return AT_FLOOR
+    if nothing and _rounds(relative, floor, precision):
+        # Relative to nothing 1 means nothing: an impulse that ran away has more error than b.
+        return AT_FLOOR if energy <= energy_rhs else WRONG
+    if velocity <= threshold:
+        return CLOSE
+    return EARLY if relative < 1.0 else WRONG
 
 
 def relative_of(data: Any, energy: float, velocity: float) -> float:
@@ -374,47 +402,33 @@ def _relative_size(problem: Problem, square: Any) -> float:
 
 def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What float32 makes of w (m,), three squares [m2/s2]: by (1), by (2, 3 or 4), by (5) of the module."""
+    general = problem.generalized
+    if general is not None:
+        free = general.v_free if general.order is None else general.v_free[general.order]
+        own, data, velocities = measure.squares_of_float32(
+            problem.metric, general.operator.mass, free, impulse
+        )
+        return own, data, velocities
     unit, none = UNIT32 * UNIT32, np.zeros(problem.m)
     a, b, lam = _squared(problem.csr), problem.b**2, impulse**2
     own = a @ lam
     if problem.matrix is not None:
         return unit * own, none if problem.precision == "float32" else unit * (own + b), none
-    jac, compliance = problem.jacobian, problem.compliance
+    jac, compliance, rows = problem.jacobian, problem.compliance, problem.rows
     assert compliance is not None
-    soft, pushed = compliance**2 * lam, _squared(jac.T) @ lam
-    if problem.rows is not None:
-        inverse = problem.rows.inverse_mass_matrix()
-        x, free = inverse @ (jac.T @ impulse), problem.rows.v_free.ravel()
-        through = _squared(jac @ inverse) @ pushed + _squared(jac) @ (
-            _squared(inverse) @ (jac.T @ impulse) ** 2
-        )
-    else:
-        general = problem.generalized
-        assert general is not None
-        x, free = general.change(impulse), general.v_free
-        through = _through(general, _squared(general.mass) @ x**2 + pushed)
-    seen, given = _squared(jac) @ x**2, (problem.b + jac @ free) ** 2 + 2.0 * (_squared(jac) @ free**2)
-    data = seen + through + soft + given
-    acts = (impulse != 0.0) & (impulse != problem.cones.lower) & (impulse != problem.cones.upper)
-    velocities = none
-    if problem.generalized is not None and not np.any(acts & (compliance == 0.0)):
-        off = np.divide(seen + b + soft, compliance**2, out=none.copy(), where=acts)
-        velocities = a @ off
-    return unit * own, unit * data, unit * velocities
+    assert rows is not None
+    inverse = rows.inverse_mass_matrix()
+    x, free = inverse @ (jac.T @ impulse), rows.v_free.ravel()
+    through = _squared(jac @ inverse) @ (_squared(jac.T) @ lam)
+    through += _squared(jac) @ (_squared(inverse) @ (jac.T @ impulse) ** 2)
+    given = (problem.b + jac @ free) ** 2 + 2.0 * (_squared(jac) @ free**2)
+    data = _squared(jac) @ x**2 + through + compliance**2 * lam + given
+    return unit * own, unit * data, none
 
 
 def _squared(a: Any) -> Any:
     """Every entry of a sparse matrix squared."""
     return a.multiply(a).tocsr()
-
-
-def _through(general: Generalized, force: FloatArray) -> FloatArray:
-    """Squares of J M^-1 f (m,) of forces f (nv,) without a correlation, their squares given."""
-    mass, out = sp.linalg.splu(sp.csc_array(general.mass)), np.empty(general.m)
-    step = max(1, CHUNK // max(1, general.nv))
-    for i in range(0, general.m, step):
-        out[i : i + step] = (mass.solve(general.jac[i : i + step].toarray().T) ** 2).T @ force
-    return out
 
 
 def told(problem: Problem, last: measure.Judged) -> Residual:

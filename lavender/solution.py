@@ -31,6 +31,7 @@ class Status(str, Enum):
     INFEASIBLE = "no solution exists; `certificate` proves it"
     NUMERICAL_ERROR = "a factorisation or the backend failed"
     INTERRUPTED = "stopped by Ctrl-C or by the callback"
+    REFUSED = "of one world of many: its data are no problem's"
 
     def __str__(self) -> str:
         return self.name

@@ -7,7 +7,8 @@
 | `.hdf5`, `.h5` | FCLIB, local (W, q, mu) and global (M, H, f, w, mu), 2D, 3D; extra `fclib` | yes |
 
 What a format cannot hold is refused by name. `docs/formats.md` lists every entry. Not from a file but from another
-engine's memory: `from_mujoco`, `from_pinocchio`, `from_drake`, and `record` for a folder of steps.
+engine's memory: `from_mujoco`, `from_pinocchio`, `from_drake`, many worlds at once by `from_mujoco_many` and
+`from_efc`, and `record` for a folder of steps.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from typing import Any
 
 from lavender._arrays import FloatArray
 from lavender.errors import InputError
-from lavender.io import drake, fclib, mujoco, npz
+from lavender.io import drake, efc, fclib, mujoco, npz
 from lavender.io.drake import from_drake
+from lavender.io.efc import from_efc, from_mujoco_many
 from lavender.io.mujoco import from_mujoco
 from lavender.io.pinocchio import from_pinocchio
 from lavender.io.recording import Recording, record
@@ -30,8 +32,11 @@ __all__ = [
     "Recording",
     "Stored",
     "drake",
+    "efc",
     "from_drake",
+    "from_efc",
     "from_mujoco",
+    "from_mujoco_many",
     "from_pinocchio",
     "load",
     "load_solution",

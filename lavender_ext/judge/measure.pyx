@@ -9,6 +9,7 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing, judge_view, relative_of, rows_slack,
                                          scratch_of)
+from lavender_ext.judge.rounding cimport mass_t, squares32
 from lavender_ext.judge.score cimport are_numbers, is_at_floor, norms_of_rhs, relative, score_rows, score_t
 
 
@@ -182,3 +183,25 @@ def velocity_change(Data p, const double[::1] lam, double[:, ::1] v):
         return
     with nogil:
         rows_velocity(&p.blocks, &p.rows, &lam[0], &v[0, 0])
+
+
+def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] lam):
+    """What float32 makes of w in generalised coordinates, (1), (4) and (5) of `judge/rounding.pxd`: (3, m) [m2/s2].
+
+    mass: (indptr, indices, data) of M's lower triangle; free (n,): v*, both in the order of the factor.
+    """
+    cdef const int32_t[::1] ptr = mass[0], idx = mass[1]
+    cdef const double[::1] val = mass[2]
+    cdef mass_t at
+    cdef const double* v = NULL
+    cdef Py_ssize_t m = p.blocks.n_rows, n = p.general.n
+    out = np.zeros((3, m))
+    cdef double[:, ::1] x = out
+    cdef double[::1] work = np.empty(4 * n + m + 1)
+    at.ptr, at.idx, at.val = &ptr[0], NULL, NULL
+    if n:
+        at.idx, at.val, v = &idx[0], &val[0], &free[0]
+    if m:
+        with nogil:
+            squares32(&p.blocks, &p.general, &at, v, &lam[0], &x[0, 0], &x[1, 0], &x[2, 0], &work[0])
+    return out

@@ -1,29 +1,44 @@
-"""Problems in generalised coordinates, one or many, one after the other without the interpreter: prepare, solve, judge.
+"""Problems in generalised coordinates, one or many, without the interpreter: lay out, prepare, solve, judge.
 
 The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. What
 does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
 asked for, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
-from libc.stdint cimport int32_t
-from libc.math cimport INFINITY, fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.math cimport INFINITY, fabs, log10, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
 import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
-from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
+from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
+from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
+                                       ROW as AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all
 from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
-from lavender_ext.judge.score cimport relative, score_t
+from lavender_ext.judge.rounding cimport relative_size, squares32
+from lavender_ext.judge.score cimport norms_of_rhs, relative, score_t
+
+cdef extern from *:
+    """
+    #if defined(_MSC_VER)
+    #include <intrin.h>
+    #define lav_add(p, x) _InterlockedExchangeAdd64((volatile __int64*)(p), (x))
+    #else
+    #define lav_add(p, x) __atomic_fetch_add((p), (x), __ATOMIC_ACQ_REL)
+    #endif
+    """
+    int64_t lav_add(int64_t* p, int64_t x) noexcept nogil
 
 
 cdef enum:
@@ -111,6 +126,15 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
     return True
 
 
+cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
+    """The judge's pass over lam; x (n + m) is scratch."""
+    cdef int32_t m = j.p.n_rows
+    j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, x, True, &j.score)
+    j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
+    j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
+
+
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef flow_t f
     cdef need_t need
@@ -143,18 +167,12 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if not has_room(room, 0, <ssize_t>j.g.n + m):
         return
-    j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, room.real, True, &j.score)
-    j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
-    j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
+    judge_job(j, room.real)
     j.solved = j.relative <= tol
 
 
-cdef inline void solve_alone(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
-    """One of many: what was worked out of its data goes with it."""
-    cdef bint known = j.made.marks != NULL
-    if j.p.n_rows > 0:
-        solve_job(j, room, limits, tol)
+cdef inline void forget(job_t* j, bint known) noexcept nogil:
+    """What was worked out of its data, unless it was known before."""
     if not known:
         free(j.made.marks)
         free(j.made.numbers)
@@ -235,76 +253,291 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     return result(&j, p, impulse, results) if j.solved or j.spent else None
 
 
-cdef class Batch:
-    """Problems and what came of them; of what is worked out of their data the error of doing nothing stays with it.
+cdef enum:                      # what is known of a world when it is done, rows of `Worlds.numbers`
+    RELATIVE = 0
+    ENERGY = 1                  # sqrt J
+    SPEED = 2                   # m/s
+    FLOOR = 3
+    START_ENERGY = 4            # of doing nothing
+    START_SPEED = 5
+    START_RELATIVE = 6
+    RHS_ENERGY = 7              # of b
+    N_NUMBERS = 8
+
+
+#: Columns of `at`, by their names.
+PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "mass": MASS, "free": FREE, "target": TARGET,
+         "soft": SOFT, "mu": MU, "block": BLOCK, "cone_row": CONE_ROW, "row": AT_ROW, "velocity": VELOCITY}
+
+
+#: Rows of `Worlds.numbers` and codes of worlds by their names.
+NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "start_energy": START_ENERGY,
+          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY}
+CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE}
+
+
+cdef enum:                      # what `Hand` says in the place of a world's number
+    DONE_ALL = -1
+    LISTEN = -2                 # to the clock
+
+
+cdef class Worlds:
+    """Problems in generalised coordinates, each made of a few arrays when its turn comes, or given; and what came of them.
+
+    `numbers` (N_NUMBERS, n) are those of the judge, `worst` (n,) his worst row, `counts` (n, 4) as of `Newton.run`; `code`
+    (n,) is LEFT, READY or BAD. `impulse` and `velocity` hold the worlds' one after the other, in the places that `at` says.
 
     Parameters
     ----------
-    data : list of Data
-        In generalised coordinates, each of a problem of at least one row.
-    starts : list of (m,) N s or None
-        None: from doing nothing.
-    limits : Limits
-    stop : (1,) bytes
-        What is not begun when it becomes nonzero is left to the caller: Ctrl-C comes to another thread than this.
+    data : list of Data or None
+        Of problems that are objects; None of one that is left to the caller. Starts come with it: (m,) [N s] or None.
+    at : (n, PLACES) int64
+        Of arrays, as in `world.pxd`; of objects its columns ROWS and ROW alone.
+    arrays : sequence of 6
+        J, M, v*, target, compliance, mu (or None), flat float64 or float32.
+    strides : (int, int)
+        Numbers from one row to the next of J and of M, 0: as many as velocities.
+    impulse, velocity : float64
+        Of the results; of arrays the impulse holds the starts, unless `cold`.
     """
 
-    cdef job_t* jobs
-    cdef list data
-    cdef object impulses, both
+    cdef job_t* jobs            # of objects
+    cdef worlds_t w
+    cdef int64_t taken
+    cdef bint cold
+    cdef readonly object numbers, worst, counts, code, impulse, velocity
+    cdef list keep
+    cdef double* lam
+    cdef double* v
+    cdef double* number
+    cdef int32_t* worst_at
+    cdef int32_t* count
+    cdef signed char* code_at
 
-    def __init__(self, list data, list starts, double tol, Limits limits, const unsigned char[::1] stop):
-        cdef Py_ssize_t i, end, done = 0, at = 0, n = len(data)
-        cdef room_t room = room_t(0, 0, NULL, NULL)
+    def __init__(self, const int64_t[:, ::1] at, double[::1] impulse, double[::1] velocity, bint cold):
+        cdef Py_ssize_t n = at.shape[0]
+        self.impulse, self.velocity, self.cold = impulse.base, velocity.base, cold
+        self.numbers, self.worst = np.zeros((N_NUMBERS, n + 1)), np.full(n + 1, -1, np.int32)
+        self.counts, self.code = np.zeros((n + 1, 4), np.int32), np.zeros(n + 1, np.int8)
+        cdef double[:, ::1] numbers = self.numbers
+        cdef int32_t[::1] worst = self.worst
+        cdef int32_t[:, ::1] counts = self.counts
+        cdef signed char[::1] code = self.code
+        self.keep = [at]
+        self.w.n = n
+        if n:
+            self.w.at = &at[0, 0]
+        self.lam = &impulse[0] if impulse.shape[0] else NULL
+        self.v = &velocity[0] if velocity.shape[0] else NULL
+        self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
+
+    def of_arrays(self, arrays, strides, Blocks blocks, int law, double asymmetry):
+        """Of arrays, which have passed every check but that of their numbers."""
+        cdef const double[::1] wide
+        cdef const float[::1] narrow
+        cdef int32_t i
+        self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
+        self.w.blocks.law = law
+        self.w.jac_row, self.w.mass_row = strides
+        self.keep += [blocks, *arrays]
+        for i in range(N_ARRAYS):
+            self.w.array[i] = NULL
+            self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
+            if arrays[i] is None or not len(arrays[i]):
+                continue
+            if self.w.narrow[i]:
+                narrow = arrays[i]
+                self.w.array[i] = &narrow[0]
+            else:
+                wide = arrays[i]
+                self.w.array[i] = &wide[0]
+
+    def of_objects(self, list data, list starts):
+        """Of Data, None where one is left to the caller."""
+        cdef int64_t i
         cdef Data p
-        cdef double[::1] whole, measured
-        self.data = data
-        for p in data:
-            at += p.blocks.n_rows
-        self.jobs = <job_t*>calloc(n + 1, sizeof(job_t))
+        self.jobs = <job_t*>calloc(self.w.n + 1, sizeof(job_t))
         if self.jobs == NULL:
-            raise MemoryError(f"{n} problems")
-        self.impulses = whole = np.empty(at + 1)
-        self.both = measured = np.empty(2 * at + n + 1)
-        at = 0
-        try:
-            for i in range(n):
-                p = data[i]
-                take(&self.jobs[i], p, starts[i], &whole[0] + at, &measured[0] + 2 * at + i)
-                at += p.blocks.n_rows
-            while done < n and not stop[0]:
-                end = done + AT_A_TIME if done + AT_A_TIME < n else n
-                with nogil:
-                    while done < end and not stop[0]:
-                        solve_alone(&self.jobs[done], &room, &limits.at, tol)
-                        done += 1
-                PyErr_CheckSignals()
-        finally:
-            free(room.index)
-            free(room.real)
-        for i in range(n):
-            remember(&self.jobs[i], data[i])
+            raise MemoryError(f"{self.w.n} problems")
+        self.keep.append(data)
+        for i in range(self.w.n):
+            p = data[i]
+            if p is not None:
+                take(&self.jobs[i], p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+
+    def remember(self, data):
+        """Doing nothing stays with the data of what was solved."""
+        cdef int64_t i
+        for i in range(self.w.n):
+            if self.code_at[i] == READY:
+                remember(&self.jobs[i], data[i])
+
+    cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, job_t* j) noexcept nogil:
+        """World i for `solve_job` or for the judge."""
+        cdef const int64_t* at = self.w.at + i * PLACES
+        cdef int32_t code = READY
+        if self.jobs != NULL:
+            j[0] = self.jobs[i]
+            if j.p.n_rows == 0:
+                return LEFT
+        else:
+            code = lay_world(&self.w, i, desk, &j.p, &j.g)
+            j.made.marks, j.made.numbers = NULL, NULL
+            j.begin[0] = -1.0
+            j.solved, j.spent, j.cold, j.lam = False, False, self.cold, self.lam + at[AT_ROW]
+        j.most = INFINITY
+        if not has_room(both, 0, 2 * at[ROWS] + 1):
+            return LEFT
+        j.both = both.real
+        return code
+
+    cdef void keep_result(self, int64_t i, const job_t* j, const desk_t* desk) noexcept nogil:
+        """The judge's numbers, and v+ of arrays."""
+        cdef const int64_t* at = self.w.at + i * PLACES
+        cdef double* v
+        cdef double size
+        cdef int64_t n = self.w.n + 1
+        cdef int32_t k
+        self.number[RELATIVE * n + i], self.number[FLOOR * n + i] = j.relative, j.floor
+        self.number[ENERGY * n + i] = j.score.energy if j.score.finite else INFINITY
+        self.number[SPEED * n + i] = j.score.velocity if j.score.finite else INFINITY
+        for k in range(3):
+            self.number[(START_ENERGY + k) * n + i] = j.begin[k]
+        norms_of_rhs(&j.p, &self.number[RHS_ENERGY * n + i], &size)
+        self.worst_at[i] = j.score.worst
+        for k in range(4):
+            self.count[4 * i + k] = j.counts[k]
+        if self.jobs == NULL:
+            v = self.v + at[VELOCITY]
+            jac_push(&j.g, j.lam, v)
+            tree_solve(&j.g, v)
+            for k in range(j.g.n):
+                v[k] = desk.free[k] + v[k]
+
+    cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
+        """A world without rows, which nothing moves."""
+        memcpy(self.v + self.w.at[i * PLACES + VELOCITY], desk.free,
+               self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
+        return READY
+
+    cdef int32_t solve(self, int64_t i, desk_t* desk, room_t* room, room_t* both, const limits_t* limits, double tol,
+                       double most) noexcept nogil:
+        cdef job_t j
+        cdef int32_t code = self.lay(i, desk, both, &j)
+        if code != READY:
+            return code
+        if j.p.n_rows == 0:
+            return self.empty(i, desk)
+        j.most = most
+        cdef bint known = j.made.marks != NULL
+        solve_job(&j, room, limits, tol)
+        if j.solved:
+            self.keep_result(i, &j, desk)
+        forget(&j, known)
+        if self.jobs != NULL:
+            self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
+        return READY if j.solved else TRIED
+
+    cdef int32_t judge(self, int64_t i, desk_t* desk, room_t* room, room_t* both, bint narrow) noexcept nogil:
+        """The judge alone, beside the floor of float32 where `narrow`; empty rows are left to the caller."""
+        cdef job_t j
+        cdef int32_t k, code = self.lay(i, desk, both, &j), m = j.p.n_rows
+        cdef bint known
+        cdef double* x
+        if code != READY:
+            return code
+        if m == 0:
+            return self.empty(i, desk)
+        known = j.made.marks != NULL
+        code = LEFT
+        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
+                and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
+            code, x = READY, room.real
+            if j.cold:
+                do_nothing(&j.p, j.lam, j.both)
+            begin(&j, x)
+            judge_job(&j, x)
+            for k in range(4):
+                j.counts[k] = 0
+            if narrow:
+                squares32(&j.p, &j.g, &desk.mass, desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
+                for k in range(m):
+                    x[k] += x[m + k] + x[2 * m + k]
+                j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
+            self.keep_result(i, &j, desk)
+        forget(&j, known)
+        return code
 
     def __dealloc__(self):
         free(self.jobs)
 
-    def hand_out(self, type kind, function, common, list at, list made):
-        """Into `made`, at the places `at`, an empty `kind` for each problem solved, which knows how to fill itself.
 
-        Its `_rest` is (function, (common, i)).
+cdef class Hand:
+    """One thread at work on `Worlds`: it takes the next one as long as there is one, by an atomic counter.
+
+    stop : (1,) bytes
+        What is not begun when it becomes nonzero never is: Ctrl-C comes to another thread than this.
+    """
+
+    cdef Worlds worlds
+    cdef room_t room
+    cdef room_t both
+    cdef desk_t desk
+    cdef const unsigned char[::1] stop
+
+    def __init__(self, Worlds worlds, const unsigned char[::1] stop):
+        self.worlds, self.stop, self.desk.n_tree = worlds, stop, -1
+
+    def __dealloc__(self):
+        free(self.room.index)
+        free(self.room.real)
+        free(self.both.index)
+        free(self.both.real)
+        free(self.desk.room.index)
+        free(self.desk.room.real)
+        free(self.desk.tree.index)
+        free(self.desk.tree.real)
+
+    def solve(self, double tol, Limits limits, double most=INFINITY):
+        """Solve worlds until one is left to the caller, which is returned; DONE_ALL where there are no more.
+
+        Without limits every world is left. most : counted cost [ns] of a world at which it is; LISTEN is then returned after
+        each.
         """
-        cdef Py_ssize_t i
-        for i in range(len(at)):
-            if self.jobs[i].solved:
-                x = object.__new__(kind)
-                x.__dict__["_rest"] = (function, (common, i))
-                made[at[i]] = x
+        return self.run(tol, limits, most, 0, False)
 
-    def judged(self, Py_ssize_t i):
-        """What the judge found of problem i, solved, with its impulse (m,) [N s]; and its counts, as `Newton.run`."""
-        cdef job_t* j = &self.jobs[i]
-        cdef Py_ssize_t at = j.lam - self.jobs[0].lam, m = j.p.n_rows
-        impulse = self.impulses[at:at + m].copy()
-        impulse.setflags(write=False)
-        at = j.both - self.jobs[0].both
-        return result(j, self.data[i], impulse, self.both[at:at + 2 * m + 1].copy())
+    def judge(self, bint narrow, bint late=False):
+        """Judge the impulses of worlds until one is left to the caller; narrow: beside the floor of float32.
+
+        late: as what they keep where there was no time to solve.
+        """
+        return self.run(0.0, None, INFINITY, LATE if late else READY, narrow)
+
+    cdef int64_t run(self, double tol, Limits limits, double most, int32_t judges, bint narrow) except? -3:
+        cdef Worlds w = self.worlds
+        cdef const limits_t* at = &limits.at if limits is not None else NULL
+        cdef int64_t i, n = w.w.n
+        cdef int32_t code, done = 0
+        with nogil:
+            while not self.stop[0]:
+                i = lav_add(&w.taken, 1)
+                if i >= n:
+                    return DONE_ALL
+                if judges:
+                    code = w.judge(i, &self.desk, &self.room, &self.both, narrow)
+                    if code == READY:
+                        code = judges
+                elif at == NULL:
+                    code = LEFT
+                else:
+                    code = w.solve(i, &self.desk, &self.room, &self.both, at, tol, most)
+                w.code_at[i] = <signed char>code
+                if code == LEFT or code == TRIED:
+                    return i
+                if most < INFINITY:
+                    return LISTEN
+                done += 1
+                if done % AT_A_TIME == 0:
+                    with gil:
+                        PyErr_CheckSignals()
+        return DONE_ALL

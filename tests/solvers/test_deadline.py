@@ -362,7 +362,8 @@ site = set(sys.modules)  # with what .pth files of other packages load
 import lavender as lv
 
 files = lambda: {name.rpartition(".")[2] for name in sys.modules if name.startswith("lavender.solvers.")}
-print(sorted({"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} & files()), "pathlib" in set(sys.modules) - site)
+others = {"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} & files()
+print(sorted(others), "pathlib" in set(sys.modules) - site)
 before = set(sys.modules)
 lv.solve(lv.Problem.lcp([[2.0]], [1.0]), "jacobi", time_limit=0.01)
 print(sorted(set(sys.modules) - before))

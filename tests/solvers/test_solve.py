@@ -190,7 +190,7 @@ def test_a_set_up_that_was_stopped_begins_again(monkeypatch):
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
 def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
-    n, begun, solve, batch = 2000, [], many.solve, many.Batch
+    n, begun, solve, hand = 2000, [], many.solve, many.Hand
 
     def interrupt():
         begun.append(form)
@@ -202,17 +202,20 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkey
         interrupt()
         return solve(*args, **options)
 
-    def slow_batch(data, starts, tol, limits, stop):
-        interrupt()
-        while not stop[0]:
-            time.sleep(1e-3)
-        found, left = batch(data, starts, tol, limits, stop), [None] * len(data)
-        found.hand_out(lv.Solution, None, None, list(range(len(data))), left)
-        assert left == [None] * len(data)
-        return found
+    class SlowHand:
+        def __init__(self, worlds, stop):
+            self.hand, self.stop = hand(worlds, stop), stop
+
+        def solve(self, *args):
+            if form == "matrix":
+                return self.hand.solve(*args)
+            interrupt()
+            while not self.stop[0]:
+                time.sleep(1e-3)
+            return self.hand.solve(*args)
 
     monkeypatch.setattr(many, "solve", slow)
-    monkeypatch.setattr(many, "Batch", slow_batch)
+    monkeypatch.setattr(many, "Hand", SlowHand)
     problem = (
         TINY
         if form == "matrix"

@@ -1,0 +1,100 @@
+"""What rounding to float32 makes of a slack in generalised coordinates: squares of its changes, entry by entry.
+
+With z_i = M^-1 J_i^T, A_ij = J_j . z_i + theta_i (i = j), x = M^-1 J^T lambda, f = M^2 x^2 + J^T^2 lambda^2, every matrix
+squared entry by entry, and u = 2^-24 (the formulas of lavender/residuals.py):
+
+    impulse     u^2 A^2 lambda^2                                                                          (1)
+    data        u^2 (J^2 x^2 + z^2 f + theta^2 lambda^2 + target^2 + 2 J^2 v*^2),  target = b + J v*      (4)
+    velocities  u^2 A^2 ((J^2 x^2 + b^2 + theta^2 lambda^2) / theta^2 on rows that act), 0 where one is rigid     (5)
+"""
+from libc.math cimport sqrt
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.judge.score cimport relative
+
+
+cdef struct mass_t:             # the lower triangle of M with its diagonal, columns ascending
+    const int32_t* ptr          # (n + 1)
+    const int32_t* idx
+    const double* val
+
+
+cdef inline double square_row(const generalized_t* g, int32_t i, const double* x) noexcept nogil:
+    """(J_i)^2 x"""
+    cdef int32_t q
+    cdef double s = 0.0
+    for q in range(g.jptr[i], g.jptr[i + 1]):
+        s += g.jval[q] * g.jval[q] * x[g.jidx[q]]
+    return s
+
+
+cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
+                           const double* lam, double* impulse, double* data, double* velocities,
+                           double* work) noexcept nogil:
+    """(1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m)."""
+    cdef int32_t i, j, q, k, m = p.n_rows, n = g.n
+    cdef double* x = work
+    cdef double* xx = x + n
+    cdef double* f = xx + n
+    cdef double* z = f + n
+    cdef double* off = z + n
+    cdef double unit = 5.9604644775390625e-08 * 5.9604644775390625e-08, s, seen, soft, target
+    cdef bint rigid = False
+    jac_push(g, lam, x)
+    tree_solve(g, x)
+    for k in range(n):
+        xx[k] = x[k] * x[k]
+        f[k] = 0.0
+    for i in range(m):
+        s = lam[i] * lam[i]
+        for q in range(g.jptr[i], g.jptr[i + 1]):
+            f[g.jidx[q]] += g.jval[q] * g.jval[q] * s
+    for k in range(n):
+        for q in range(mass.ptr[k], mass.ptr[k + 1]):
+            s = mass.val[q] * mass.val[q]
+            f[k] += s * xx[mass.idx[q]]
+            if mass.idx[q] != k:
+                f[mass.idx[q]] += s * xx[k]
+    for i in range(m):
+        seen = square_row(g, i, xx)
+        soft = g.compliance[i] * lam[i]
+        off[i] = 0.0
+        if lam[i] != 0.0 and lam[i] != p.lower[i] and lam[i] != p.upper[i]:
+            rigid |= g.compliance[i] == 0.0
+            off[i] = (seen + p.b[i] * p.b[i] + soft * soft) / (g.compliance[i] * g.compliance[i])
+        target = p.b[i] + jac_row(g, i, free)
+        data[i] = seen + soft * soft + target * target
+    for k in range(n):
+        xx[k] = free[k] * free[k]
+    for i in range(m):
+        for k in range(n):
+            z[k] = 0.0
+        for q in range(g.jptr[i], g.jptr[i + 1]):
+            z[g.jidx[q]] = g.jval[q]
+        tree_solve(g, z)
+        data[i] += 2.0 * square_row(g, i, xx)
+        for k in range(n):
+            data[i] += z[k] * z[k] * f[k]
+        data[i] *= unit
+        impulse[i] = velocities[i] = 0.0
+        for j in range(m):
+            s = jac_row(g, j, z) + (g.compliance[i] if i == j else 0.0)
+            impulse[i] += s * s * (lam[j] * lam[j])
+            if not rigid:
+                velocities[i] += s * s * off[j]
+        impulse[i] *= unit
+        velocities[i] *= unit
+
+
+cdef inline double relative_size(const blocks_t* p, const double* square, double e0, double v0) noexcept nogil:
+    """Changes of w in the judge's two norms beside those of doing nothing; their squares (m) given."""
+    cdef int32_t i
+    cdef double energy = 0.0, velocity = 0.0, v
+    for i in range(p.n_rows):
+        energy += square[i] / p.d[i]
+        v = sqrt(p.nu[i]) * sqrt(p.d[i]) * sqrt(square[i]) / p.d[i]
+        if not v <= velocity:
+            velocity = v
+    return relative(sqrt(energy), velocity, e0, v0)

@@ -1,0 +1,236 @@
+"""One world of many that stand in a few arrays: J and M, dense, in float32 or float64, made what kernels read.
+
+The same numbers as `Generalized` makes of the same arrays: J and the lower triangle of M in compressed rows without
+zeros, M = L^T D L in the order given, b = target - J v*. What `Generalized` would put into another order is left to it.
+"""
+from libc.math cimport INFINITY, fabs, sqrt
+from libc.stdint cimport int32_t, int64_t
+from libc.string cimport memcmp, memcpy
+
+from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.generalized cimport generalized_t, jac_row, tree_factor, tree_pattern
+from lavender_ext.driver.driver cimport room_t
+from lavender_ext.judge.rounding cimport mass_t
+from lavender_ext.judge.score cimport are_numbers
+from lavender_ext.small.room cimport has_room
+
+
+cdef enum:                      # what became of a world
+    LEFT = 0                    # to the caller
+    READY = 1
+    BAD = 2                     # numbers that no problem has
+    TRIED = 3                   # to the caller, after the same compiled call as of one problem
+    LATE = 4                    # its start is judged: there was no time to solve
+
+cdef enum:                      # columns of `at`: how many it has, and where they begin
+    ROWS = 0
+    VELOCITIES = 1
+    BLOCKS = 2
+    JAC = 3                     # in the entries of J,
+    MASS = 4                    # of M,
+    FREE = 5                    # of v*,
+    TARGET = 6                  # of the target,
+    SOFT = 7                    # of the compliance
+    MU = 8                      # and of mu, where it has its own
+    BLOCK = 9                   # in the blocks of all worlds,
+    CONE_ROW = 10               # in their rows,
+    ROW = 11                    # in the impulses
+    VELOCITY = 12               # and in the velocities that are the results
+    PLACES = 13
+
+cdef enum:                      # arrays that may be in float32
+    N_ARRAYS = 6
+
+cdef enum:
+    MESH = 400                  # velocities from which on `Generalized` looks for another order
+
+
+cdef struct worlds_t:
+    int64_t n
+    const int64_t* at           # (n, PLACES)
+    const void* array[N_ARRAYS]     # J, M, v*, target, compliance, mu (NULL: that of the blocks)
+    int32_t narrow[N_ARRAYS]    # in float32
+    int64_t jac_row             # numbers from one row of J to the next, 0: as many as velocities;
+    int64_t mass_row            # of M
+    blocks_t blocks             # of all worlds, or of each
+    double asymmetry            # of sqrt(M_ii M_jj), that M may have
+
+
+cdef struct desk_t:             # of one thread
+    room_t room                 # of the world at hand
+    room_t tree                 # and the pattern of the last M's factor
+    int32_t n_tree              # velocities of that, -1: none
+    mass_t mass                 # of the world at hand
+    double* free
+
+
+cdef inline void widen(const worlds_t* w, int32_t which, int64_t first, int32_t n, double* out) noexcept nogil:
+    cdef int32_t i
+    cdef const float* x = <const float*>w.array[which] + first
+    if w.narrow[which]:
+        for i in range(n):
+            out[i] = x[i]
+    else:
+        memcpy(out, <const double*>w.array[which] + first, n * sizeof(double))
+
+
+cdef inline const double* widened(const worlds_t* w, int32_t which, int64_t first, int32_t m, int32_t n, int64_t* row,
+                                  double* out) noexcept nogil:
+    """A matrix (m, n) where it stands, or from float32 into out (m n); row: numbers from one row to the next."""
+    cdef int32_t i
+    if not row[0]:
+        row[0] = n
+    if not w.narrow[which]:
+        return <const double*>w.array[which] + first
+    for i in range(m):
+        widen(w, which, first + i * row[0], n, out + <int64_t>i * n)
+    row[0] = n
+    return out
+
+
+cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
+                            double* val) noexcept nogil:
+    """J in compressed rows; its entries."""
+    cdef int32_t i, j, q = 0
+    ptr[0] = 0
+    for i in range(m):
+        for j in range(n):
+            if a[j] != 0.0:
+                idx[q] = j
+                val[q] = a[j]
+                q += 1
+        a += row
+        ptr[i + 1] = q
+    return q
+
+
+cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, int32_t n, int32_t* ptr, int32_t* idx,
+                                double* val) noexcept nogil:
+    """The lower triangle of M with its diagonal in compressed rows; its entries, -1 where M is not symmetric."""
+    cdef const double* own = a
+    cdef const double* other
+    cdef int32_t i, j, q = 0
+    cdef double gap, s
+    ptr[0] = 0
+    for i in range(n):
+        other = a + i
+        for j in range(i):
+            if own[j] != 0.0 or other[0] != 0.0:
+                idx[q] = j
+                val[q] = own[j]
+                q += 1
+                if own[j] != other[0]:
+                    gap = fabs(own[j] - other[0])
+                    s = own[i] * a[j * (row + 1)]
+                    if not (gap / sqrt(s) if s > 0.0 else gap) <= allowed:
+                        return -1
+            other += row
+        idx[q] = i
+        val[q] = own[i]
+        q += 1
+        ptr[i + 1] = q
+        own += row
+    return q
+
+
+cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t* idx, generalized_t* g) noexcept nogil:
+    """The pattern of L, that of the world before where M has its entries in the same places; is there room for it?"""
+    cdef int64_t most = <int64_t>n * (n + 1) // 2
+    cdef int32_t* t
+    if not has_room(&d.tree, 6 * <int64_t>n + 2 + 2 * most, 0):
+        return False
+    t = d.tree.index                                    # lptr, parent, scratch (3 n), ptr, idx, lidx
+    g.lptr, g.parent, g.lidx = t, t + n + 1, t + 6 * n + 2 + most
+    if d.n_tree == n and memcmp(t + 5 * n + 1, ptr, (n + 1) * sizeof(int32_t)) == 0 \
+            and memcmp(t + 6 * n + 2, idx, ptr[n] * sizeof(int32_t)) == 0:
+        return True
+    d.n_tree = n
+    memcpy(t + 5 * n + 1, ptr, (n + 1) * sizeof(int32_t))
+    memcpy(t + 6 * n + 2, idx, ptr[n] * sizeof(int32_t))
+    tree_pattern(n, ptr, idx, <int32_t>most, t, <int32_t*>g.lidx, <int32_t*>g.parent, t + 2 * n + 1, t + 3 * n + 1,
+                 t + 4 * n + 1)
+    return True
+
+
+cdef inline bint is_ordered(const generalized_t* g, int32_t entries) noexcept nogil:
+    """Would `Generalized` look for an order with less fill? As `_worth_ordering` of lavender/generalized.py."""
+    cdef int32_t i, c
+    cdef double work = 0.0
+    if g.lptr[g.n] <= entries - g.n:
+        return False
+    for i in range(g.n):
+        c = g.lptr[i + 1] - g.lptr[i]
+        work += 0.5 * c * (c + 1.0)
+    return 40.0 * work > 4e5 + 130.0 * entries
+
+
+cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t* p, generalized_t* g) noexcept nogil:
+    """World i on the desk; READY, BAD or LEFT."""
+    cdef const int64_t* at = w.at + i * PLACES
+    cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
+    cdef int64_t whole = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
+    cdef int64_t numbers = whole + 2 * half + 4 * n + 2 * m + k + 1, wide = whole if m > n else <int64_t>n * n
+    cdef const double* a
+    cdef int32_t* ptr
+    cdef int32_t* idx
+    cdef double* x
+    cdef double* b
+    if n >= MESH or not has_room(&d.room, m + 1 + whole + n + 1 + half + k + 1, numbers + wide):
+        return LEFT
+    ptr, x = d.room.index, d.room.real
+    idx = ptr + m + 1
+    g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
+    a = widened(w, 0, at[JAC], m, n, &row, x + numbers)
+    entries = rows_of(a, row, m, n, ptr, idx, x)
+    if not are_numbers(x, entries):
+        return BAD
+    ptr, x = idx + whole, x + whole
+    idx = ptr + n + 1
+    row = w.mass_row
+    a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
+    entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
+    if entries < 0 or not are_numbers(x, entries):
+        return BAD
+    d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
+    if not tree_of(d, n, ptr, idx, g):
+        return LEFT
+    if is_ordered(g, entries):
+        return LEFT
+    x += half
+    g.lval, g.inv_pivot, g.root = x, x + half, x + half + n
+    if tree_factor(n, ptr, idx, d.mass.val, g.lptr, g.lidx, x, <double*>g.root, <double*>g.inv_pivot) >= 0:
+        return BAD
+    for j in range(n):
+        (<double*>g.root)[j] = sqrt(g.inv_pivot[j])
+    x += half + 2 * n
+    d.free, b, g.compliance = x, x + n, x + n + m
+    widen(w, 2, at[FREE], n, d.free)
+    widen(w, 3, at[TARGET], m, b)
+    widen(w, 4, at[SOFT], m, <double*>g.compliance)
+    for j in range(m):
+        if not 0.0 <= g.compliance[j] < INFINITY:
+            return BAD
+        b[j] -= jac_row(g, j, d.free)
+    if not are_numbers(d.free, n) or not are_numbers(b, m):
+        return BAD
+    lay_blocks(w, at, p, idx + half, x + n + 2 * m)
+    p.b = b
+    for j in range(k):
+        if not 0.0 <= p.mu[j] < INFINITY:
+            return BAD
+    return READY
+
+
+cdef inline void lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, int32_t* ptr, double* mu) noexcept nogil:
+    """Its blocks, whose rows count from 0, with its own mu where it has one."""
+    cdef const blocks_t* all = &w.blocks
+    cdef int32_t k, first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
+    p[0] = all[0]
+    p.n_rows, p.n_blocks = <int32_t>at[ROWS], <int32_t>at[BLOCKS]
+    for k in range(p.n_blocks + 1):
+        ptr[k] = all.ptr[block + k] - first
+    p.ptr, p.kind, p.lower, p.upper = ptr, all.kind + block, all.lower + first, all.upper + first
+    p.mu, p.patch_radius, p.rolling = all.mu + block, all.patch_radius + block, all.rolling + block
+    if w.array[5] != NULL:
+        widen(w, 5, at[MU], p.n_blocks, mu)
+        p.mu = mu

@@ -1,0 +1,119 @@
+"""Many states of MuJoCo in arrays: the problems and answers of one at a time, in float64 and in float32."""
+
+import numpy as np
+import pytest
+from mujoco_scene import mj, scene
+
+import lavender as lv
+from lavender.io import mujoco as single
+
+
+def states_of(model, n, steps=40, seed=0):
+    rng, out, data = np.random.default_rng(seed), [], mj.MjData(model)
+    while len(out) < n:
+        mj.mj_resetData(model, data)
+        data.qvel[:] = 0.5 * rng.standard_normal(model.nv)
+        for _ in range(int(rng.integers(1, steps))):
+            mj.mj_step(model, data)
+        out.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(out)
+
+
+def forwarded(model, state):
+    data = mj.MjData(model)
+    data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
+    mj.mj_forward(model, data)
+    return data
+
+
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+@pytest.mark.parametrize(
+    ("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3), ("elliptic", 1)]
+)
+def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
+    model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim, jacobian=jacobian))
+    states = states_of(model, 6)
+    batch, impulse = lv.io.from_mujoco_many(model, states, threads=2)
+    found = lv.residual_many(batch, impulse)
+    for i, state in enumerate(states):
+        data = forwarded(model, state)
+        problem = lv.io.from_mujoco(model, data)
+        own = batch[i]
+        # Rows of an equality are blocks of their own here, and a normal alone is a row: the same bounds.
+        for name in ("lower", "upper", "friction_rows"):
+            assert getattr(own.cones, name).tolist() == getattr(problem.cones, name).tolist(), name
+        assert own.cones.mu[own.cones.mu > 0.0].tolist() == problem.cones.mu[problem.cones.mu > 0.0].tolist()
+        # Sums of a few terms in another order.
+        size = abs(problem.generalized.jac).max()
+        assert abs(own.generalized.jac - problem.generalized.jac).max() <= 1e-13 * size
+        np.testing.assert_allclose(own.b, problem.b, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(own.compliance, problem.compliance, rtol=1e-12)
+        np.testing.assert_allclose(
+            own.generalized.mass.toarray(), problem.generalized.mass.toarray(), rtol=1e-12, atol=1e-15
+        )
+        one = lv.residual(problem, single.impulse(model, data))
+        assert found.velocity_error[i] == pytest.approx(one.velocity, rel=1e-3, abs=1e-9)
+
+
+def stacked(model, states, dtype):
+    """Arrays as MJX and Warp hold them: room for the most rows of all, in float32."""
+    datas = [forwarded(model, s) for s in states]
+    m, n, nv = max(d.nefc for d in datas) + 3, len(datas), model.nv
+    jac = np.zeros((n, m, nv), dtype)
+    of = np.zeros((n, m), int)
+    rows = {name: np.ones((n, m), dtype) for name in ("efc_D", "efc_aref", "efc_frictionloss", "efc_force")}
+    mass, contacts = np.zeros((n, nv, nv)), [[], [], [], []]
+    for i, d in enumerate(datas):
+        jac[i, : d.nefc], of[i, : d.nefc] = d.efc_J.reshape(-1, nv), d.efc_type
+        for name, x in rows.items():
+            x[i, : d.nefc] = getattr(d, name)
+        mj.mj_fullM(model, d, mass[i])
+        for c in range(d.ncon):
+            parts = (i, d.contact.efc_address[c], d.contact.dim[c], d.contact.friction[c])
+            for held, x in zip(contacts, parts, strict=True):
+                held.append(x)
+    each = {
+        name: np.array([getattr(d, name) for d in datas]).astype(dtype)
+        for name in ("qvel", "qacc_smooth", "qfrc_smooth")
+    }
+    return {
+        "efc_J": jac, "efc_type": of, **rows, "M": mass.astype(dtype), **each, "timestep": model.opt.timestep,
+        "nefc": [d.nefc for d in datas], "contacts": tuple(np.array(x) for x in contacts),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("cone", "condim"), [("elliptic", 3), ("elliptic", 6), ("pyramidal", 3)])
+def test_arrays_in_float32_are_judged_by_their_own_floor(cone, condim):
+    model = mj.MjModel.from_xml_string(scene(cone=cone, condim=condim))
+    states = states_of(model, 12)
+    exact, rough = (lv.io.from_efc(**stacked(model, states, dtype)) for dtype in (np.float64, np.float32))
+    assert (exact.batch.precision, rough.batch.precision) == ("float64", "float32")
+    ragged = lv.io.from_mujoco_many(model, states)
+    want = lv.residual_many(ragged.batch, ragged.impulse)
+    got = lv.residual_many(exact.batch, exact.impulse)
+    np.testing.assert_allclose(got.velocity_error, want.velocity_error, rtol=1e-3, atol=1e-9)
+    answered = lv.residual_many(rough.batch, rough.impulse)
+    early = lv.residual_many(rough.batch, 0.9 * rough.impulse)
+    assert np.isin(answered.verdict, ["at its floor", "close enough"]).mean() >= 0.9
+    assert (early.verdict == "stopped early").mean() >= 0.9
+    assert lv.solve_many(rough.batch, tol=1e-6).success.all()
+
+
+def test_arrays_that_do_not_fit_say_so():
+    model = mj.MjModel.from_xml_string(scene())
+    given = stacked(model, states_of(model, 3), np.float32)
+    with pytest.raises(lv.InputError, match="contacts= is needed"):
+        lv.io.from_efc(**given | {"contacts": None})
+    stiff, mass = given["efc_D"].copy(), given["M"].copy()
+    stiff[1, 2] = 0.0
+    mass[2] *= 1.01
+    with pytest.raises(lv.InputError, match="efc_D of world 1, row 2"):
+        lv.io.from_efc(**given | {"efc_D": stiff})
+    with pytest.raises(lv.CapabilityError, match="world 2: M qacc_smooth"):
+        lv.io.from_efc(**given | {"M": mass})
+    with pytest.raises(lv.InputError, match="contacts name"):
+        lv.io.from_efc(**given | {"contacts": tuple(x[:-1] for x in given["contacts"])})
+    with pytest.raises(lv.InputError, match="numbers each"):
+        lv.io.from_mujoco_many(model, np.zeros((2, 3)))
+    with pytest.raises(lv.InputError, match="MjModel is needed"):
+        lv.io.from_mujoco_many(None, np.zeros((2, 3)))
