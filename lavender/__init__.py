@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from lavender import bench, engine, io, motion, phenomena, report, scene, suite
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
     from lavender.many import solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
 # Public name -> module that holds it; the module itself where both are the same.
 _LATER = {
     "CrossCheck": "lavender.check",
+    "Derivative": "lavender.gradient",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
     "Plan": "lavender.plan",
@@ -72,6 +74,8 @@ _LATER = {
     "Suspicion": "lavender.suspicions",
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
+    "derivative": "lavender.gradient",
+    "derivatives": "lavender.gradient",
     "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
     "explain": "lavender.plan",
@@ -100,6 +104,7 @@ __all__ = [
     "Claim",
     "Cones",
     "CrossCheck",
+    "Derivative",
     "Generalized",
     "InUse",
     "InputError",
@@ -126,6 +131,8 @@ __all__ = [
     "available",
     "bench",
     "cross_check",
+    "derivative",
+    "derivatives",
     "diagnose",
     "engine",
     "explain",

@@ -14,6 +14,7 @@ from lavender._arrays import FloatArray, read_only, table_of
 from lavender.errors import InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
+from lavender.states import State, States, states_of
 
 if TYPE_CHECKING:
     from lavender.motion import MotionError
@@ -213,6 +214,26 @@ class Solution:
     def slack(self) -> FloatArray:
         """w = A lambda - b (m,) [m/s], recomputed by the judge."""
         return self.residual.slack
+
+    @property
+    def states(self) -> States:
+        """What each block does, a sequence: open, sticks, slides, at a bound or free, and how far the next state is."""
+        kept = self.__dict__
+        if "_states" not in kept:
+            kept["_states"] = states_of(self.residual._problem, self.impulse, self.residual)
+        found: States = kept["_states"]
+        return found
+
+    def state(self, i: int) -> State:
+        """What block i does (see `states`).
+
+        Raises
+        ------
+        IndexError
+            No such block.
+        """
+        found: State = self.states[i]
+        return found
 
     @property
     def success(self) -> bool:
