@@ -38,10 +38,9 @@ from lavender.cones import CONTACT_BOX, CONTACT_ELLIPSE, ROW
 from lavender.errors import CapabilityError, InputError
 from lavender.lu import sparse_lu
 from lavender.problem import OPERATORS, Problem, check_problem
-from lavender.residuals import Residual, residual
-from lavender.solution import Solution
-from lavender.states import States, natural_of
-from lavender_ext.core.natural import CASES
+from lavender.residuals import at_floor, residual
+from lavender.states import States, linear_of
+from lavender_ext.derivative.linear import CASES, Linear
 
 if TYPE_CHECKING:
     from lavender.motion import Motions
@@ -210,9 +209,19 @@ class Gradient:
         along it counts.
     """
 
-    def __init__(self, of: Derivative, q: FloatArray, s: FloatArray, y: FloatArray | None) -> None:
-        self._of, self._q, self._s, self._y = of, q, s, y
+    def __init__(
+        self,
+        of: Derivative,
+        q: FloatArray,
+        s: FloatArray,
+        y: FloatArray | None,
+        c: FloatArray | None,
+        moved: tuple[FloatArray, ...] | None = None,  # v_free, p
+    ) -> None:
+        self._of, self._q, self._s, self._y, self._c = of, q, s, y, c
         self._kept: dict[str, Any] = {}
+        if moved is not None:
+            self._kept["v_free"], self.__dict__["_p"] = moved
 
     def __getattr__(self, name: str) -> Any:
         if name not in INPUTS:
@@ -239,11 +248,22 @@ class Gradient:
         found = -(o.problem.jacobian.T @ self._s)
         return (found if self._y is None else self._y + found).reshape(o._shape)
 
+    @cached_property
+    def _pull(self) -> FloatArray:
+        # by an impulse that is moved and held: c + A^T-part of what its push changes
+        o, c = self._of, 0.0 if self._c is None else self._c
+        matrix, compliance = o.problem.matrix, o.problem.compliance
+        if matrix is not None:
+            return np.asarray(c - matrix.T @ self._s)
+        assert compliance is not None
+        return np.asarray(c + o.problem.jacobian @ self._p - compliance * self._s)
+
     def _by_lower(self, acts: int = LOW) -> FloatArray:
         o = self._of
-        c, case, pull = o.problem.cones, o._natural.case, o._root * self._q
+        c, case = o.problem.cones, o._linear.case
         bound = (case == LOW) | (case == HIGH)
-        return np.where(bound & (c.lower == c.upper), 0.5 * pull, np.where(case == acts, pull, 0.0))
+        half = 0.5 * self._pull
+        return np.where(bound & (c.lower == c.upper), half, np.where(case == acts, self._pull, 0.0))
 
     def _by_upper(self) -> FloatArray:
         return self._by_lower(HIGH)
@@ -251,10 +271,10 @@ class Gradient:
     @cached_property
     def _reach(self) -> FloatArray:
         o = self._of
-        e = o._natural.times(self._q, True, True)
+        e = o._linear.times(self._q, True, True)
         if o.problem.cones.has_ellipse:
             rows, own, through = o._axes
-            e[rows] = own * self._q[rows] - through * o._natural.times(self._q, True)[rows]
+            e[rows] = own * self._q[rows] - through * o._linear.times(self._q, True)[rows]
         return e
 
     def _by_mu(self) -> FloatArray:
@@ -344,29 +364,50 @@ class Derivative:
     Made by `lavender.derivative`.
     """
 
-    def __init__(self, problem: Problem, impulse: FloatArray, found: Residual) -> None:
-        self.problem = problem
-        self._impulse, self._found = impulse, found
-        self._natural = n = natural_of(problem, impulse, found.slack)
-        self._root: FloatArray = n.root if not problem.cones.has_ellipse else n.root / problem.cones.stretch
-        self._places = np.flatnonzero(n.place >= 0)
-        self._shape = (
-            (problem.m,) if problem.matrix is not None else (-1, 6) if problem.rows is not None else (-1,)
-        )
+    def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
+        self.problem, self._impulse, self._linear = problem, impulse, linear
+        disk = problem.disk
+        self._regular = linear.prepare(disk.csr_data if disk.generalized is None else disk.metric)
+
+    @cached_property
+    def _root(self) -> FloatArray:
+        root: FloatArray = self._linear.root
+        return root / self.problem.cones.stretch if self.problem.cones.has_ellipse else root
+
+    @cached_property
+    def _slack(self) -> FloatArray:
+        w: FloatArray = self._linear.slack
+        return w / self.problem.cones.stretch if self.problem.cones.has_ellipse else w
+
+    @cached_property
+    def _places(self) -> Any:
+        return np.flatnonzero(self._linear.place >= 0)
+
+    @cached_property
+    def _shape(self) -> tuple[int, ...]:
+        return (-1, 6) if self.problem.rows is not None else (-1,)
 
     @cached_property
     def _system(self) -> _System:
-        n, p = self._natural, self.problem
+        """Where the kernel has no factor: many rows, or rows that repeat others."""
+        n, p = self._linear, self.problem
         if n.rows <= DENSE:
-            data = p.metric if p.generalized is not None else p.csr_data
-            return _System(n.system(data, self._root), lambda: self._p_matrix().toarray(), n.rows)
+            return _System(n.matrix(), lambda: self._p_matrix().toarray(), n.rows)
         at, scale = self._places, sp.diags_array(1.0 / self._root[self._places])
         pi = self._p_matrix()
         h = scale @ p.csr[at][:, at] @ scale
         return _System(sp.csc_array(sp.eye_array(n.rows) - pi + pi @ h), lambda: pi, n.rows)
 
+    @property
+    def _solver(self) -> Any:
+        return self._linear if self._regular else self._system
+
+    @property
+    def _singular(self) -> bool:
+        return not self._regular and self._system.singular
+
     def _p_matrix(self) -> sp.csr_array:
-        c, n, size = self.problem.cones, self._natural, np.diff(self.problem.cones.ptr)
+        c, n, size = self.problem.cones, self._linear, np.diff(self.problem.cones.ptr)
         single = c.kind == ROW
         rows, cols = [], []
         for i in range(c.n_blocks):
@@ -424,7 +465,7 @@ class Derivative:
         rows = np.flatnonzero(np.repeat(self._parts.ellipse, np.diff(self.problem.cones.ptr)))
         rows = rows[self.problem.cones.friction_rows[rows]]
         root, e = self._root[rows], self.problem.cones.reach[rows]
-        lam, w = self._impulse[rows], self._found.slack[rows]
+        lam, w = self._impulse[rows], self._slack[rows]
         live = e > 0.0
         e = np.where(live, e, 1.0)
         return rows, np.where(live, root * lam / e, 0.0), np.where(live, (root * lam + w / root) / e, 0.0)
@@ -437,8 +478,8 @@ class Derivative:
         """G x = r of all rows."""
         out, at = r.copy(), self._places
         out[at] = 0.0
-        known = self._natural.times(self._a(out / self._root) / self._root) if out.any() else 0.0
-        out[at] = self._system.solve((r - known)[at])
+        known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
+        out[at] = self._solver.solve((r - known)[at])
         return out
 
     # -- both ways -------------------------------------------------------------------------------
@@ -465,28 +506,37 @@ class Derivative:
         p = self.problem
         if velocity is None and impulse is None and slack is None:
             raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
-        c, x, y = np.zeros(p.m), None, None
+        x = y = given = None
         if velocity is not None:
-            jac = p.jacobian  # CapabilityError of a matrix
-            shape = (jac.shape[1] // 6, 6) if p.rows is not None else (jac.shape[1],)
-            y = as_array("velocity", velocity, shape).ravel()
-            c = c + jac @ self._through_mass(y)
+            nv = (
+                p.jacobian.shape[1] if p.generalized is None else p.generalized.nv
+            )  # CapabilityError of a matrix
+            y = as_array("velocity", velocity, (nv // 6, 6) if p.rows is not None else (nv,)).reshape(-1)
+        if impulse is not None:
+            given = as_array("impulse", impulse, (p.m,))
+        c = np.zeros(p.m) if given is None else given.copy()
         if slack is not None:
             x = as_array("slack", slack, (p.m,))
-            c = c + self._a(x, True)
-        if impulse is not None:
-            c = c + as_array("impulse", impulse, (p.m,))
-        scaled, at, q = c / self._root, self._places, np.zeros(p.m)
-        self._refuse_undetermined(scaled[at])
-        q[at] = self._system.solve(scaled[at], True)
-        s = self._natural.times(q, True) / self._root
-        if self._natural.rows < p.m:
-            gone = self._natural.place < 0
-            q[gone] = (scaled - self._a(s, True) / self._root)[gone]
-        return Gradient(self, q, s if x is None else s - x, y)
+            c += self._a(x, True)
+        general = p.generalized
+        if general is not None and self._regular:
+            order, stretch = general.order, p.cones.stretch if p.cones.has_ellipse else None
+            c = c if stretch is None else c * stretch
+            q, s, *moved = self._linear.adjoint(y if y is None or order is None else y[order], c)
+            s = s if stretch is None else s * stretch
+            if x is None:
+                return Gradient(self, q, s, y, given, tuple(map(general._given, moved)))
+            return Gradient(self, q, s - x, y, given)
+        if y is not None:
+            c += p.jacobian @ self._through_mass(y)
+        scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)
+        self._refuse_undetermined(scaled)
+        q[at] = self._solver.solve(scaled, True)
+        s = self._linear.times(q, True) / self._root
+        return Gradient(self, q, s if x is None else s - x, y, given)
 
     def _refuse_undetermined(self, c: FloatArray) -> None:
-        if not self._system.singular:
+        if not self._singular:
             return
         size = float(np.linalg.norm(c))
         if any(abs(float(x @ c)) > UNMOVED * size for x in self._null):
@@ -516,12 +566,12 @@ class Derivative:
         InputError
             A name that this problem has no data of, another shape, numbers that are not finite, or none at all.
         """
-        p, n = self.problem, self._natural
+        p, n = self.problem, self._linear
         given = self._checked(changes)
         r, push = np.zeros(p.m), np.zeros(p.m)  # push: dA lambda - db
         for name in ("b", "target"):
             push -= given.get(name, 0.0)
-        case = self.states.case
+        case = self._linear.case
         for name, at in (("lower", LOW), ("upper", HIGH)):
             if name in given:
                 r += np.where(case == at, self._root * given[name], 0.0)
@@ -560,7 +610,7 @@ class Derivative:
         return Tangent(slack, dv, impulse, self)
 
     def _by_reach(self, de: FloatArray) -> FloatArray:
-        n = self._natural
+        n = self._linear
         if not self.problem.cones.has_ellipse:
             return n.times(de, False, True)
         rows, own, through = self._axes
@@ -601,7 +651,7 @@ class Derivative:
 
     @cached_property
     def _null(self) -> FloatArray:
-        return self._system.probes(False)
+        return self._system.probes(False) if self._singular else np.zeros((0, self._linear.rows))
 
     @cached_property
     def unique(self) -> Unique:
@@ -617,16 +667,16 @@ class Derivative:
             impulse &= np.abs(x) <= UNMOVED * size
             slack &= moved <= UNMOVED * size
             velocity = velocity and bool(moved.max() <= UNMOVED * size)
-        for q in self._system.probes(True):
+        for q in self._system.probes(True) if self._singular else ():
             x = np.zeros(m)
             x[at] = q
-            target &= np.abs(self._natural.times(x, True)) <= UNMOVED * np.abs(x).max()
+            target &= np.abs(self._linear.times(x, True)) <= UNMOVED * np.abs(x).max()
         return Unique(impulse, slack, velocity, target, p)
 
     @cached_property
     def states(self) -> States:
         """What each block does; `within` is how far Newton's next step would move it, and rounding."""
-        n, p = self._natural, self.problem
+        n, p = self._linear, self.problem
         with np.errstate(all="ignore"):
             size = np.abs(self._a_of_sizes()) + np.abs(p.b)
             rounding = U * size / self._root * np.random.default_rng(0).choice([-1.0, 1.0], p.m)
@@ -834,14 +884,16 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     """
     check_problem(problem)
     x = problem.impulse_array(getattr(solution, "impulse", solution))
-    judged = isinstance(solution, Solution) and solution.residual._problem is problem
-    found: Residual = solution.residual if judged else residual(problem, x, "float64")
-    if not (found.relative <= ACCEPTED or found.at_floor or (found.nothing_to_do and found.rounds)):
-        raise InputError(
-            f"this is no solution of this problem: its relative residual is {found.relative:.2e}; a derivative needs "
-            f"{ACCEPTED:g} or the floor ({found.floor:.1e}): solve with tol=1e-10, or give the problem that it solves"
-        )
-    return Derivative(problem, x, found)
+    linear = linear_of(problem, x)
+    if not (linear.relative <= ACCEPTED or at_floor(linear.relative, linear.floor)):
+        found = residual(problem, x, "float64")
+        if not (found.nothing_to_do and found.rounds):
+            raise InputError(
+                f"this is no solution of this problem: its relative residual is {found.relative:.2e}; a derivative "
+                f"needs {ACCEPTED:g} or the floor ({found.floor:.1e}): solve with tol=1e-10, or give the problem that "
+                "it solves"
+            )
+    return Derivative(problem, x, linear)
 
 
 def derivatives(problems: Iterable[Problem], solutions: Iterable[Any]) -> list[Derivative]:

@@ -1,6 +1,6 @@
 """What each block of a problem does at an answer: open, sticks, slides, at a bound or free, and how far the next is.
 
-The cases are those of the judge's map (`lavender_ext/core/natural.pxd`): y = lambda - w / d decides.
+The cases are those of the judge's map (`lavender_ext/derivative/natural.pxd`): y = lambda - w / d decides.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ import numpy as np
 
 from lavender._arrays import FloatArray, whole_number
 from lavender.problem import Problem
-from lavender.residuals import Residual
-from lavender_ext.core.natural import CASES, Natural
-from lavender_ext.core.problem import LAWS
+from lavender.residuals import Residual, reference
+from lavender_ext.derivative.linear import CASES, Linear
 
-__all__ = ["State", "States", "natural_of"]
+__all__ = ["State", "States", "linear_of"]
 
 NAMES = ("open", "closed", "sticks", "slides", "free", "at a bound", "at a bound")  # by the kernels' numbers
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
@@ -49,19 +48,19 @@ class States(Sequence[State]):
     Parameters
     ----------
     problem : Problem
-    natural : Natural
-        As `natural_of` makes it.
+    linear : Linear
+        As `linear_of` makes it.
     within : (m,) N s
         Error of each row's impulse.
     """
 
-    def __init__(self, problem: Problem, natural: Natural, within: FloatArray) -> None:
+    def __init__(self, problem: Problem, linear: Linear, within: FloatArray) -> None:
         cones = problem.cones
-        self.case: Any = natural.case  # (m,) int8, case of each row by the kernels' numbers
+        self.case: Any = linear.case  # (m,) int8, case of each row by the kernels' numbers
         self._ptr = cones.ptr
         first = cones.ptr[:-1]
         if len(first):
-            self.margin: FloatArray = np.minimum.reduceat(natural.margin, first)  # (k,) N s
+            self.margin: FloatArray = np.minimum.reduceat(linear.margin, first)  # (k,) N s
             self.within: FloatArray = np.maximum.reduceat(within, first)  # (k,) N s
             # A contact slides where some part does, a joint is at a bound where some row is.
             self._code = np.maximum.reduceat(self.case, first)
@@ -95,13 +94,12 @@ class States(Sequence[State]):
         return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
 
 
-def natural_of(problem: Problem, impulse: FloatArray, slack: FloatArray) -> Natural:
-    """The natural map at an impulse (m,) [N s] with its slack (m,) [m/s]; ellipses as their disks."""
-    disk = problem.disk
-    if disk is not problem:
-        stretch = problem.cones.stretch
-        impulse, slack = impulse / stretch, slack * stretch
-    return Natural(disk.cones._blocks, LAWS[problem.friction], disk.d, impulse, slack)
+def linear_of(problem: Problem, impulse: FloatArray) -> Linear:
+    """An impulse (m,) [N s], judged and linearised, which must not change any more; of ellipses as their disks."""
+    data = problem.disk.metric
+    if data.start_energy < 0.0:
+        reference(problem.disk)
+    return Linear(data, problem.on_disk(impulse))
 
 
 def states_of(problem: Problem, impulse: FloatArray, found: Residual) -> States:
@@ -112,6 +110,4 @@ def states_of(problem: Problem, impulse: FloatArray, found: Residual) -> States:
         hidden = found.floor * np.minimum(
             found.energy_start / np.sqrt(metric.d), found.velocity_start / metric.weight
         )
-    return States(
-        problem, natural_of(problem, impulse, found.slack), np.abs(found.error) + np.nan_to_num(hidden)
-    )
+    return States(problem, linear_of(problem, impulse), np.abs(found.error) + np.nan_to_num(hidden))

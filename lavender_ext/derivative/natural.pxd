@@ -133,6 +133,37 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
             edge[k * n + first] *= root[first] / root[0]
 
 
+cdef inline void natural_all(const blocks_t* b, const double* lam, const double* w, int32_t* at,
+                             const natural_t* out) noexcept nogil:
+    """(1) and (2) of every block; `at` (k + 1) are the places of `out`."""
+    cdef int32_t i, j, k, n
+    at[0] = 0
+    for i in range(b.n_blocks):
+        j = b.ptr[i]
+        n = b.ptr[i + 1] - j
+        at[i + 1] = at[i] + (n if b.kind[i] == ROW else n * n)
+        if b.kind[i] != ROW:
+            natural_contact(b, i, lam, w, out)
+            continue
+        for k in range(n):
+            out.root[j + k] = sqrt(b.d[j + k])
+            natural_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
+                        out.margin + j + k, out.case_ + j + k, out.p + at[i] + k)
+            out.edge[at[i] + k] = 0.0
+
+
+cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* place) noexcept nogil:
+    """Rows of G that (3) leaves: those of closed contacts, and rows between their bounds; how many."""
+    cdef int32_t i, j, n = 0
+    for i in range(b.n_blocks):
+        for j in range(b.ptr[i], b.ptr[i + 1]):
+            place[j] = -1
+            if x.case_[b.ptr[i]] != OPEN and x.case_[j] != LOW and x.case_[j] != HIGH:
+                place[j] = n
+                n += 1
+    return n
+
+
 cdef inline void block_times(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint back,
                              double* out) noexcept nogil:
     """out (m) = values v of all blocks, or with `back` of their transposes."""
