@@ -167,10 +167,10 @@ cdef class Linear:
         if y_ is not None:
             y = y_
             given = &y[0] if n else NULL
-        if m and n:
+        if n:
             with nogil:
                 lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, given,
-                            &c[0], &out[0], &out[m], &out[2 * m], &out[2 * m + n])
+                            &c[0] if m else NULL, &out[0], &out[m], &out[2 * m], &out[2 * m + n])
         return out_[:m], out_[m:2 * m], out_[2 * m:2 * m + n], out_[2 * m + n:2 * (m + n)]
 
     def times(self, v_, bint back=False, bint edge=False):

@@ -82,3 +82,185 @@ def test_gradients_are_the_adjoint_of_directions(kind, law, operator):
             pairs = [(getattr(g, key), x) for key, x in named(name, change).items()]
         told = sum(float(np.sum(a * b)) for a, b in pairs)
         assert told == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
+
+
+# -- states ------------------------------------------------------------------------------------------------------
+
+
+def test_states_of_one_contact_pushed_harder_and_harder():
+    # mu 0.5, 10 N s of weight, mass 1: it holds up to 5 N s, then slides; lifted it is open
+    told = []
+    for push in (0.0, 4.0, 6.0):
+        p = lv.Problem.contact(np.eye(3), [10.0, push, 0.0], mu=[0.5])
+        state = lv.solve(p, tol=1e-12).state(0)
+        told.append((state.name, round(state.margin, 9), state.border))
+    assert told == [("sticks", 5.0, False), ("sticks", 1.0, False), ("slides", 1.0, False)]
+    lifted = lv.solve(lv.Problem.contact(np.eye(3), [-2.0, 1.0, 0.0], mu=[0.5]), tol=1e-12).state(0)
+    assert (lifted.name, lifted.rows, round(lifted.margin, 9)) == ("open", ("open",) * 3, 2.0)
+    # under the cone law the slide of 1 m/s pulls the contact by 0.5
+    cone = lv.Problem.contact(np.eye(3), [-2.0, 1.0, 0.0], mu=[0.5], friction="cone")
+    assert lv.solve(cone, tol=1e-12).state(0).margin == pytest.approx(1.5)
+
+
+def test_states_of_rows_and_parts():
+    p = lv.Problem.lcp(np.eye(4), [1.0, -1.0, 3.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 2.0, 2.0])
+    solution = lv.solve(p, tol=1e-12)
+    assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
+    assert [s.margin for s in solution.states[:3]] == pytest.approx([1.0, 1.0, 1.0])
+    assert solution.states.borders == (3,) and "on a border" in str(solution.state(3))
+    with pytest.raises(IndexError, match="block 4; there are 4"):
+        solution.state(4)
+    spin = lv.Problem(np.array([10.0, 9.0, 0.0, 0.5]), lv.Cones.contacts(0.5, 2, 1.0), np.eye(4))
+    state = lv.solve(spin, tol=1e-12).state(0)
+    assert (state.name, state.rows) == ("slides", ("closed", "slides", "slides", "sticks"))
+    assert len(lv.solve(lv.Problem.linear(np.zeros((0, 0)), [])).states) == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_fit_impulse_and_slack(kind):
+    # the definition, in NumPy: what is open has no impulse, what sticks no slack, what slides is on its rim
+    law = "cone" if kind == "round" else "coulomb"
+    p = drawn(1, kind, law, "generalized")
+    solution, near = solved(p), 1e-8
+    lam, w, c = solution.impulse, solution.slack, p.cones
+    for i, state in enumerate(solution.states):
+        rows = np.arange(c.ptr[i], c.ptr[i + 1])
+        for j, name in zip(rows, state.rows, strict=True):
+            if name in ("sticks", "free") or (name == "closed" and law == "coulomb"):
+                assert abs(w[j]) < near
+            elif name == "open":
+                assert abs(lam[j]) < near
+            elif name == "at a bound":
+                assert min(abs(lam[j] - c.lower[j]), abs(lam[j] - c.upper[j])) < near
+        if state.name == "slides" and len(rows) == 3 and "box" not in kind:
+            reach = np.where(c.reach[rows[1:]] > 0.0, c.reach[rows[1:]], 1.0)
+            share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
+            assert (
+                share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6)
+                or kind == "smooth"
+            )
+
+
+# -- where it does not exist ------------------------------------------------------------------------------------
+
+
+def table():
+    """A box on four corners, resting: three rows are enough to hold it."""
+    corner = np.array([(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    jac = np.column_stack([np.ones(4), corner[:, 1], -corner[:, 0]])
+    return lv.Problem.from_jacobian(
+        jac, np.eye(3), [-1.0, 0.1, 0.0], cones=lv.Cones.bounded(np.zeros(4), np.full(4, np.inf))
+    )
+
+
+def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
+    p = table()
+    d = lv.derivative(p, lv.solve(p, tol=1e-12))
+    assert not d.unique.impulse.any() and d.unique.slack.all() and d.unique.velocity
+    assert not d.unique.target.any() and not d.exists
+    g = d.vjp(velocity=[1.0, 2.0, 3.0])
+    assert np.abs(g.v_free).max() < 1e-9  # it stays at rest whatever pushes it a little
+    total = d.vjp(impulse=np.ones(4))  # their sum is unique: the weight
+    assert total.v_free == pytest.approx([-1.0, 0.0, 0.0], abs=1e-9)
+    with pytest.raises(
+        lv.CapabilityError, match=r"not unique here: impulse: not of 4 rows \(row 0, row 1, row 2, ..."
+    ):
+        d.vjp(impulse=[1.0, 0.0, 0.0, 0.0])
+    t = d.jvp(v_free=[0.3, 0.2, 0.1])
+    assert np.abs(t.velocity).max() < 1e-9 and np.abs(t.slack).max() < 1e-9
+    with pytest.raises(lv.CapabilityError, match="impulses are not unique here"):
+        _ = t.impulse
+
+
+def test_a_switch_is_flagged_within_the_error_of_the_answer():
+    a = np.array([[2.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    edge = np.array([10.0, 5.0, 0.0])  # N s, on the rim, about to slide
+
+    def push(x):
+        return lv.Problem.contact(a, a @ edge + [0.0, x, 0.0], mu=[0.5])
+
+    for gap, told in ((1e-3, ()), (1e-15, (0,)), (-1e-15, (0,)), (0.0, (0,))):
+        p = push(gap)
+        d = lv.derivative(p, lv.solve(p, tol=1e-13))
+        assert d.switching == told and d.exists == (not told), gap
+    # it slides by 1e-9 m/s: an exact answer sees it, one that is off by as much does not
+    p = push(1e-9)
+    assert lv.derivative(p, lv.solve(p, tol=1e-14)).switching == ()
+    rough = lv.derivative(p, edge + [3e-9, 2e-9, 0.0])
+    assert rough.switching == (0,) and "about to switch" in str(rough)
+    assert rough.distance[0] < 1e-8 and rough.distance_in_errors[0] < 10.0
+
+
+def test_several_motions_are_told():
+    # Painleve's kind: friction and normal couple so that a contact may stick or lift
+    p = lv.Problem.contact(np.array([[1.0, -2.5], [-2.5, 8.0]]), [1.0, -4.0], mu=[1.0])
+    found = lv.motions(p)
+    d = lv.derivative(p, found[0].impulse)
+    assert len(d.motions) == len(found) and d.motions.all == found.all
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------
+
+
+def test_refusals_say_what_came_and_what_to_do():
+    p = lv.Problem.contact(np.eye(3), [10.0, 6.0, 0.0], mu=[0.5])
+    solution = lv.solve(p, tol=1e-12)
+    with pytest.raises(
+        lv.InputError, match=r"relative residual is 1\.\d\de-02.*needs 1e-08 or the floor.*solve with tol"
+    ):
+        lv.derivative(p, solution.impulse * 0.99)
+    other = lv.Problem.contact(np.eye(3), [9.0, 6.0, 0.0], mu=[0.5])
+    with pytest.raises(lv.InputError, match="no solution of this problem"):
+        lv.derivative(other, solution)
+    with pytest.raises(lv.InputError, match=r"impulse \[N s\] has shape \(3,\); \(2,\)"):
+        lv.derivative(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), solution)
+    d = lv.derivative(p, solution)
+    with pytest.raises(lv.InputError, match="b must be finite"):
+        d.jvp(b=[np.nan, 0.0, 0.0])
+    with pytest.raises(lv.InputError, match="impulse must be finite"):
+        d.vjp(impulse=[np.nan, 0.0, 0.0])
+    with pytest.raises(lv.InputError, match="give velocity="):
+        d.vjp()
+    with pytest.raises(lv.InputError, match="give a change of the data: b, lower"):
+        d.jvp()
+    with pytest.raises(lv.InputError, match="'J' is no data of this problem"):
+        d.jvp(J=np.eye(3))
+    with pytest.raises(lv.CapabilityError, match="given as a matrix"):
+        d.vjp(velocity=np.ones(3))
+    g = d.vjp(impulse=np.ones(3))
+    with pytest.raises(lv.CapabilityError, match="J is of problems given as rows or generalized"):
+        _ = g.J
+    with pytest.raises(AttributeError, match="a gradient has no 'weight'"):
+        _ = g.weight
+    p = table()
+    d = lv.derivative(p, lv.solve(p, tol=1e-12))
+    with pytest.raises(lv.InputError, match="the change of M is not symmetric"):
+        d.jvp(M=np.triu(np.ones((3, 3))))
+
+
+def test_an_empty_problem_has_an_empty_derivative():
+    p = lv.Problem.linear(np.zeros((0, 0)), [])
+    d = lv.derivative(p, lv.solve(p))
+    assert d.jvp(b=[]).impulse.shape == (0,) and d.vjp(impulse=[]).b.shape == (0,) and d.exists
+    free = lv.Problem.from_jacobian(np.zeros((0, 2)), np.eye(2), [1.0, 2.0], cones=lv.Cones.free(0))
+    d = lv.derivative(free, lv.solve(free))
+    assert d.vjp(velocity=[3.0, 4.0]).v_free.tolist() == [3.0, 4.0]
+
+
+def test_equal_bounds_move_together():
+    p = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0], [0.25, 0.0], [0.25, np.inf])
+    d = lv.derivative(p, lv.solve(p, tol=1e-13))
+    assert d.exists and d.distance[0] == np.inf
+    t = d.jvp(lower=[1.0, 0.0], upper=[1.0, 0.0])
+    assert t.impulse == pytest.approx([1.0, -0.5])
+    g = d.vjp(impulse=[0.0, 1.0])
+    assert g.lower == pytest.approx([-0.25, 0.0]) and g.upper == pytest.approx([-0.25, 0.0])
+
+
+@pytest.mark.parametrize("name", ["pgs", "newton", "admm", "nncg", "direct"])
+def test_any_solvers_answer_serves(name):
+    p = drawn(2, "bounded", "cone", "dense").boxed(1.0)
+    solution = lv.solve(p, name, tol=1e-9, max_iter=100_000)
+    d, best = lv.derivative(p, solution), lv.derivative(p, solved(p))
+    y = np.random.default_rng(0).standard_normal(p.m)
+    assert d.vjp(impulse=y).b == pytest.approx(best.vjp(impulse=y).b, rel=1e-6, abs=1e-9)
