@@ -5,7 +5,7 @@ Where the equations are of J and M, with cotangents c of lambda and y of v (equa
     G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
 """
 from libc.math cimport fabs
-from libc.stdint cimport int8_t, int32_t
+from libc.stdint cimport int8_t, int32_t, int64_t
 from libc.string cimport memcpy
 
 import numpy as np
@@ -169,9 +169,13 @@ cdef class Linear:
             given = &y[0] if n else NULL
         if n:
             with nogil:
-                lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, given,
-                            &c[0] if m else NULL, &out[0], &out[m], &out[2 * m], &out[2 * m + n])
+                self.back(given, &c[0] if m else NULL, &out[0])
         return out_[:m], out_[m:2 * m], out_[2 * m:2 * m + n], out_[2 * m + n:2 * (m + n)]
+
+    cdef void back(self, const double* y, double* c, double* out) noexcept nogil:
+        cdef int32_t m = self.b.n_rows, n = self.data.general.n
+        lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out, out + m,
+                    out + 2 * m, out + 2 * m + n)
 
     def times(self, v_, bint back=False, bint edge=False):
         """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
@@ -244,3 +248,16 @@ cdef class Linear:
         for i in range(self.b.n_rows):
             out[i] = self.place_[i]
         return out_
+
+
+def adjoint_all(list linears, const int64_t[::1] at_y, const double[::1] y, const int64_t[::1] at_c, double[::1] c,
+                const int64_t[::1] at_out, double[::1] out):
+    """`adjoint` of many, each with J and M and a factor: y, c and what is returned end to end from the places given."""
+    cdef Linear one
+    cdef Py_ssize_t i
+    cdef const double* from_
+    for i in range(len(linears)):
+        one = <Linear>linears[i]
+        from_ = &y[0] + at_y[i] if y.shape[0] else NULL
+        if one.data.general.n:
+            one.back(from_, &c[0] + at_c[i] if c.shape[0] else NULL, &out[0] + at_out[i])

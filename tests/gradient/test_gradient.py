@@ -186,7 +186,7 @@ def test_a_switch_is_flagged_within_the_error_of_the_answer():
     # it slides by 1e-9 m/s: an exact answer sees it, one that is off by as much does not
     p = push(1e-9)
     assert lv.derivative(p, lv.solve(p, tol=1e-14)).switching == ()
-    rough = lv.derivative(p, edge + [3e-9, 2e-9, 0.0])
+    rough = lv.derivative(p, edge + np.array([3e-9, 2e-9, 0.0]))
     assert rough.switching == (0,) and "about to switch" in str(rough)
     assert rough.distance[0] < 1e-8 and rough.distance_in_errors[0] < 10.0
 
@@ -264,3 +264,43 @@ def test_any_solvers_answer_serves(name):
     d, best = lv.derivative(p, solution), lv.derivative(p, solved(p))
     y = np.random.default_rng(0).standard_normal(p.m)
     assert d.vjp(impulse=y).b == pytest.approx(best.vjp(impulse=y).b, rel=1e-6, abs=1e-9)
+
+
+# -- many at once ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_a_batch_is_each_one_alone(operator):
+    problems = [drawn(seed, "disk", "cone", operator) for seed in range(4)]
+    solutions = lv.solve_many(problems, tol=1e-12)
+    together, rng = lv.derivatives(problems, solutions), np.random.default_rng(0)
+    weights = {"impulse": [rng.standard_normal(p.m) for p in problems]}
+    if operator in ("generalized", "bodies"):
+        weights["velocity"] = [
+            rng.standard_normal(p.velocity(s.impulse).shape) for p, s in zip(problems, solutions, strict=True)
+        ]
+    found = together.vjp(**weights)
+    for i, (p, s) in enumerate(zip(problems, solutions, strict=True)):
+        alone = lv.derivative(p, s).vjp(**{name: x[i] for name, x in weights.items()})
+        for name in ("b", "mu", "lower"):
+            assert np.array_equal(getattr(found[i], name), getattr(alone, name)), (i, name)
+        if "velocity" in weights:
+            assert np.array_equal(found[i].full("J"), alone.full("J"))
+    assert (
+        len(together) == 4
+        and together[1].states.names == lv.derivative(problems[1], solutions[1]).states.names
+    )
+
+
+def test_batches_of_another_length_are_refused():
+    p = drawn(0, "disk", "cone", "generalized")
+    s = solved(p)
+    with pytest.raises(lv.InputError, match="1 solutions for 2 problems"):
+        lv.derivatives([p, p], [s])
+    with pytest.raises(lv.InputError, match="problem 1: this is no solution"):
+        lv.derivatives([p, p], [s, 1.1 * s.impulse])
+    with pytest.raises(lv.InputError, match="velocity has 2 cotangents for 1 problems"):
+        lv.derivatives([p], [s]).vjp(velocity=[1, 2])
+    with pytest.raises(lv.InputError, match="a list of them is needed"):
+        lv.derivatives(p, s)
+    assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]) == []
