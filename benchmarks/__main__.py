@@ -14,6 +14,7 @@ NAMES = (
     "auto",
     "branches",
     "constants",
+    "derivatives",
     "engine",
     "film",
     "float32",

@@ -23,7 +23,7 @@ determined.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +40,8 @@ from lavender.lu import sparse_lu
 from lavender.problem import OPERATORS, Problem, check_problem
 from lavender.residuals import at_floor, residual
 from lavender.states import States, linear_of
-from lavender_ext.derivative.linear import CASES, Linear, adjoint_all
+from lavender_ext.core.problem import rows_velocity
+from lavender_ext.derivative.linear import CASES, Linear, adjoint_all, wrench
 
 if TYPE_CHECKING:
     from lavender.motion import Motions
@@ -52,6 +53,7 @@ DENSE = 400  # rows of the system up to which it is dense
 SINGULAR = 1e-12  # least pivot over the largest, from which on rows count as repeating others
 SHIFT = 1e-11  # eps of (6)
 TURNS = 8  # of (6): what is 1e-11 of the diagonal is off by 2^-8 then, what is 1e-9 by 1e-16
+ENOUGH = 1e-14  # of the largest entry, below which a turn changes nothing
 PROBES = 2  # random vectors that show what is not determined
 UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
 MANY = 10.0  # errors of the answer within which a switch counts as one: they are estimates of first order
@@ -98,11 +100,11 @@ class Unique:
 class _System:
     """A factor of G on the rows that are not its identity; solves with it and with its transpose."""
 
-    def __init__(self, g: Any, p: Any, n: int) -> None:
-        self.g, self.n = g, n
-        self.is_dense = isinstance(g, np.ndarray)
-        self.singular = n > 0 and not self._factor(g)
-        if self.singular and not self._factor(g + SHIFT * p()):
+    def __init__(self, shifted: Callable[[float], Any], n: int) -> None:
+        self.g, self.n = shifted(0.0), n
+        self.is_dense = isinstance(self.g, np.ndarray)
+        self.singular = n > 0 and not self._factor(self.g)
+        if self.singular and not self._factor(shifted(SHIFT)):
             raise CapabilityError(
                 f"the equations of this solution's states have no factor, shifted by {SHIFT:g} of their diagonal "
                 "either: an A that is indefinite, or states that are wrong"
@@ -135,7 +137,10 @@ class _System:
         if self.singular:
             g = self.g.T if back else self.g
             for _ in range(TURNS):
-                x = x + self._once(r - g @ x, back)
+                more = self._once(r - g @ x, back)
+                x = x + more
+                if not np.abs(more).max() > ENOUGH * np.abs(x).max():
+                    break
         return x
 
     def probes(self, back: bool) -> FloatArray:
@@ -245,8 +250,8 @@ class Gradient:
 
     def _by_v_free(self) -> FloatArray:
         o = self._of
-        found = -(o.problem.jacobian.T @ self._s)
-        return (found if self._y is None else self._y + found).reshape(o._shape)
+        found = -o._wrench(self._s)
+        return (found if self._y is None else self._y + found).reshape(o._velocities())
 
     @cached_property
     def _pull(self) -> FloatArray:
@@ -256,7 +261,7 @@ class Gradient:
         if matrix is not None:
             return np.asarray(c - matrix.T @ self._s)
         assert compliance is not None
-        return np.asarray(c + o.problem.jacobian @ self._p - compliance * self._s)
+        return np.asarray(c + o._along(self._p) - compliance * self._s)
 
     def _by_lower(self, acts: int = LOW) -> FloatArray:
         o = self._of
@@ -383,20 +388,25 @@ class Derivative:
     def _places(self) -> Any:
         return np.flatnonzero(self._linear.place >= 0)
 
-    @cached_property
-    def _shape(self) -> tuple[int, ...]:
-        return (-1, 6) if self.problem.rows is not None else (-1,)
+    def _velocities(self) -> tuple[int, ...]:
+        """Shape of the velocities; CapabilityError of a matrix."""
+        p = self.problem
+        if p.generalized is not None:
+            return (p.generalized.nv,)
+        if p.rows is None:
+            raise CapabilityError("this problem was given as a matrix; velocities need J and M")
+        return p.rows.n_bodies, 6
 
     @cached_property
     def _system(self) -> _System:
         """Where the kernel has no factor: many rows, or rows that repeat others."""
         n, p = self._linear, self.problem
         if n.rows <= DENSE:
-            return _System(n.matrix(), lambda: self._p_matrix().toarray(), n.rows)
+            return _System(n.matrix, n.rows)
         at, scale = self._places, sp.diags_array(1.0 / self._root[self._places])
-        pi = self._p_matrix()
+        pi, one = self._p_matrix(), sp.eye_array(n.rows)
         h = scale @ p.csr[at][:, at] @ scale
-        return _System(sp.csc_array(sp.eye_array(n.rows) - pi + pi @ h), lambda: pi, n.rows)
+        return _System(lambda shift: sp.csc_array(one - pi + pi @ (h + shift * one)), n.rows)
 
     @property
     def _solver(self) -> Any:
@@ -407,14 +417,14 @@ class Derivative:
         return not self._regular and self._system.singular
 
     def _p_matrix(self) -> sp.csr_array:
-        c, n, size = self.problem.cones, self._linear, np.diff(self.problem.cones.ptr)
-        single = c.kind == ROW
-        rows, cols = [], []
-        for i in range(c.n_blocks):
-            j = np.arange(c.ptr[i], c.ptr[i + 1])
-            rows.append(j if single[i] else np.repeat(j, size[i]))
-            cols.append(j if single[i] else np.tile(j, size[i]))
-        found = sp.csr_array((n.p, (np.concatenate(rows), np.concatenate(cols))), shape=(c.n_rows, c.n_rows))
+        c = self.problem.cones
+        block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
+        alone = (c.kind == ROW)[block]
+        width = np.where(alone, 1, np.diff(c.ptr)[block])
+        indptr = np.concatenate([[0], np.cumsum(width)])
+        first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
+        columns = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], width)
+        found = sp.csr_array((self._linear.p, columns, indptr), shape=(c.n_rows, c.n_rows))
         return sp.csr_array(found[self._places][:, self._places])
 
     # -- products --------------------------------------------------------------------------------
@@ -424,18 +434,36 @@ class Derivative:
         p = self.problem
         if p.generalized is not None:
             return p.generalized.solve(y)
-        return np.asarray(self._minv @ y)
+        rows = p.rows
+        assert rows is not None
+        out, y = np.empty((rows.n_bodies, 6)), y.reshape(-1, 6)
+        out[:, :3] = rows.inv_mass[:, None] * y[:, :3]
+        out[:, 3:] = np.einsum("ijk,ik->ij", rows.inv_inertia, y[:, 3:])
+        return out.ravel()
 
-    @cached_property
-    def _minv(self) -> sp.csr_array:
-        assert self.problem.rows is not None
-        return self.problem.rows.inverse_mass_matrix()
+    def _along(self, v: FloatArray) -> FloatArray:
+        """J v (m,) of velocities (nv,)."""
+        p = self.problem
+        if p.generalized is not None:
+            return p.generalized.velocity_of(v)
+        out = np.empty(p.m)
+        rows_velocity(p.data, v.reshape(-1, 6), out)
+        return out
+
+    def _wrench(self, x: FloatArray) -> FloatArray:
+        """J^T x (nv,)."""
+        p = self.problem
+        if p.rows is None:
+            return np.asarray(p.jacobian.T @ x)
+        out = np.empty((p.rows.n_bodies, 6))
+        wrench(p.data, np.ascontiguousarray(x), out)
+        return out.ravel()
 
     def _moved(self, x: FloatArray) -> FloatArray:
         """M^-1 J^T x (nv,)."""
         if self.problem.generalized is not None:
             return self.problem.generalized.change(np.ascontiguousarray(x))
-        return self._through_mass(self.problem.jacobian.T @ x)
+        return self._through_mass(self._wrench(x))
 
     def _a(self, x: FloatArray, back: bool = False) -> FloatArray:
         """A x, or A^T x."""
@@ -443,7 +471,7 @@ class Derivative:
         if p.matrix is not None:
             return np.asarray((p.matrix.T if back else p.matrix) @ x)
         assert p.compliance is not None
-        return np.asarray(p.jacobian @ self._moved(x) + p.compliance * x)
+        return self._along(self._moved(x)) + p.compliance * x
 
     @cached_property
     def _change(self) -> FloatArray:
@@ -528,9 +556,12 @@ class Derivative:
                 return Gradient(self, q, s, y, given, tuple(map(general._given, moved)))
             return Gradient(self, q, s - x, y, given)
         if y is not None:
-            c += p.jacobian @ self._through_mass(y)
+            c += self._along(self._through_mass(y))
         scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)
-        self._refuse_undetermined(scaled)
+        if (
+            p.matrix is not None or p.law == "coulomb" or impulse is not None
+        ):  # else slacks and velocities are unique
+            self._refuse_undetermined(scaled)
         q[at] = self._solver.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
         return Gradient(self, q, s if x is None else s - x, y, given)
@@ -595,18 +626,18 @@ class Derivative:
         if pulled is not None:
             dv += self._through_mass(pulled)
         if "inv_mass" in given or "inv_inertia" in given:
-            dv += self._bodies.through(given, p.jacobian.T @ self._impulse)
+            dv += self._bodies.through(given, self._wrench(self._impulse))
         if dv is not None and dv.any():
-            push += p.jacobian @ dv
+            push += self._along(dv)
         if "v_free" in given:
             free = given["v_free"].ravel()
-            push += p.jacobian @ free
+            push += self._along(free)
             dv = dv + free
         dz = self._solve(r - n.times(push / self._root))
         impulse = dz / self._root
         slack = self._a(impulse) + push
         if dv is not None:
-            dv = (dv + self._moved(impulse)).reshape(self._shape)
+            dv = (dv + self._moved(impulse)).reshape(self._velocities())
         return Tangent(slack, dv, impulse, self)
 
     def _by_reach(self, de: FloatArray) -> FloatArray:
@@ -799,9 +830,7 @@ class _Bodies:
             out[name] = np.zeros((r.n_contacts, 3))
             np.add.at(out[name], self.i, np.where(still, 0.0, x))
         # dM^-1: v+ has M^-1 J^T lambda, so (y - J^T s) dM^-1 (J^T lambda).
-        jac = o.problem.jacobian
-        left = (0.0 if g._y is None else g._y) - jac.T @ g._s
-        left, right = left.reshape(-1, 6), (jac.T @ o._impulse).reshape(-1, 6)
+        left, right = g.v_free.reshape(-1, 6), o._wrench(o._impulse).reshape(-1, 6)
         out["inv_mass"] = np.einsum("ij,ij->i", left[:, :3], right[:, :3])
         turn = np.einsum("ij,ik->ijk", left[:, 3:], right[:, 3:])
         out["inv_inertia"] = 0.5 * (turn + turn.transpose(0, 2, 1))

@@ -10,9 +10,10 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport ROW, blocks_t
+from lavender_ext.core.block cimport ROW, blocks_t, n_directions, n_turns
 from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
 from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.velocity cimport contact_wrench, joint_wrench
 from lavender_ext.core.view cimport view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
                                               natural_t, place_rows, scaled_csr, scaled_general, system_rows)
@@ -117,7 +118,7 @@ cdef class Linear:
         self.factor = room_for((<Py_ssize_t>n * n) * sizeof(double) + n * sizeof(int32_t))
         self.lu = <double*>self.factor.at
         self.swap = <int32_t*>(self.lu + n * n)
-        self.form(self.lu)
+        self.form(self.lu, 0.0)
         with nogil:
             if lu_factor(n, self.lu, self.swap):
                 for i in range(n):
@@ -127,8 +128,8 @@ cdef class Linear:
         self.regular = least > SINGULAR * most and most > 0.0
         return self.regular
 
-    cdef void form(self, double* g):
-        cdef int32_t n = self.rows
+    cdef void form(self, double* g, double shift):
+        cdef int32_t n = self.rows, i
         cdef Room room = room_for(<Py_ssize_t>n * (n + self.data.general.n) * sizeof(double))
         cdef double* h = <double*>room.at
         with nogil:
@@ -136,14 +137,16 @@ cdef class Linear:
                 scaled_general(&self.data.general, n, self.place_, self.x.root, h + <Py_ssize_t>n * n, h)
             else:
                 scaled_csr(&self.data.csr, self.b.n_rows, n, self.place_, self.x.root, h)
+            for i in range(n):
+                h[<Py_ssize_t>i * n + i] += shift
             system_rows(&self.x, &self.b, n, self.place_, h, g)
 
-    def matrix(self):
-        """G (n, n) on the rows with a place."""
+    def matrix(self, double shift=0.0):
+        """G (n, n) on the rows with a place, of H + shift."""
         out_ = np.empty((self.rows, self.rows))
         cdef double[:, ::1] out = out_
         if self.rows:
-            self.form(&out[0, 0])
+            self.form(&out[0, 0], shift)
         return out_
 
     def solve(self, r, bint back=False):
@@ -261,3 +264,19 @@ def adjoint_all(list linears, const int64_t[::1] at_y, const double[::1] y, cons
         from_ = &y[0] + at_y[i] if y.shape[0] else NULL
         if one.data.general.n:
             one.back(from_, &c[0] + at_c[i] if c.shape[0] else NULL, &out[0] + at_out[i])
+
+
+def wrench(Data p, const double[::1] lam, double[:, ::1] f):
+    """f (n, 6) = J^T lam of bodies."""
+    cdef int32_t i, c, size
+    f[:, :] = 0.0
+    if p.blocks.n_rows == 0 or p.rows.n_bodies == 0:
+        return
+    with nogil:
+        for i in range(p.rows.n_joints):
+            joint_wrench(&p.blocks, &p.rows, i, &lam[0], &f[0, 0])
+        for c in range(p.rows.n_contacts):
+            i = p.rows.n_joints + c
+            size = p.blocks.ptr[i + 1] - p.blocks.ptr[i]
+            contact_wrench(&p.rows, c, n_directions(p.blocks.kind[i], size), n_turns(p.blocks.kind[i], size),
+                           &lam[p.blocks.ptr[i]], &f[0, 0])
