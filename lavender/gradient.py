@@ -536,10 +536,7 @@ class Derivative:
             raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
         x = y = given = None
         if velocity is not None:
-            nv = (
-                p.jacobian.shape[1] if p.generalized is None else p.generalized.nv
-            )  # CapabilityError of a matrix
-            y = as_array("velocity", velocity, (nv // 6, 6) if p.rows is not None else (nv,)).reshape(-1)
+            y = as_array("velocity", velocity, self._velocities()).reshape(-1)
         if impulse is not None:
             given = as_array("impulse", impulse, (p.m,))
         c = np.zeros(p.m) if given is None else given.copy()
@@ -558,9 +555,8 @@ class Derivative:
         if y is not None:
             c += self._along(self._through_mass(y))
         scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)
-        if (
-            p.matrix is not None or p.law == "coulomb" or impulse is not None
-        ):  # else slacks and velocities are unique
+        # Slacks and velocities are unique where A is that of bodies and the law is convex.
+        if p.matrix is not None or p.law == "coulomb" or impulse is not None:
             self._refuse_undetermined(scaled)
         q[at] = self._solver.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
