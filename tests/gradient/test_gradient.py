@@ -304,3 +304,44 @@ def test_batches_of_another_length_are_refused():
     with pytest.raises(lv.InputError, match="a list of them is needed"):
         lv.derivatives(p, s)
     assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]) == []
+
+
+@pytest.mark.parametrize("count", [3, 170])  # dense; sparse
+@pytest.mark.parametrize("law", ["lcp", "cone"])
+def test_contacts_given_twice_move_as_given_once(law, count):
+    rng = np.random.default_rng(count)
+    each, size = (1, 0) if law == "lcp" else (3, 2)
+    jac = np.zeros((each * count, 3 * count + 3))
+    for i in range(count):  # a chain: each contact between neighbours
+        jac[each * i : each * (i + 1), 3 * i : 3 * i + 6] = rng.standard_normal((each, 6))
+    free = rng.standard_normal(jac.shape[1])
+    made = []
+    for times in (1, 2):
+        rows = np.concatenate([jac] * times)
+        cones = lv.Cones.contacts(np.full(count * times, 0.4), size)
+        made.append(lv.Problem.from_jacobian(rows, np.eye(jac.shape[1]), free, cones=cones, friction="cone"))
+    found = [lv.derivative(p, solved(p)) for p in made]
+    assert found[0].unique and not found[1].unique.impulse.all() and found[1].unique.slack.all()
+    closed = [d.states.case[: each * count : each] != 0 for d in found]
+    assert np.array_equal(*closed)
+    assert np.array_equal(
+        found[1].unique.impulse[: each * count : each], ~closed[1]
+    )  # what is open is unique
+    y, push = rng.standard_normal((2, jac.shape[1]))
+    once, twice = (d.vjp(velocity=y).v_free for d in found)
+    assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
+    once, twice = (d.jvp(v_free=push).velocity for d in found)
+    assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
+
+
+def test_many_rows_of_bodies_agree_with_their_adjoint_and_with_differences():
+    p = drawn(0, "disk", "cone", "bodies", 200)
+    assert p.m > 500
+    d, rng = lv.derivative(p, solved(p)), np.random.default_rng(0)
+    y, change = rng.standard_normal((4, 6)), rng.standard_normal((4, 6))
+    moved_by = d.jvp(v_free=change).velocity
+    assert np.sum(d.vjp(velocity=y).v_free * change) == pytest.approx(np.sum(y * moved_by), rel=1e-9)
+    h = 0.1 * float(d.distance.min())
+    ends = [moved(p, "v_free", change, x) for x in (-h, h)]
+    velocities = [q.velocity(solved(q).impulse) for q in ends]
+    assert (velocities[1] - velocities[0]) / (2.0 * h) == pytest.approx(moved_by, rel=1e-4, abs=1e-4)
