@@ -1,6 +1,6 @@
 """An answer, judged and linearised (`natural.pxd`), with a factor of its equations where these are few; for Python.
 
-Where the equations are of J and M, with cotangents c of lambda and y of v (equation (4) of lavender/gradient.py),
+Where the equations are of J and M, with cotangents c of lambda and y of v (equation (4) of lavender/gradient/__init__.py),
 
     G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
 """
