@@ -36,12 +36,7 @@ class Derivatives(Sequence[Derivative]):
     @cached_property
     def _together(self) -> tuple[Any, ...] | None:
         """The kernel's objects, and where velocities, rows and results of each stand end to end; None: not all can."""
-        plain = all(
-            d._regular and d.problem.generalized is not None
-            and d.problem.generalized.order is None and not d.problem.cones.has_ellipse
-            for d in self._of
-        )  # fmt: skip
-        if not plain:
+        if not all(d._plain for d in self._of):
             return None
         sizes = [(d.problem.generalized.nv, d.problem.m) for d in self._of]  # type: ignore[union-attr]
         nv, m = np.array(sizes, np.int64).reshape(-1, 2).T

@@ -92,8 +92,10 @@ class Derivative:
 
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
         self.problem, self._impulse, self._linear = problem, impulse, linear
-        disk = problem.disk
-        self._regular = linear.prepare(disk.csr_data if disk.generalized is None else disk.metric)
+        disk, general = problem.disk, problem.generalized
+        self._regular = linear.prepare(disk.csr_data if general is None else disk.metric)
+        # The kernel has all that `vjp` needs, in the order given.
+        self._plain = self._regular and general is not None and general.order is None and disk is problem
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -264,15 +266,9 @@ class Derivative:
         if slack is not None:
             x = as_array("slack", slack, (p.m,))
             c += self._a(x, True)
-        general = p.generalized
-        if general is not None and self._regular:
-            order, stretch = general.order, p.cones.stretch if p.cones.has_ellipse else None
-            c = c if stretch is None else c * stretch
-            q, s, *moved = self._linear.adjoint(y if y is None or order is None else y[order], c)
-            s = s if stretch is None else s * stretch
-            if x is None:
-                return Gradient(self, q, s, y, given, tuple(map(general._given, moved)))
-            return Gradient(self, q, s - x, y, given)
+        if self._plain and x is None:
+            q, s, *moved = self._linear.adjoint(y, c)
+            return Gradient(self, q, s, y, given, moved)
         if y is not None:
             c += self._along(self._through_mass(y))
         scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)

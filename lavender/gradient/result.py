@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -64,7 +65,7 @@ class Gradient:
         s: FloatArray,
         y: FloatArray | None,
         c: FloatArray | None,
-        moved: tuple[FloatArray, ...] | None = None,  # v_free, p
+        moved: Sequence[FloatArray] | None = None,  # v_free, p
     ) -> None:
         self._of, self._q, self._s, self._y, self._c = of, q, s, y, c
         self._kept: dict[str, Any] = {}
