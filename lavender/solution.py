@@ -14,10 +14,10 @@ from lavender._arrays import FloatArray, read_only, table_of
 from lavender.errors import InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
-from lavender.states import State, States, states_of
 
 if TYPE_CHECKING:
     from lavender.motion import MotionError
+    from lavender.states import State, States
 
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn", "counted"]
 
@@ -220,6 +220,8 @@ class Solution:
         """What each block does, a sequence: open, sticks, slides, at a bound or free, and how far the next state is."""
         kept = self.__dict__
         if "_states" not in kept:
+            from lavender.states import states_of
+
             kept["_states"] = states_of(self.residual._problem, self.impulse, self.residual)
         found: States = kept["_states"]
         return found
