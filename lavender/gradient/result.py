@@ -38,24 +38,18 @@ class Gradient:
     Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
     What a problem has no data of is refused (CapabilityError).
 
-    b, target : (m,)
-        By b as it is given; by the target of a problem with J and M, which is the same.
-    v_free : (nv,) or (n, 6)
-        By v*, b = target - J v* following.
-    lower, upper : (m,)
-        By the bounds that act, 0 on other rows. Where lower = upper half of it each: both move together.
-    mu, patch_radius, rolling : (k,)
-        By the fields of `Cones`.
-    coefficients : (k, 2)
-        By mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0.
-    compliance : (m,)
-    A : (m, m)
-        Entry by entry: dense, or of a sparse A in its pattern.
-    J, M : sparse, (m, nv), (nv, nv)
-        In the patterns of J and M, target and v* given; by M as a symmetric matrix. `full` has them whole.
-    jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia : as in `Rows`
-        By the arrays of bodies, target and v* given; by normals and tangents as free vectors: of a turn only the part
-        along it counts.
+        b, target            (m,): by b as it is given; by the target of a problem with J and M, which is the same
+        v_free               (nv,) or (n, 6): by v*, b = target - J v* following
+        lower, upper         (m,): by the bounds that act; of lower = upper, which move together, half of it each
+        mu, patch_radius, rolling   (k,): by the fields of `Cones`
+        coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0
+        compliance           (m,)
+        A                    (m, m): entry by entry; dense, or of a sparse A in its pattern
+        J, M                 (m, nv), (nv, nv), sparse, in their patterns; M as a symmetric matrix; `full` has them whole
+        jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
+
+    By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn only
+    the part along it does.
     """
 
     def __init__(
