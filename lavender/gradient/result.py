@@ -38,14 +38,14 @@ class Gradient:
     Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
     What a problem has no data of is refused (CapabilityError).
 
-        b, target            (m,): by b as it is given; by the target of a problem with J and M, which is the same
+        b, target            (m,): by b as it is given; by the target of a problem with J and M, the same
         v_free               (nv,) or (n, 6): by v*, b = target - J v* following
         lower, upper         (m,): by the bounds that act; of lower = upper, which move together, half of it each
         mu, patch_radius, rolling   (k,): by the fields of `Cones`
         coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0
         compliance           (m,)
         A                    (m, m): entry by entry; dense, or of a sparse A in its pattern
-        J, M                 (m, nv), (nv, nv), sparse, in their patterns; M as a symmetric matrix; `full` has them whole
+        J, M                (m, nv), (nv, nv), sparse, in their patterns; M as symmetric; `full` has them whole
         jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
 
     By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn only
