@@ -45,11 +45,11 @@ class Gradient:
         coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0
         compliance           (m,)
         A                    (m, m): entry by entry; dense, or of a sparse A in its pattern
-        J, M                (m, nv), (nv, nv), sparse, in their patterns; M as symmetric; `full` has them whole
+        J, M                 (m, nv), (nv, nv), sparse, in their patterns; M as symmetric; `full` has them whole
         jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
 
-    By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn only
-    the part along it does.
+    By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn
+    only the part along it does.
     """
 
     def __init__(
