@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from lavender.batch import Batch
     from lavender.check import CrossCheck, cross_check
     from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
     from lavender.many import Residuals, Solutions, residual_many, solve_many
     from lavender.motion import MotionError, Motions, motion_error, motions
@@ -68,6 +69,7 @@ if TYPE_CHECKING:
 _LATER = {
     "Batch": "lavender.batch",
     "CrossCheck": "lavender.check",
+    "Derivative": "lavender.gradient",
     "MotionError": "lavender.motion",
     "Motions": "lavender.motion",
     "Plan": "lavender.plan",
@@ -81,6 +83,8 @@ _LATER = {
     "bench": "lavender.bench",
     "cross_check": "lavender.check",
     "Enclosure": "lavender.proof",
+    "derivative": "lavender.gradient",
+    "derivatives": "lavender.gradient",
     "diagnose": "lavender.suspicions",
     "engine": "lavender.engine",
     "explain": "lavender.plan",
@@ -113,6 +117,7 @@ __all__ = [
     "Claim",
     "Cones",
     "CrossCheck",
+    "Derivative",
     "Enclosure",
     "Generalized",
     "InUse",
@@ -143,6 +148,8 @@ __all__ = [
     "available",
     "bench",
     "cross_check",
+    "derivative",
+    "derivatives",
     "diagnose",
     "engine",
     "explain",

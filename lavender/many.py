@@ -22,9 +22,9 @@ from lavender.errors import InputError, LavenderError
 from lavender.loop import LEAST
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.registry import SolverSpec, get
-from lavender.residuals import AT_REST, ENOUGH, Residual, judged, judging_time, residual, verdict_of
+from lavender.residuals import AT_REST, ENOUGH, Residual, judged, residual, verdict_of
 from lavender.solution import Solution, Status, uninterrupted
-from lavender.solve import COUNTED, check_budget, rest_of, seconds_of, solve
+from lavender.solve import COUNTED, check_budget, check_taken, rest_of, seconds_of, solve, unjudged
 from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds
 
 __all__ = ["Residuals", "Solutions", "residual_many", "solve_many"]
@@ -32,6 +32,8 @@ __all__ = ["Residuals", "Solutions", "residual_many", "solve_many"]
 DONE_ALL = -1  # of `Hand`: there are no more worlds
 ERRORS = ("raise", "status")
 LATE = 1e-5  # s, that the judge is given for a world whose turn comes too late
+UNREAD = 4e-5  # s, of one that he reads later
+NO_TURN = "the time limit was over before its turn: the start, unjudged"
 STATUS = np.array(list(Status), object)
 NUMBER_OF = {status: i for i, status in enumerate(Status)}
 
@@ -84,12 +86,17 @@ class _Many:
     @property
     def worst_row(self) -> np.ndarray:
         """(n,) row of the largest velocity error, counted in its world; -1 where there is none."""
+        self._read()
         worst: np.ndarray = self._worlds.worst[:-1]
         return worst
 
     def _numbers(self, which: str) -> FloatArray:
+        self._read()
         found: FloatArray = self._worlds.numbers[NUMBER[which], :-1]
         return found
+
+    def _read(self) -> None:
+        """Judge what is not yet."""
 
     def _rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
@@ -177,6 +184,7 @@ class Solutions(_Many, Sequence[Solution]):
         super().__init__(given, starts, cold)
         self.tol, self._spec, self._starts, self._cold = tol, spec, starts, cold
         self._kept: dict[int, Solution] = {}
+        self._unread: list[int] = []  # worlds whose turn came too late: their starts, unjudged
         self._seconds = 0.0  # share of each
         # Of a batch the loop writes over the starts.
         self._given = None if cold or not isinstance(given, Batch) else starts.copy()
@@ -230,6 +238,17 @@ class Solutions(_Many, Sequence[Solution]):
         if isinstance(self.problems, Batch):
             return None if self._given is None else self._given[self._rows(i)]
         return self._starts[i]
+
+    def late(self, i: int, found: Solution) -> None:
+        """The start of a world whose turn came too late, judged when its numbers are read."""
+        self._kept[i] = found
+        self._impulse[self._rows(i)] = found.impulse
+        self._unread.append(i)
+
+    def _read(self) -> None:
+        while self._unread:
+            i = self._unread.pop()
+            self.keep(i, self._kept[i])
 
     def keep(self, i: int, found: Solution) -> None:
         """The solution of a world that the loop left."""
@@ -361,7 +380,7 @@ def solve_many(
         As `solve`.
     time_limit : float, optional, s
         Limit of the whole call on the wall clock. Worlds take their turns in order, each with all of the time left;
-        those whose turn comes too late keep their start, judged, with status TIME_LIMIT.
+        those whose turn comes too late keep their start, with status TIME_LIMIT.
     errors : {"raise", "status"}
         Of a world whose data are refused (NaN, an M that is not definite, a negative mu): raise what is wrong with the
         first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
@@ -392,7 +411,7 @@ def solve_many(
         deadline.keep(
             LATE * len(given)
             if isinstance(given, Batch)
-            else sum(LATE if data else judging_time(p) for p, data in zip(given, made._data, strict=True))
+            else sum(LATE if data else UNREAD for data in made._data)
         )
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
@@ -413,6 +432,12 @@ def solve_many(
             # The same steps need not be done again.
             at = problem._start if start is None else start
             problem.derived.vain = (spec.name, tol, np.ascontiguousarray(at, float).tobytes())
+        if deadline.is_set and not isinstance(given, Batch):
+            deadline.keep(-UNREAD)
+            if deadline.passed():
+                check_taken(problem, spec)
+                made.late(i, unjudged(problem, spec, options, start, tol, NO_TURN))
+                return
         found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
         made.keep(i, found if "callback" in options else uninterrupted(found))
 

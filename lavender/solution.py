@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from lavender._later import above
 from lavender.errors import InputError, SolveFailed
 from lavender.problem import Problem
 from lavender.residuals import Residual, residual
+
+if TYPE_CHECKING:
+    from lavender.states import State, States
 
 __all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn", "counted"]
 
@@ -212,6 +215,28 @@ class Solution:
     def slack(self) -> FloatArray:
         """w = A lambda - b (m,) [m/s], recomputed by the judge."""
         return self.residual.slack
+
+    @property
+    def states(self) -> States:
+        """What each block does, a sequence: open, sticks, slides, at a bound or free, and how far the next state is."""
+        kept = self.__dict__
+        if "_states" not in kept:
+            from lavender.states import states_of
+
+            kept["_states"] = states_of(self.residual._problem, self.impulse, self.residual)
+        found: States = kept["_states"]
+        return found
+
+    def state(self, i: int) -> State:
+        """What block i does (see `states`).
+
+        Raises
+        ------
+        IndexError
+            No such block.
+        """
+        found: State = self.states[i]
+        return found
 
     @property
     def success(self) -> bool:

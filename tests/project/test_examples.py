@@ -11,7 +11,13 @@ from lavender import suite
 
 
 # Those of the chapter are run by test_chapter.py.
-@pytest.mark.parametrize("name", ["residual_or_motion", "two_motions", "turns_of_auto", "what_a_row_costs"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "residual_or_motion", "two_motions", "turns_of_auto", "what_a_row_costs", "recorded_slide", "planned_push",
+        "which_contact",
+    ],
+)  # fmt: skip
 def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
     path = tmp_path / "figure.png"
     example(name).main(str(path))
@@ -310,3 +316,27 @@ def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
     assert found[:, 1].max() <= 1e-9 < theirs < 1e-3  # asked for; SAP's contacts are soft, and little
     assert apart < 1e-5
     assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)
+
+
+def test_mass_and_friction_are_found_to_what_the_noise_allows():
+    module = example("recorded_slide")
+    mass, mu, left = module.numbers()["way"][-1]
+    # 60 speeds of 0.01 m/s noise determine either to a percent; the fit leaves less than the noise does.
+    assert abs(mass / module.TRUE["mass"] - 1.0) < 0.02 and abs(mu / module.TRUE["mu"] - 1.0) < 0.02
+    assert left < 0.5 * module.NOISE**2
+
+
+def test_a_push_gets_across_the_switch_only_where_it_looks_for_it():
+    found = example("planned_push").numbers()
+    assert (
+        found["as it is"]["errors"][-1] == found["as it is"]["errors"][0]
+    )  # the derivative is 0 all the way
+    assert found["heeding the switches"]["errors"][-1] < 1e-9 and found["heeding the switches"]["crossed"] > 0
+
+
+def test_the_sensitivity_of_a_step_agrees_with_differences():
+    found = example("which_contact").numbers()
+    row, block = found["at"]
+    assert found["d"].exists
+    assert found["target"][row] == pytest.approx(found["differences"][0], rel=1e-6)
+    assert found["mu"][block] == pytest.approx(found["differences"][1], rel=1e-6)

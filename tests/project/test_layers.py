@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 KERNEL_LEVELS = [
     {"core"},
     {"factor", "judge", "local"},
-    {"generalized", "newton", "pivot", "sweep"},
+    {"derivative", "generalized", "newton", "pivot", "sweep"},
     {"accelerate", "engine"},
     {"warm"},
     {"driver", "host"},

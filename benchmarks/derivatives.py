@@ -1,0 +1,399 @@
+"""Derivatives of solutions: whether they agree with differences, whether the others are flagged, what they cost.
+
+    python -m benchmarks derivatives [--draws 300] [--steps 125] [--models MODEL.xml]... [--out FILE]
+
+A direction of v* (of b, where only a matrix is known) is drawn for each problem. The change of the slack along it is
+compared with central differences of solutions whose residual is at most 1e-12 or at its floor. Their step h is the one
+whose error is least: how far neighbours differ, or what the residuals of both ends leave over 2 h; a derivative agrees
+within TIMES that, or within 1e-6 of its size. Steps at whose ends a block is in another state cross a switch, and are
+left out: where none remains a switch is nearer than differences can see, and nothing is compared. A derivative counts
+as flagged where a block is about to switch, or what is compared is not unique.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+import lavender as lv
+from benchmarks.output import markdown, out_option, write_json
+from lavender import suite
+
+STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
+AGREES = 1e-6
+TIMES = 5.0
+SOLVED = 1e-12
+ROWS = 300
+DRAWS = "wild(seed={}, rows=300)"
+
+
+@dataclass(frozen=True)
+class Compared:
+    """One problem and direction."""
+
+    source: str
+    law: str
+    operator: str
+    rows: int
+    flagged: str  # why; empty where it is not
+    off: float  # - of the derivative's size
+    error: float  # - of the differences
+
+
+def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
+    """Steps of MuJoCo models under random controls, under their own law and with cones of two tangents."""
+    import mujoco as mj
+
+    from lavender.io import from_mujoco
+
+    for path in models:
+        for cone in (mj.mjtCone.mjCONE_PYRAMIDAL, mj.mjtCone.mjCONE_ELLIPTIC):
+            model = mj.MjModel.from_xml_path(path)
+            model.opt.cone = cone
+            data, rng, count = mj.MjData(model), np.random.default_rng(1), 0
+            low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+            for step in range(20 * steps):
+                if step % 20 == 0:
+                    data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
+                mj.mj_step(model, data)
+                if step % 5 == 0 and data.nefc and count < steps:
+                    mj.mj_forward(model, data)
+                    count += 1
+                    yield from_mujoco(model, data)
+
+
+def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
+    """(source, problem) of at most ROWS rows."""
+    import benchmarks.drawn.wild  # noqa: F401 - registers the family
+
+    for seed in range(draws):
+        problem = suite.case(DRAWS.format(seed)).problem
+        if 0 < problem.m <= ROWS:
+            yield "drawn", problem
+    for case in (*suite.cases("default"), *suite.cases("hard")):
+        if 0 < case.problem.m <= ROWS:
+            yield "suite", case.problem
+    for problem in robots(models, steps) if models else ():
+        yield "robots", problem
+        if problem.law == "cone":
+            yield "robots", problem.relaxed("coulomb") if not problem.cones.has_round else problem
+
+
+def solved(problem: lv.Problem, start: Any = None) -> lv.Solution | None:
+    """A solution with a residual of at most 1e-12 or at its floor, or None."""
+    solution = lv.solve(problem, tol=1e-14, impulse=start, time_limit=2.0)
+    return solution if solution.residual.relative <= SOLVED or solution.residual.at_floor else None
+
+
+def along(problem: lv.Problem, h: float, change: np.ndarray) -> lv.Problem:
+    """The problem with h times a change of v*, or of b."""
+    return replace(problem, b=problem.b + h * change, guess=None)
+
+
+def compared(source: str, problem: lv.Problem, seed: int = 0) -> Compared | None:
+    """Derivative beside differences; None where the problem is not solved."""
+    rng, solution = np.random.default_rng(seed), solved(problem)
+    if solution is None:
+        return None
+    d = lv.derivative(problem, solution)
+    if problem.matrix is None:
+        n = problem.jacobian.shape[1]
+        change = -(problem.jacobian @ rng.standard_normal(n))  # of b, by v*
+    else:
+        change = rng.standard_normal(problem.m)
+    size = float(np.abs(problem.b).max(initial=1e-3)) / max(float(np.abs(change).max(initial=0.0)), 1e-300)
+    change = change * size
+    found = d.jvp(b=change).slack
+    told = []
+    if d.switching:
+        told.append("switching")
+    if not d.unique.slack.all():
+        told.append("slack")
+    if problem.matrix is not None and not d.unique.target.all():
+        told.append("target")
+    weight = 1.0 / np.sqrt(problem.disk.d)
+
+    def norm(x: np.ndarray) -> float:
+        return float(np.linalg.norm(weight * x))
+
+    # From nothing: a start at its floor would be kept as it is. Of several motions the nearest is wanted.
+    start = solution.impulse if problem.law == "coulomb" else None
+    best, error, before = None, np.inf, None
+    for h in STEPS:
+        low, high = (solved(along(problem, x, change), start) for x in (-h, h))
+        if low is None or high is None:
+            continue
+        if any(not np.array_equal(x.states.case, solution.states.case) for x in (low, high)):
+            continue
+        now = (high.slack - low.slack) / (2.0 * h)
+        # What the residuals leave in w, or rounding does: sqrt(J), as `norm` has it.
+        left = sum(max(x.residual.energy, x.residual.floor * x.residual.energy_start) for x in (low, high))
+        if before is not None and max(norm(now - before), left / (2.0 * h)) < error:
+            best, error = now, max(norm(now - before), left / (2.0 * h))
+        before = now
+    if best is None:
+        return Compared(source, problem.law, problem.operator, problem.m, " and ".join(told), np.nan, np.nan)
+    scale = max(norm(best), norm(change) * 1e-3, 1e-300)
+    off = norm(found - best) / scale
+    return Compared(source, problem.law, problem.operator, problem.m, " and ".join(told), off, error / scale)
+
+
+def agrees(line: Compared) -> bool:
+    """Within 1e-6, or what differences know."""
+    return line.off <= max(AGREES, TIMES * line.error)
+
+
+def agreement(lines: list[Compared]) -> str:
+    """By source, law and operator."""
+    keys = sorted({(x.source, x.law, x.operator) for x in lines})
+    rows: list[tuple[Any, ...]] = []
+    for key in [*keys, None]:
+        of = [x for x in lines if key is None or (x.source, x.law, x.operator) == key]
+        seen = [x for x in of if not np.isnan(x.off)]
+        free, wrong = [x for x in seen if not x.flagged], [x for x in seen if not agrees(x)]
+        rows.append(
+            (
+                *(key or ("all", "", "")),
+                len(of),
+                f"{sum(bool(x.flagged) for x in of) / len(of):.1%}",
+                len(of) - len(seen),
+                f"{sum(map(agrees, free))} of {len(free)}",
+                f"{sum(bool(x.flagged) for x in wrong)} of {len(wrong)}",
+            )
+        )
+    head = (
+        "source",
+        "law",
+        "given as",
+        "problems",
+        "flagged",
+        "beyond differences",
+        "agree of those not flagged",
+        "flagged of those that disagree",
+    )
+    return markdown(head, rows)
+
+
+# -- what it costs ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds of one problem, or of a batch."""
+
+    source: str
+    law: str
+    operator: str
+    rows: int
+    solve: float  # by newton, cold
+    first: float  # the derivative and one vjp
+    more: float  # another vjp
+
+
+def fresh(problem: lv.Problem) -> lv.Problem:
+    """The same, with nothing worked out."""
+    kind, values = problem.__reduce__()  # type: ignore[misc]
+    made: lv.Problem = kind(*values)
+    return made
+
+
+def took(work: Callable[[], Any]) -> tuple[float, Any]:
+    """CPU seconds of one call, and what it returns."""
+    start = time.process_time()
+    found = work()
+    return time.process_time() - start, found
+
+
+def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
+    """Least times of a few runs, each on a problem with nothing worked out; None where `newton` does not solve it."""
+    best = np.full(3, np.inf)
+    for _ in range(repeats):
+        own = fresh(problem)
+        solve, solution = took(lambda own=own: lv.solve(own, "newton", tol=1e-10))  # type: ignore[misc]
+        if not (solution.residual.relative <= 1e-8 or solution.residual.at_floor):
+            return None
+        weights = {"slack": np.ones(own.m)}
+        if own.matrix is None:
+            weights = {"velocity": np.ones(own.velocity(solution.impulse).shape)}
+        answer = solution.impulse
+
+        def both(
+            own: lv.Problem = own, answer: Any = answer, weights: dict[str, Any] = weights
+        ) -> lv.Derivative:
+            d = lv.derivative(own, answer)
+            d.vjp(**weights).b  # noqa: B018 - read
+            return d
+
+        try:
+            first, d = took(both)
+        except lv.CapabilityError:  # what it weighs is not unique
+            return None
+        more, _ = took(lambda d=d, weights=weights: d.vjp(**weights).b)  # type: ignore[misc]
+        best = np.minimum(best, (solve, first, more))
+    return Cost(source, problem.law, problem.operator, problem.m, *best.tolist())
+
+
+def batch(source: str, problems: list[lv.Problem], repeats: int = 5) -> Cost:
+    """The same of many at once, by `solve_many`, the answers read."""
+    best = np.full(3, np.inf)
+    for _ in range(repeats):
+        own = [fresh(p) for p in problems]
+
+        def solved_all(own: list[lv.Problem] = own) -> list[Any]:
+            return [s.impulse for s in lv.solve_many(own, "newton", tol=1e-10)]
+
+        solve, answers = took(solved_all)
+        ones = [np.ones(p.generalized.nv) for p in own]  # type: ignore[union-attr]
+
+        def both(own: Any = own, answers: Any = answers, ones: Any = ones) -> Any:
+            d = lv.derivatives(own, answers)
+            d.vjp(velocity=ones)
+            return d
+
+        first, d = took(both)
+        more, _ = took(lambda d=d, ones=ones: d.vjp(velocity=ones))  # type: ignore[misc]
+        best = np.minimum(best, (solve, first, more))
+    first_of = problems[0]
+    return Cost(source, first_of.law, first_of.operator, sum(p.m for p in problems), *best.tolist())
+
+
+def costs(lines: list[Cost]) -> str:
+    """Medians by source and size."""
+    rows = []
+    for source in dict.fromkeys(x.source for x in lines):
+        for low, high in ((0, 10), (10, 30), (30, 100), (100, 10**9)):
+            of = [x for x in lines if x.source == source and low <= x.rows < high]
+            if of:
+                first, more = (
+                    np.array([getattr(x, name) / x.solve for x in of]) for name in ("first", "more")
+                )
+                rows.append(
+                    (source, f"{low} to {high - 1}" if high < 10**9 else f"{low} and more", len(of),
+                     f"{1e6 * np.median([x.solve for x in of]):.0f}", f"{np.median(first):.2f}",
+                     f"{np.mean(first <= 1.0):.0%}", f"{np.median(more):.2f}", f"{np.mean(more <= 0.2):.0%}")
+                )  # fmt: skip
+    head = (
+        "source",
+        "rows",
+        "problems",
+        "`newton` [us]",
+        "first vjp / solve",
+        "at most 1",
+        "another / solve",
+        "at most 0.2",
+    )
+    return markdown(head, rows)
+
+
+def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
+    """Time [us] of d v+ / d controls at one step of a model: vjp, differences of solves, MuJoCo's differences."""
+    import mujoco as mj
+
+    from lavender.io import from_mujoco
+
+    model = mj.MjModel.from_xml_path(path)
+    data, rng = mj.MjData(model), np.random.default_rng(1)
+    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    for _ in range(steps):
+        data.ctrl[:] = rng.uniform(low, np.maximum(low, high))
+        mj.mj_step(model, data)
+    mj.mj_forward(model, data)
+    problem = from_mujoco(model, data)
+    g = problem.generalized
+    assert g is not None
+    # v* = ... + dt M^-1 (moment^T gain u): what controls change of v*, (nv, nu).
+    free = np.zeros((model.nv, model.nu))
+    for i in range(model.nu):
+        ends = []
+        for sign in (-1.0, 1.0):
+            other = mj.MjData(model)
+            mj.mj_copyData(other, model, data)
+            other.ctrl[i] += sign * 1e-3
+            mj.mj_forward(model, other)
+            ends.append(other.qfrc_actuator.copy())
+        free[:, i] = model.opt.timestep * g.solve((ends[1] - ends[0]) / 2e-3)
+    unit, found = np.eye(g.nv), None
+
+    def implicit() -> np.ndarray:
+        d = lv.derivative(problem, solution)
+        return np.array([d.vjp(velocity=y).v_free for y in unit]) @ free
+
+    def differences() -> np.ndarray:
+        out = np.empty((g.nv, model.nu))
+        for i in range(model.nu):
+            ends = []
+            for h in (-1e-6, 1e-6):
+                b = problem.b - h * (problem.jacobian @ free[:, i])
+                x = lv.solve(
+                    replace(problem, b=b, guess=None), "newton", tol=1e-12, impulse=solution.impulse
+                ).impulse
+                ends.append(g.v_free + h * free[:, i] + g.change(x))
+            out[:, i] = (ends[1] - ends[0]) / 2e-6
+        return out
+
+    def of_mujoco() -> None:
+        b = np.zeros((2 * model.nv + model.na, model.nu))
+        mj.mjd_transitionFD(model, data, 1e-6, True, None, b, None, None)
+
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    ways = []
+    for way in (implicit, differences, of_mujoco):
+        best = min(took(way)[0] for _ in range(5))
+        found = way()
+        ways.append((best, found))
+    off = float(np.abs(ways[0][1] - ways[1][1]).max() / max(np.abs(ways[1][1]).max(), 1e-300))
+    return (
+        Path(path).stem,
+        problem.m,
+        model.nv,
+        model.nu,
+        *(f"{1e6 * t:.0f}" for t, _ in ways),
+        f"{off:.1e}",
+    )
+
+
+@click.command("derivatives")
+@click.option("--draws", default=300, show_default=True, help="Problems of `wild`.")
+@click.option("--steps", default=125, show_default=True, help="Steps of each model, under each of its cones.")
+@click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
+@click.option("--only", type=click.Choice(("agreement", "costs")), help="One part alone.")
+@out_option("Every problem as JSON.")
+def command(draws: int, steps: int, models: tuple[str, ...], only: str | None, out: Path | None) -> None:
+    """Derivatives beside differences of solves: agreement, what is flagged, times."""
+    lines: list[Any] = []
+    given = list(sources(draws, steps, models))
+    if only != "costs":
+        lines = [x for source, p in given if (x := compared(source, p)) is not None]
+        click.echo(agreement(lines))
+    if only != "agreement":
+        measured = [x for source, p in given if (x := cost(source, p)) is not None]
+        for path in models:
+            for i, made in enumerate(_chunks(list(robots((path,), 64)), 64)):
+                measured.append(batch(f"64 of {Path(path).stem}, {('pyramids', 'cones')[i % 2]}", made))
+        click.echo("\n" + costs(measured))
+        lines += measured
+        if models:
+            head = (
+                "model",
+                "rows",
+                "nv",
+                "nu",
+                "vjp [us]",
+                "differences of solves [us]",
+                "mjd_transitionFD [us]",
+                "off [-]",
+            )
+            click.echo("\n" + markdown(head, [jacobians(path) for path in models]))
+    if out is not None:
+        write_json(out, [asdict(x) for x in lines])
+
+
+def _chunks(problems: list[lv.Problem], size: int) -> Iterator[list[lv.Problem]]:
+    for i in range(0, len(problems), size):
+        yield problems[i : i + size]

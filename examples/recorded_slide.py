@@ -1,0 +1,122 @@
+"""Friction and mass found from a recorded slide: gradients through every step, by the derivative of its solve.
+
+A puck on a table is pushed by a known force, slides, and stops. Its speed is recorded with noise. Each step solves
+
+    M v+ = M v + dt (push + gravity) + J^T lambda,      |lambda_t| <= mu lambda_n
+
+and the adjoint goes back through the steps: `vjp(velocity=)` of a step gives the cotangent of the speed before it, and
+what mass and mu have changed in it. Descent is in the logarithms of both, with steps of Barzilai and Borwein (1988).
+
+    python examples/recorded_slide.py [FIGURE.png]
+"""
+
+import sys
+
+import numpy as np
+
+import lavender as lv
+
+DT, STEPS, GRAVITY = 0.02, 60, 9.81  # s, -, m/s2
+TRUE = {"mass": 0.7, "mu": 0.35}  # kg, -
+NOISE = 0.01  # m/s
+START = {"mass": 1.5, "mu": 0.15}
+TURNS = 40
+
+
+def push(k):
+    """Force along x in step k [N]: for the first half second."""
+    return 4.0 * np.sin(np.pi * k / 25.0) if k < 25 else 0.0
+
+
+def step(v, k, mass, mu):
+    """(problem, solution) of one step from velocity v (3,)."""
+    free = v + DT * np.array([push(k) / mass, 0.0, -GRAVITY])
+    jac = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # normal, two tangents
+    problem = lv.Problem.from_jacobian(jac, mass * np.eye(3), free, cones=lv.Cones.contacts(mu))
+    return problem, lv.solve(problem, tol=1e-12)
+
+
+def slide(mass, mu):
+    """Speeds along x (STEPS + 1,) and the steps' problems and solutions."""
+    v, speeds, taken = np.zeros(3), [0.0], []
+    for k in range(STEPS):
+        problem, solution = step(v, k, mass, mu)
+        v = problem.velocity(solution.impulse)
+        speeds.append(v[0])
+        taken.append((problem, solution))
+    return np.array(speeds), taken
+
+
+def loss(recorded, mass, mu):
+    """Half the mean square of the speeds' error [m2/s2], its gradient by (mass, mu), and states of the contact."""
+    speeds, taken = slide(mass, mu)
+    error = (speeds - recorded) / STEPS
+    back, by_mass, by_mu, states = np.zeros(3), 0.0, 0.0, []
+    for k in reversed(range(STEPS)):
+        problem, solution = taken[k]
+        back = back + np.array([error[k + 1], 0.0, 0.0])
+        d = lv.derivative(problem, solution)
+        g = d.vjp(velocity=back)
+        by_mu += g.mu[0]
+        by_mass += g.M.diagonal().sum() - g.v_free[0] * DT * push(k) / mass**2
+        back = g.v_free
+        states.append(solution.state(0).name)
+    return 0.5 * float(np.sum(error**2)) * STEPS, np.array([by_mass, by_mu]), states[::-1]
+
+
+def numbers():
+    """The way of the descent: (mass, mu, loss) of each turn, and the recording."""
+    exact, _ = slide(**TRUE)
+    recorded = exact + NOISE * np.random.default_rng(0).standard_normal(len(exact))
+    x, before, way = np.log([START["mass"], START["mu"]]), None, []
+    for _ in range(TURNS):
+        mass, mu = np.exp(x)
+        value, gradient, states = loss(recorded, mass, mu)
+        gradient = gradient * np.exp(x)
+        way.append((mass, mu, value))
+        length = 0.1 / max(np.abs(gradient).max(), 1e-12)
+        if before is not None:
+            dx, dg = x - before[0], gradient - before[1]
+            length = min(abs(dx @ dg) / max(dg @ dg, 1e-30), 5.0 * length)
+        before = x.copy(), gradient
+        x = x - length * gradient
+    return {"recorded": recorded, "way": np.array(way), "states": states}
+
+
+def figure(found, path):
+    """The slide, and mass and mu turn by turn."""
+    from matplotlib.figure import Figure
+
+    canvas = Figure(figsize=(8, 3.4), layout="constrained")
+    left, right = canvas.subplots(1, 2)
+    t = DT * np.arange(STEPS + 1)
+    left.plot(t, found["recorded"], ".", markersize=3, label="recorded")
+    left.plot(t, slide(**START)[0], "--", label="first guess")
+    left.plot(t, slide(*found["way"][-1][:2])[0], label="found")
+    left.set(xlabel="time [s]", ylabel="speed [m/s]")
+    left.legend(frameon=False, fontsize=8)
+    for i, (name, unit) in enumerate((("mass", "kg"), ("mu", "-"))):
+        right.plot(found["way"][:, i], label=f"{name} [{unit}]")
+        right.axhline(TRUE[name], color="gray", linewidth=0.8)
+    right.set(xlabel="turn")
+    right.legend(frameon=False, fontsize=8)
+    canvas.savefig(path)
+
+
+def main(path="recorded_slide.png"):
+    """Print what was found, save the figure."""
+    found = numbers()
+    for turn in (0, 5, 10, 20, TURNS - 1):
+        mass, mu, value = found["way"][turn]
+        print(f"turn {turn:>2}: mass {mass:.4f} kg, mu {mu:.4f}, loss {value:.2e} m2/s2")
+    print(
+        f"true:    mass {TRUE['mass']:.4f} kg, mu {TRUE['mu']:.4f}; the noise alone leaves {0.5 * NOISE**2:.1e}"
+    )
+    count = {name: found["states"].count(name) for name in sorted(set(found["states"]))}
+    print(f"states of the {STEPS} steps: {count}")
+    figure(found, path)
+    print(f"figure: {path}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

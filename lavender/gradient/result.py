@@ -1,0 +1,181 @@
+"""Gradients by the data of a problem, each worked out when it is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lavender._arrays import FloatArray
+from lavender._derived import cached_property
+from lavender._later import issparse
+from lavender._later import sparse as sp
+from lavender.errors import CapabilityError
+from lavender.problem import OPERATORS
+from lavender_ext.derivative.linear import CASES
+
+__all__ = ["BODIES", "HIGH", "INPUTS", "LOW", "Gradient"]
+
+LOW, HIGH = CASES["low"], CASES["high"]
+BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
+# What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
+INPUTS = {
+    **dict.fromkeys(("b", "lower", "upper", "mu", "coefficients", "patch_radius", "rolling"), OPERATORS),
+    "A": ("matrix",),
+    **dict.fromkeys(("target", "v_free", "compliance", "J"), ("rows", "generalized")),
+    "M": ("generalized",),
+    **dict.fromkeys(BODIES, ("rows",)),
+}
+
+
+class Gradient:
+    """Gradients of a scalar by the data of a problem, of cotangents of its solution: `Derivative.vjp`.
+
+    Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
+    What a problem has no data of is refused (CapabilityError).
+
+        b, target            (m,): by b as it is given; by the target of a problem with J and M, the same
+        v_free               (nv,) or (n, 6): by v*, b = target - J v* following
+        lower, upper         (m,): by the bounds that act; of lower = upper, which move together, half of it each
+        mu, patch_radius, rolling   (k,): by the fields of `Cones`
+        coefficients         (k, 2): by mu_1 and mu_2 of ellipses and boxes; of other contacts by mu, 0
+        compliance           (m,)
+        A                    (m, m): entry by entry; dense, or of a sparse A in its pattern
+        J, M                 (m, nv), (nv, nv), sparse, in their patterns; M as symmetric; `full` has them whole
+        jac, normal, tangent, arm_a, arm_b, inv_mass, inv_inertia   as in `Rows`
+
+    By J, M and the arrays of bodies with target and v* given. Normals and tangents count as free vectors: of a turn
+    only the part along it does.
+    """
+
+    def __init__(
+        self,
+        of: Any,
+        q: FloatArray,
+        s: FloatArray,
+        y: FloatArray | None,
+        c: FloatArray | None,
+        moved: Sequence[FloatArray] | None = None,  # v_free, p
+    ) -> None:
+        self._of, self._q, self._s, self._y, self._c = of, q, s, y, c
+        self._kept: dict[str, Any] = {}
+        if moved is not None:
+            self._kept["v_free"], self.__dict__["_p"] = moved
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in INPUTS:
+            raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
+        if name not in self._kept:
+            operator = self._of.problem.operator
+            if operator not in INPUTS[name]:
+                raise CapabilityError(
+                    f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
+                )
+            if name in BODIES:
+                self._kept |= self._of._bodies.back(self)
+            else:
+                self._kept[name] = getattr(self, f"_by_{name}")()
+        return self._kept[name]
+
+    def _by_b(self) -> FloatArray:
+        return self._s
+
+    _by_target = _by_b
+
+    def _by_v_free(self) -> FloatArray:
+        o = self._of
+        found = -o._wrench(self._s)
+        return (found if self._y is None else self._y + found).reshape(o._velocities())
+
+    @cached_property
+    def _pull(self) -> FloatArray:
+        # by an impulse that is moved and held: c + A^T-part of what its push changes
+        o, c = self._of, 0.0 if self._c is None else self._c
+        matrix, compliance = o.problem.matrix, o.problem.compliance
+        if matrix is not None:
+            return np.asarray(c - matrix.T @ self._s)
+        assert compliance is not None
+        return np.asarray(c + o._along(self._p) - compliance * self._s)
+
+    def _by_lower(self, acts: int = LOW) -> FloatArray:
+        o = self._of
+        c, case = o.problem.cones, o._linear.case
+        bound = (case == LOW) | (case == HIGH)
+        half = 0.5 * self._pull
+        return np.where(bound & (c.lower == c.upper), half, np.where(case == acts, self._pull, 0.0))
+
+    def _by_upper(self) -> FloatArray:
+        return self._by_lower(HIGH)
+
+    @cached_property
+    def _reach(self) -> FloatArray:
+        o = self._of
+        e = o._linear.times(self._q, True, True)
+        if o.problem.cones.has_ellipse:
+            rows, own, through = o._axes
+            e[rows] = own * self._q[rows] - through * o._linear.times(self._q, True)[rows]
+        return e
+
+    def _by_mu(self) -> FloatArray:
+        parts = self._of._parts
+        return parts.gather(self._reach, parts.first) + parts.radius * parts.gather(self._reach, parts.second)
+
+    def _by_coefficients(self) -> FloatArray:
+        parts = self._of._parts
+        second = np.where(parts.two, parts.gather(self._reach, parts.second), 0.0)
+        first = np.where(parts.two, parts.gather(self._reach, parts.first), self.mu)
+        return np.stack([first, second], axis=1)
+
+    def _by_patch_radius(self) -> FloatArray:
+        parts = self._of._parts
+        return parts.mu * parts.gather(self._reach, parts.second)
+
+    def _by_rolling(self) -> FloatArray:
+        parts = self._of._parts
+        return parts.gather(self._reach, parts.rolls)
+
+    def _by_compliance(self) -> FloatArray:
+        return -self._s * self._of._impulse
+
+    def _by_A(self) -> Any:
+        o = self._of
+        if issparse(o.problem.matrix):
+            return _on(o.problem.matrix, (-self._s, o._impulse))
+        return -np.outer(self._s, o._impulse)
+
+    @cached_property
+    def _p(self) -> FloatArray:
+        # p of (4)
+        o = self._of
+        z = o._moved(self._s)
+        return -z if self._y is None else o._through_mass(self._y) - z
+
+    def _pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
+        # (5) of A, J or M as a sum of u v^T
+        o = self._of
+        if name == "A":
+            return [(-self._s, o._impulse)]
+        if name == "J":
+            return [(o._impulse, self._p), (-self._s, o._velocity)]
+        return [(-0.5 * self._p, o._change), (-0.5 * o._change, self._p)]
+
+    def _by_J(self) -> sp.csr_array:
+        return _on(self._of.problem.jacobian, *self._pairs("J"))
+
+    def _by_M(self) -> sp.csr_array:
+        general = self._of.problem.generalized
+        assert general is not None
+        return _on(general.mass, *self._pairs("M"))
+
+    def full(self, name: str) -> FloatArray:
+        """The whole of A, J or M, a dense array with entries outside its pattern, too."""
+        getattr(self, name)  # refuses what is not there
+        return np.asarray(sum(np.outer(u, v) for u, v in self._pairs(name)))
+
+
+def _on(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
+    """Sum of u v^T on the pattern of a matrix in compressed rows."""
+    row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
+    data = sum(u[row] * v[pattern.indices] for u, v in pairs)
+    return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)

@@ -1,0 +1,90 @@
+"""A step's solve as a function of JAX, with a gradient by all of its arguments (extra: jax).
+
+```python
+jax.config.update("jax_enable_x64", True)
+from lavender.jax import solve
+velocity, impulse = solve(J, M, v_free, mu)      # arrays of float64; jit, grad and vmap apply
+```
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from lavender.cones import Cones
+from lavender.errors import InputError, SolverUnavailable
+from lavender.layer import NAMES, Step, shapes, step
+
+try:
+    import jax
+    import jax.numpy as jnp
+except ImportError as error:
+    raise SolverUnavailable(
+        "lavender.jax needs JAX: pip install 'lavender-contact[jax]', or jax itself"
+    ) from error
+
+__all__ = ["solve"]
+
+
+def _call(function: Any, like: Any, arrays: Any) -> Any:
+    # What vmap adds are leading axes, on all arrays alike.
+    return jax.pure_callback(function, like, *arrays, vmap_method="broadcast_all")
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _solve(made: Step, *arrays: Any) -> Any:
+    like = tuple(jax.ShapeDtypeStruct(shape, jnp.float64) for shape in shapes(arrays))
+    return _call(made.forward, like, arrays)
+
+
+def _forward(made: Step, *arrays: Any) -> Any:
+    found = _solve(made, *arrays)
+    return found, (arrays, found[1])
+
+
+def _backward(made: Step, kept: Any, cotangents: Any) -> Any:
+    arrays, impulse = kept
+    like = tuple(jax.ShapeDtypeStruct(x.shape, jnp.float64) for x in arrays)
+    return _call(made.backward, like, (*arrays, impulse, *cotangents))
+
+
+_solve.defvjp(_forward, _backward)
+
+
+def solve(
+    J: Any,
+    M: Any,
+    v_free: Any,
+    mu: Any,
+    *,
+    target: Any = None,
+    compliance: Any = None,
+    cones: Cones | None = None,
+    friction: str = "coulomb",
+    solver: str = "auto",
+    tol: float = 1e-10,
+) -> tuple[Any, Any]:
+    """Velocities after a step and its impulses, with gradients by all arrays.
+
+    Parameters, results and errors are those of `lavender.torch.solve`, of arrays of JAX. The solve itself runs on the
+    CPU, outside of what JAX compiles.
+
+    Raises
+    ------
+    InputError
+        Also where 64-bit numbers are not switched on.
+    """
+    given = [jnp.asarray(x) for x in (J, M, v_free, mu)]
+    none = jnp.zeros(given[0].shape[-2], given[0].dtype)
+    given += [none if x is None else jnp.asarray(x) for x in (target, compliance)]
+    for name, x in zip(NAMES, given, strict=True):
+        if x.dtype != jnp.float64:
+            raise InputError(
+                f"{name} is {x.dtype}; float64 is needed: jax.config.update('jax_enable_x64', True) before it is made"
+            )
+    shapes(given)
+    # Arrays that share their batch, as `broadcast_all` of vmap would make them.
+    given[1] = 0.5 * (given[1] + jnp.swapaxes(given[1], -1, -2))
+    velocity, impulse = _solve(step(given, cones, friction, solver, tol), *given)
+    return velocity, impulse

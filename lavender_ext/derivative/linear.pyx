@@ -1,0 +1,282 @@
+"""An answer, judged and linearised (`natural.pxd`), with a factor of its equations where these are few; for Python.
+
+Where the equations are of J and M, with cotangents c of lambda and y of v (equation (4) of lavender/gradient/__init__.py),
+
+    G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int8_t, int32_t, int64_t
+from libc.string cimport memcpy
+
+import numpy as np
+
+from lavender_ext.core.block cimport ROW, blocks_t, n_directions, n_turns
+from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.velocity cimport contact_wrench, joint_wrench
+from lavender_ext.core.view cimport view_t
+from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
+                                              natural_t, place_rows, scaled_csr, scaled_general, system_rows)
+from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve, lu_solve_back
+from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
+from lavender_ext.judge.score cimport relative, score_t
+
+cdef enum:
+    SMALL = 64                  # rows up to which the factor is made here; LAPACK's is faster beyond
+
+cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
+
+#: Cases of rows by the kernels' numbers.
+CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
+
+
+cdef public void lav_adjoint(const blocks_t* b, const natural_t* x, const generalized_t* g, int32_t rows,
+                             const int32_t* place, const double* lu, const int32_t* swap, const double* y, double* c,
+                             double* q, double* s, double* f, double* p) noexcept nogil:
+    """(1) but for q on rows outside the factor; c (m) is changed, y (n) may be NULL, then f = -J^T s."""
+    cdef int32_t i, m = b.n_rows
+    if y != NULL:
+        memcpy(p, y, g.n * sizeof(double))
+        tree_solve(g, p)
+        for i in range(m):
+            c[i] += jac_row(g, i, p)
+    for i in range(m):
+        if place[i] >= 0:
+            s[place[i]] = c[i] / x.root[i]
+    lu_solve_back(rows, lu, swap, s)
+    for i in range(m):
+        q[i] = s[place[i]] if place[i] >= 0 else 0.0
+    block_times(x, b, x.p, q, True, s)
+    for i in range(m):
+        s[i] /= x.root[i]
+    jac_push(g, s, f)
+    for i in range(g.n):
+        f[i] = (y[i] if y != NULL else 0.0) - f[i]
+    memcpy(p, f, g.n * sizeof(double))
+    tree_solve(g, p)
+
+
+cdef class Linear:
+    """An impulse (m,) [N s], judged by the data that the judge reads, and linearised.
+
+    `impulse` is kept as it is. The judge's reference must be known to the data. `regular`: `solve` and `adjoint` have
+    a factor; else `prepare` was not called, or G is singular, or it has more rows than are factored here.
+    """
+    cdef blocks_t b
+    cdef natural_t x
+    cdef Data judge, data
+    cdef Room room, factor
+    cdef double* w
+    cdef double* e
+    cdef double* lu
+    cdef int32_t* place_
+    cdef int32_t* swap
+    cdef readonly object impulse
+    cdef readonly int rows                              # of G: those with a place
+    cdef readonly bint regular
+    cdef readonly double relative, floor                # of the judge
+
+    def __init__(self, Data judge, impulse):
+        cdef const double[::1] lam = impulse
+        cdef int32_t m = judge.blocks.n_rows, k = judge.blocks.n_blocks, i, n, size = 0
+        cdef view_t v = judge.view()
+        cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+        cdef double* at
+        cdef double* scratch
+        cdef int32_t* ptr
+        self.judge, self.impulse, self.b = judge, impulse, judge.blocks
+        if m == 0:
+            self.regular = True
+            return
+        for i in range(k):
+            n = self.b.ptr[i + 1] - self.b.ptr[i]
+            size += n if self.b.kind[i] == ROW else n * n
+        self.room = room_for((5 * <Py_ssize_t>m + 2 * size) * sizeof(double) + (m + k + 1) * sizeof(int32_t) + m)
+        at = <double*>self.room.at
+        self.w, self.e = at, at + m
+        ptr = <int32_t*>(at + 5 * m + 2 * size)
+        self.place_ = ptr + k + 1
+        self.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(ptr + k + 1 + m), ptr, at + 5 * m,
+                           at + 5 * m + size)
+        scratch_room = room_for(scratch_of(&v) * sizeof(double))
+        scratch = <double*>(<Room>scratch_room).at
+        with nogil:
+            judge_view(&v, &lam[0], self.w, self.e, scratch, True, &s)
+            natural_all(&self.b, &lam[0], self.w, ptr, &self.x)
+            self.rows = place_rows(&self.b, &self.x, self.place_)
+        self.relative = relative_of(&s, self.w, m, judge.start_energy, judge.start_velocity)
+        self.floor = relative(s.floor_energy, s.floor_velocity, judge.start_energy, judge.start_velocity)
+
+    def prepare(self, Data data):
+        """Factor G with A of the data, in rows or J and M, where it has few rows; whether there is a factor."""
+        cdef int32_t i, n = self.rows
+        cdef double least = 1.0 / 0.0, most = 0.0, x
+        self.data = data
+        if n == 0 or n > SMALL:
+            self.regular = n == 0
+            return self.regular
+        self.factor = room_for((<Py_ssize_t>n * n) * sizeof(double) + n * sizeof(int32_t))
+        self.lu = <double*>self.factor.at
+        self.swap = <int32_t*>(self.lu + n * n)
+        self.form(self.lu, 0.0)
+        with nogil:
+            if lu_factor(n, self.lu, self.swap):
+                for i in range(n):
+                    x = fabs(self.lu[i * n + i])
+                    least = x if x < least else least
+                    most = x if x > most else most
+        self.regular = least > SINGULAR * most and most > 0.0
+        return self.regular
+
+    cdef void form(self, double* g, double shift):
+        cdef int32_t n = self.rows, i
+        cdef Room room = room_for(<Py_ssize_t>n * (n + self.data.general.n) * sizeof(double))
+        cdef double* h = <double*>room.at
+        with nogil:
+            if self.data.is_general:
+                scaled_general(&self.data.general, n, self.place_, self.x.root, h + <Py_ssize_t>n * n, h)
+            else:
+                scaled_csr(&self.data.csr, self.b.n_rows, n, self.place_, self.x.root, h)
+            for i in range(n):
+                h[<Py_ssize_t>i * n + i] += shift
+            system_rows(&self.x, &self.b, n, self.place_, h, g)
+
+    def matrix(self, double shift=0.0):
+        """G (n, n) on the rows with a place, of H + shift."""
+        out_ = np.empty((self.rows, self.rows))
+        cdef double[:, ::1] out = out_
+        if self.rows:
+            self.form(&out[0, 0], shift)
+        return out_
+
+    def solve(self, r, bint back=False):
+        """x (n,) with G x = r, of the transpose with `back`."""
+        out_ = r.copy()
+        cdef double[::1] out = out_
+        if self.rows and back:
+            lu_solve_back(self.rows, self.lu, self.swap, &out[0])
+        elif self.rows:
+            lu_solve(self.rows, self.lu, self.swap, &out[0])
+        return out_
+
+    def adjoint(self, y_, c_):
+        """(q (m,), s (m,), f (n,), p (n,)) of (1), y (n,) or None, c (m,), which is changed. Of J and M, with a factor."""
+        cdef double[::1] c = c_
+        cdef const double[::1] y
+        cdef const double* given = NULL
+        cdef int32_t m = self.b.n_rows, n = self.data.general.n
+        out_ = np.empty(2 * (m + n) + 1)
+        cdef double[::1] out = out_
+        if y_ is not None:
+            y = y_
+            given = &y[0] if n else NULL
+        if n:
+            with nogil:
+                self.back(given, &c[0] if m else NULL, &out[0])
+        return out_[:m], out_[m:2 * m], out_[2 * m:2 * m + n], out_[2 * m + n:2 * (m + n)]
+
+    cdef void back(self, const double* y, double* c, double* out) noexcept nogil:
+        cdef int32_t m = self.b.n_rows, n = self.data.general.n
+        lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out, out + m,
+                    out + 2 * m, out + 2 * m + n)
+
+    def times(self, v_, bint back=False, bint edge=False):
+        """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
+        cdef const double[::1] v = v_
+        out_ = np.empty(self.b.n_rows)
+        cdef double[::1] out = out_
+        if self.b.n_rows:
+            block_times(&self.x, &self.b, self.x.edge if edge else self.x.p, &v[0], back, &out[0])
+        return out_
+
+    cdef object numbers(self, const double* x):
+        cdef int32_t m = self.b.n_rows
+        out_ = np.empty(m)
+        cdef double[::1] out = out_
+        if m:
+            memcpy(&out[0], x, m * sizeof(double))
+        return out_
+
+    @property
+    def slack(self):
+        """w (m,) [m/s]."""
+        return self.numbers(self.w)
+
+    @property
+    def error(self):
+        """The judge's e (m,) [N s]."""
+        return self.numbers(self.e)
+
+    @property
+    def root(self):
+        """D^1/2 (m,)."""
+        return self.numbers(self.x.root)
+
+    @property
+    def residual(self):
+        """F (m,) of (1) of natural.pxd."""
+        return self.numbers(self.x.f)
+
+    @property
+    def margin(self):
+        """(m,) N s: of each row to the next case."""
+        return self.numbers(self.x.margin)
+
+    @property
+    def p(self):
+        """Values of P, block by block: the diagonal of rows, else row by row."""
+        cdef int32_t n = self.x.at[self.b.n_blocks] if self.b.n_rows else 0
+        out_ = np.empty(n)
+        cdef double[::1] out = out_
+        if n:
+            memcpy(&out[0], self.x.p, n * sizeof(double))
+        return out_
+
+    @property
+    def case(self):
+        """(m,) int8, by the numbers of CASES."""
+        cdef int32_t i
+        out_ = np.empty(self.b.n_rows, np.int8)
+        cdef int8_t[::1] out = out_
+        for i in range(self.b.n_rows):
+            out[i] = self.x.case_[i]
+        return out_
+
+    @property
+    def place(self):
+        """(m,) row of G that each row is, -1 without one."""
+        cdef int32_t i
+        out_ = np.empty(self.b.n_rows, np.int32)
+        cdef int32_t[::1] out = out_
+        for i in range(self.b.n_rows):
+            out[i] = self.place_[i]
+        return out_
+
+
+def adjoint_all(list linears, const int64_t[::1] at_y, const double[::1] y, const int64_t[::1] at_c, double[::1] c,
+                const int64_t[::1] at_out, double[::1] out):
+    """`adjoint` of many, each with J and M and a factor: y, c and what is returned end to end from the places given."""
+    cdef Linear one
+    cdef Py_ssize_t i
+    cdef const double* from_
+    for i in range(len(linears)):
+        one = <Linear>linears[i]
+        from_ = &y[0] + at_y[i] if y.shape[0] else NULL
+        if one.data.general.n:
+            one.back(from_, &c[0] + at_c[i] if c.shape[0] else NULL, &out[0] + at_out[i])
+
+
+def wrench(Data p, const double[::1] lam, double[:, ::1] f):
+    """f (n, 6) = J^T lam of bodies."""
+    cdef int32_t i, c, size
+    f[:, :] = 0.0
+    if p.blocks.n_rows == 0 or p.rows.n_bodies == 0:
+        return
+    with nogil:
+        for i in range(p.rows.n_joints):
+            joint_wrench(&p.blocks, &p.rows, i, &lam[0], &f[0, 0])
+        for c in range(p.rows.n_contacts):
+            i = p.rows.n_joints + c
+            size = p.blocks.ptr[i + 1] - p.blocks.ptr[i]
+            contact_wrench(&p.rows, c, n_directions(p.blocks.kind[i], size), n_turns(p.blocks.kind[i], size),
+                           &lam[p.blocks.ptr[i]], &f[0, 0])

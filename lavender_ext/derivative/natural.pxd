@@ -1,0 +1,262 @@
+"""The natural map of a problem's blocks at an answer, differentiated: which case each row is in, and how far the next is.
+
+With z = D^1/2 lambda, s = D^-1/2 w, y = z - s, Pi and P = dPi/dy of contact_map.pxd, H = D^-1/2 A D^-1/2,
+
+    F = z - Pi(y) = 0                                                                                       (1)
+    (I - P) dz + P ds = (dPi/da) da + dl,   ds = H dz + ...                                                 (2)
+    G = I - P + P H,   which is the identity on rows where P is 0: open contacts, rows at a bound           (3)
+
+Any metric D does at a solution, so a round cone has one d for all its tangents. Of a part g that slides, with
+u = y_g / |y_g|, ray as in contact_map.pxd and s_n the normal of Pi,
+
+    dPi/da_g = s_n u on its own rows;   cone: besides ray (|y_g| - 2 a_g s_n) / |ray|^2                     (4)
+
+since there s_n = (y_n + sum a |y|) / (1 + sum a^2). A row's margin is how far y is from the next case, in N s:
+y from its bound; of an open contact y_n below 0, under the cone law y_n + sum a |y| below 0; of a closed one s_n, and
+||y_g| - a_g s_n| of each part.
+"""
+from libc.math cimport INFINITY, fabs, sqrt
+from libc.stdint cimport int8_t, int32_t
+
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, n_tangents
+from lavender_ext.core.contact_map cimport contact_map, length
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.generalized cimport dot, generalized_t
+
+
+cdef enum:                      # the case of a row
+    OPEN = 0                    # of a contact without an impulse
+    CLOSED = 1                  # a normal that presses
+    STICKS = 2
+    SLIDES = 3
+    FREE = 4                    # between its bounds
+    LOW = 5                     # at the lower bound, at the upper one
+    HIGH = 6
+
+
+cdef struct natural_t:          # of all blocks
+    double* root                # (m) D^1/2
+    double* f                   # (m) F
+    double* margin              # (m) N s
+    int8_t* case_               # (m)
+    const int32_t* at           # (k + 1) first value of each block in p and edge: its diagonal for ROW, else square
+    double* p                   # P
+    double* edge                # dPi/de, e_g the reach of part g in its first column
+
+
+cdef inline void natural_row(double lam, double w, double low, double high, double root, double* f, double* margin,
+                             int8_t* case_, double* p) noexcept nogil:
+    cdef double y = lam - w / (root * root), below = y - low, above = high - y
+    p[0] = 0.0
+    if below > 0.0 and above > 0.0:
+        case_[0] = FREE
+        p[0] = 1.0
+        f[0] = w / root
+        margin[0] = below if below < above else above
+    elif above > 0.0 or (above == 0.0 and below == 0.0):
+        case_[0] = LOW
+        f[0] = root * (lam - low)
+        margin[0] = fabs(below)
+    else:
+        case_[0] = HIGH
+        f[0] = root * (lam - high)
+        margin[0] = fabs(above)
+    if low == high:
+        margin[0] = INFINITY
+
+
+cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
+                                 const natural_t* out) noexcept nogil:
+    cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, rolls = b.kind[i] == CONTACT_ROLLING
+    cdef int32_t nt = n_tangents(b.kind[i], n), spin = n - 1 - nt - 2 * rolls, k, g, first, size
+    cdef double* root = out.root + j
+    cdef double* margin = out.margin + j
+    cdef double* p = out.p + out.at[i]
+    cdef double* edge = out.edge + out.at[i]
+    cdef double y[6]
+    cdef double to[6]
+    cdef double ray[6]
+    cdef double a[3]
+    cdef double t, s, gone, norm = 1.0, over
+    for k in range(n):
+        root[k] = sqrt(b.d[j + (1 if 0 < k <= nt else k)])
+        y[k] = root[k] * lam[j + k] - w[j + k] / root[k]
+        ray[k] = 0.0
+        margin[k] = INFINITY
+    a[0] = b.mu[i] * root[1] / root[0] if nt else 0.0
+    a[1] = b.mu[i] * b.patch_radius[i] * root[1 + nt] / root[0] if spin else 0.0
+    a[2] = b.rolling[i] * root[n - 2] / root[0] if rolls else 0.0
+    contact_map(b.law, nt, spin, rolls, a, y, to, p)
+    for k in range(n):
+        out.f[j + k] = w[j + k] / root[k] if to[k] == y[k] else root[k] * lam[j + k] - to[k]
+        out.case_[j + k] = OPEN
+    for k in range(n * n):
+        edge[k] = 0.0
+    s = to[0]
+    gone = -y[0]
+    ray[0] = 1.0
+    if s > 0.0:
+        out.case_[j] = CLOSED
+    for g in range(3):
+        first = 1 if g == 0 else 1 + nt if g == 1 else n - 2
+        size = nt if g == 0 else spin if g == 1 else 2 * rolls
+        if size == 0:
+            continue
+        t = length(y + first, size)
+        gone -= a[g] * t
+        if not s > 0.0:
+            continue
+        over = t - a[g] * s
+        for k in range(first, first + size):
+            out.case_[j + k] = STICKS if over <= 0.0 and a[g] > 0.0 else SLIDES
+            if over > 0.0:
+                ray[k] = a[g] * y[k] / t
+                edge[k * n + first] = s * y[k] / t
+        if a[g] > 0.0:
+            margin[first] = fabs(over) / root[first]
+        if over > 0.0:
+            norm += a[g] * a[g]
+    if s > 0.0:
+        margin[0] = s / root[0]
+    else:
+        margin[0] = (gone if b.law == CONE else -y[0]) / root[0]
+    for g in range(3):
+        first = 1 if g == 0 else 1 + nt if g == 1 else n - 2
+        size = nt if g == 0 else spin if g == 1 else 2 * rolls
+        if size == 0 or not s > 0.0:
+            continue
+        t = length(y + first, size)
+        if b.law == CONE and t > a[g] * s:
+            for k in range(n):
+                edge[k * n + first] += ray[k] * (t - 2.0 * a[g] * s) / norm
+        for k in range(n):                              # of a_g = e_g root_g / root_n
+            edge[k * n + first] *= root[first] / root[0]
+
+
+cdef inline void natural_all(const blocks_t* b, const double* lam, const double* w, int32_t* at,
+                             const natural_t* out) noexcept nogil:
+    """(1) and (2) of every block; `at` (k + 1) are the places of `out`."""
+    cdef int32_t i, j, k, n
+    at[0] = 0
+    for i in range(b.n_blocks):
+        j = b.ptr[i]
+        n = b.ptr[i + 1] - j
+        at[i + 1] = at[i] + (n if b.kind[i] == ROW else n * n)
+        if b.kind[i] != ROW:
+            natural_contact(b, i, lam, w, out)
+            continue
+        for k in range(n):
+            out.root[j + k] = sqrt(b.d[j + k])
+            natural_row(lam[j + k], w[j + k], b.lower[j + k], b.upper[j + k], out.root[j + k], out.f + j + k,
+                        out.margin + j + k, out.case_ + j + k, out.p + at[i] + k)
+            out.edge[at[i] + k] = 0.0
+
+
+cdef inline int32_t place_rows(const blocks_t* b, const natural_t* x, int32_t* place) noexcept nogil:
+    """Rows of G that (3) leaves: those of closed contacts, and rows between their bounds; how many."""
+    cdef int32_t i, j, n = 0
+    for i in range(b.n_blocks):
+        for j in range(b.ptr[i], b.ptr[i + 1]):
+            place[j] = -1
+            if x.case_[b.ptr[i]] != OPEN and x.case_[j] != LOW and x.case_[j] != HIGH:
+                place[j] = n
+                n += 1
+    return n
+
+
+cdef inline void block_times(const natural_t* x, const blocks_t* b, const double* values, const double* v, bint back,
+                             double* out) noexcept nogil:
+    """out (m) = values v of all blocks, or with `back` of their transposes."""
+    cdef int32_t i, j, k, l, n
+    cdef const double* a
+    cdef double s
+    for i in range(b.n_blocks):
+        j = b.ptr[i]
+        n = b.ptr[i + 1] - j
+        a = values + x.at[i]
+        for k in range(n):
+            if b.kind[i] == ROW:
+                out[j + k] = a[k] * v[j + k]
+                continue
+            s = 0.0
+            for l in range(n):
+                s += a[l * n + k if back else k * n + l] * v[j + l]
+            out[j + k] = s
+
+
+cdef inline void scaled_csr(const csr_t* a, int32_t m, int32_t count, const int32_t* place, const double* root,
+                            double* h) noexcept nogil:
+    """H (count, count) on the rows that have a place."""
+    cdef int32_t i, q, c
+    cdef double* row
+    for i in range(m):
+        if place[i] < 0:
+            continue
+        row = h + <ssize_t>place[i] * count
+        for c in range(count):
+            row[c] = 0.0
+        for q in range(a.indptr[i], a.indptr[i + 1]):
+            c = place[a.indices[q]]
+            if c >= 0:
+                row[c] += a.data[q] / (root[i] * root[a.indices[q]])
+
+
+cdef inline void scaled_general(const generalized_t* g, int32_t count, const int32_t* place, const double* root,
+                                double* y, double* h) noexcept nogil:
+    """H (count, count) of J and M on the rows that have a place; y (count, nv) is scratch."""
+    cdef int32_t i, k, c, b, nc, n = g.n
+    cdef const double* from_
+    cdef double* row
+    cdef double x
+    for c in range(count):
+        for k in range(n):
+            y[<ssize_t>c * n + k] = 0.0
+    for b in range(g.n_panels):
+        nc = g.pcol[b + 1] - g.pcol[b]
+        from_ = g.y + g.pval[b]
+        for i in range(g.prow[b], g.prow[b + 1]):
+            if place[i] >= 0:
+                row = y + <ssize_t>place[i] * n
+                for k in range(nc):
+                    row[g.cols[g.pcol[b] + k]] = from_[k] / root[i]
+            from_ += nc
+    for i in range(count):
+        for c in range(i + 1):
+            x = dot(y + <ssize_t>i * n, y + <ssize_t>c * n, n)
+            h[<ssize_t>i * count + c] = x
+            h[<ssize_t>c * count + i] = x
+    for i in range(g.m):
+        if place[i] >= 0:
+            h[<ssize_t>place[i] * count + place[i]] += g.compliance[i] / (root[i] * root[i])
+
+
+cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t count, const int32_t* place,
+                             const double* h, double* g) noexcept nogil:
+    """G (count, count) of (3) on the rows that have a place, -1 for the others; h is H there."""
+    cdef int32_t i, j, k, l, n, c
+    cdef const double* p
+    cdef double* row
+    cdef const double* from_
+    for i in range(b.n_blocks):
+        j = b.ptr[i]
+        n = b.ptr[i + 1] - j
+        p = x.p + x.at[i]
+        for k in range(n):
+            if place[j + k] < 0:
+                continue
+            row = g + <ssize_t>place[j + k] * count
+            if b.kind[i] == ROW:
+                from_ = h + <ssize_t>place[j + k] * count
+                for c in range(count):
+                    row[c] = from_[c]
+                continue
+            for c in range(count):
+                row[c] = 0.0
+            for l in range(n):
+                if p[k * n + l] != 0.0:
+                    from_ = h + <ssize_t>place[j + l] * count
+                    for c in range(count):
+                        row[c] += p[k * n + l] * from_[c]
+            for l in range(n):
+                row[place[j + l]] -= p[k * n + l]
+            row[place[j + k]] += 1.0

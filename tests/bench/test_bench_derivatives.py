@@ -1,0 +1,50 @@
+"""`python -m benchmarks derivatives`: what counts as agreement, as flagged, and as beyond differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import lavender as lv
+from benchmarks import derivatives
+from lavender import suite
+
+
+def test_a_derivative_agrees_with_differences_and_a_wrong_one_would_not(monkeypatch):
+    problem = suite.case("pyramidF(k=2, sliding=0.5)").problem.relaxed("cone")
+    found = derivatives.compared("suite", problem)
+    assert derivatives.agrees(found) and found.off < 1e-6
+    right = lv.Derivative.jvp
+
+    def wrong(self, **changes):
+        t = right(self, **changes)
+        return replace(t, slack=1.001 * t.slack)
+
+    monkeypatch.setattr(lv.Derivative, "jvp", wrong)
+    assert not derivatives.agrees(derivatives.compared("suite", problem))
+
+
+def test_a_border_is_flagged_and_nothing_is_compared_across_it():
+    a = np.eye(3)
+    edge = lv.Problem.contact(a, [10.0, 5.0, 0.0], mu=[0.5])
+    found = derivatives.compared("made", edge)
+    assert found.flagged == "switching" and np.isnan(found.off)
+    table = derivatives.agreement(
+        [found, derivatives.compared("made", lv.Problem.contact(a, [10.0, 4.0, 0.0], mu=[0.5]))]
+    )
+    assert "| made | coulomb | matrix | 2 | 50.0% | 1 | 1 of 1 | 0 of 0 |" in table
+
+
+def test_the_command_prints_both_tables():
+    found = CliRunner().invoke(derivatives.command, ["--draws", "2", "--only", "costs"])
+    assert found.exit_code == 0, found.output
+    assert "| source | rows | problems | `newton` [us] |" in found.output
+    line = derivatives.cost("made", suite.case("stack(n=6)").problem, repeats=1)
+    assert min(line.solve, line.first, line.more) > 0.0
+
+
+@pytest.mark.parametrize("rows", [(0,), (40, 200)])
+def test_costs_are_put_by_size(rows):
+    lines = [derivatives.Cost("made", "lcp", "rows", n, 1.0, 0.5, 0.1) for n in rows]
+    assert derivatives.costs(lines).count("| made |") == len(rows)
