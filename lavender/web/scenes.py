@@ -130,49 +130,65 @@ _APPROACH = "approach velocity left [m/s]"
 #: The chapter's five, under its numbers (docs/chapter.md), opened by a link.
 EXPERIMENTS = (
     Preset(
-        "experiment=1",
-        "1 directly, or by sweeps",
-        "stack",
-        (Side(16, COLD, solver="newton"), Side(64, COLD)),
-        "A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each step from nothing. "
+        name="experiment=1",
+        title="1 directly, or by sweeps",
+        scene="stack",
+        sides=(Side(16, COLD, solver="newton"), Side(64, COLD)),
+        note="A factorises a few times and is done; B sweeps 64 times and leaves more. Both begin each "
+        "step from nothing. "
         "In the plots along the sweeps each point of A is a factorisation.",
-        (Number(_LEFT, "residual_final", 20, 60, "BA"), Number(_APPROACH, "violation_final", 20, 60, "BA")),
+        numbers=(
+            Number(_LEFT, "residual_final", 20, 60, "BA"),
+            Number(_APPROACH, "violation_final", 20, 60, "BA"),
+        ),
     ),
     Preset(
-        "experiment=2",
-        "2 inequalities, sweep by sweep",
-        "stack",
-        (Side(8, COLD, "bottom_up"), Side(32, COLD, "bottom_up")),
-        "Pause and step: the plots show the error after every sweep. Each impulse is clamped in its own row, so that "
+        name="experiment=2",
+        title="2 inequalities, sweep by sweep",
+        scene="stack",
+        sides=(Side(8, COLD, "bottom_up"), Side(32, COLD, "bottom_up")),
+        note="Pause and step: the plots show the error after every sweep. Each impulse is clamped in its "
+        "own row, so that "
         "the error falls from sweep to sweep; clamping once at the end would not do.",
-        (Number(_LEFT, "residual_final", 0, 0, "AB"), Number(_APPROACH, "violation_final", 0, 0, "AB")),
+        numbers=(
+            Number(_LEFT, "residual_final", 0, 0, "AB"),
+            Number(_APPROACH, "violation_final", 0, 0, "AB"),
+        ),
     ),
     Preset(
-        "experiment=3",
-        "3 two orders",
-        "stack",
-        (Side(4, COLD, "bottom_up"), Side(4, COLD, "top_down")),
-        "The same sweeps, from the ground up and from the top down. By the residual B looks better, by the approach "
+        name="experiment=3",
+        title="3 two orders",
+        scene="stack",
+        sides=(Side(4, COLD, "bottom_up"), Side(4, COLD, "top_down")),
+        note="The same sweeps, from the ground up and from the top down. By the residual B looks better, "
+        "by the approach "
         "velocity A does: compare orders by the error of all rows, E.",
-        (Number(_LEFT, "residual_final", 20, 60, "AB"), Number(_APPROACH, "violation_final", 20, 60, "AB")),
+        numbers=(
+            Number(_LEFT, "residual_final", 20, 60, "AB"),
+            Number(_APPROACH, "violation_final", 20, 60, "AB"),
+        ),
     ),
     Preset(
-        "experiment=4",
-        "4 four sweeps or 64",
-        "stack",
-        (Side(4, COLD, "bottom_up"), Side(64, COLD, "bottom_up")),
-        "B sweeps sixteen times as often; both from nothing, from the ground up. How much less it leaves depends on "
+        name="experiment=4",
+        title="4 four sweeps or 64",
+        scene="stack",
+        sides=(Side(4, COLD, "bottom_up"), Side(64, COLD, "bottom_up")),
+        note="B sweeps sixteen times as often; both from nothing, from the ground up. How much less it "
+        "leaves depends on "
         "when you look: A begins to lean.",
-        tuple(Number(_LEFT, "residual_final", *steps, "AB") for steps in ((0, 0), (20, 60), (180, 240))),
+        numbers=tuple(
+            Number(_LEFT, "residual_final", *steps, "AB") for steps in ((0, 0), (20, 60), (180, 240))
+        ),
     ),
     Preset(
-        "experiment=5",
-        "5 warm or cold",
-        "stack",
-        (Side(4, WARM, "alternating"), Side(4, COLD, "alternating")),
-        "Four sweeps in both. A finds its contacts in the cache and begins where the last step ended; B begins from "
+        name="experiment=5",
+        title="5 warm or cold",
+        scene="stack",
+        sides=(Side(4, WARM, "alternating"), Side(4, COLD, "alternating")),
+        note="Four sweeps in both. A finds its contacts in the cache and begins where the last step "
+        "ended; B begins from "
         "nothing.",
-        (
+        numbers=(
             Number("residual before the first sweep [N s]", "residual_initial", 20, 90, "BA"),
             Number("contacts found in the cache", "cache_matches", 20, 90, ""),
         ),
@@ -182,46 +198,48 @@ EXPERIMENTS = (
 #: The first opens the page.
 PRESETS = (
     Preset(
-        "chain-cold",
-        "a chain, 16 sweeps: warm against cold",
-        "chain",
-        (Side(16, WARM), Side(16, COLD)),
-        "16 sweeps a substep in both; A starts them from the impulses of the last one, B from nothing: its links part.",
+        name="chain-cold",
+        title="a chain, 16 sweeps: warm against cold",
+        scene="chain",
+        sides=(Side(16, WARM), Side(16, COLD)),
+        note="16 sweeps a substep in both; A starts them from the impulses of the last one, B from "
+        "nothing: its links part.",
     ),
     Preset(
-        "4-warm-64-cold",
-        "4 warm against 64 cold",
-        "stack",
-        (Side(4, WARM), Side(64, COLD)),
-        "B works sixteen times as hard as A and still creeps: each step starts from nothing.",
+        name="4-warm-64-cold",
+        title="4 warm against 64 cold",
+        scene="stack",
+        sides=(Side(4, WARM), Side(64, COLD)),
+        note="B works sixteen times as hard as A and still creeps: each step starts from nothing.",
     ),
     Preset(
-        "bottom-up-top-down",
-        "bottom-up against top-down, cold",
-        "stack",
-        (Side(16, COLD, "bottom_up"), Side(16, COLD, "top_down")),
-        "The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
+        name="bottom-up-top-down",
+        title="bottom-up against top-down, cold",
+        scene="stack",
+        sides=(Side(16, COLD, "bottom_up"), Side(16, COLD, "top_down")),
+        note="The same sweeps in opposite orders, each time from nothing: both towers walk sideways.",
     ),
     Preset(
-        "heavy-on-light",
-        "heavy on light",
-        "heavy_on_light",
-        (Side(16, WARM), Side(16, COLD)),
-        "The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
+        name="heavy-on-light",
+        title="heavy on light",
+        scene="heavy_on_light",
+        sides=(Side(16, WARM), Side(16, COLD)),
+        note="The upper box is a hundred times as heavy. A carries it, B lets it slip off.",
     ),
     Preset(
-        "newton-against-sweeps",
-        "newton against sweeps, cold",
-        "heavy_on_light",
-        (Side(16, COLD, solver="newton"), Side(64, COLD)),
-        "Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times and the box slips.",
+        name="newton-against-sweeps",
+        title="newton against sweeps, cold",
+        scene="heavy_on_light",
+        sides=(Side(16, COLD, solver="newton"), Side(64, COLD)),
+        note="Each step starts from nothing. A takes a few Newton steps to the answer; B sweeps 64 times "
+        "and the box slips.",
     ),
     Preset(
-        "cards",
-        "a house of cards",
-        "card_house",
-        (Side(16, WARM), Side(16, COLD)),
-        "A stands. B slides by what its sweeps leave over, and falls after some seconds.",
+        name="cards",
+        title="a house of cards",
+        scene="card_house",
+        sides=(Side(16, WARM), Side(16, COLD)),
+        note="A stands. B slides by what its sweeps leave over, and falls after some seconds.",
     ),
 )
 

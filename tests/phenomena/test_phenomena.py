@@ -421,7 +421,7 @@ def test_the_command(tmp_path):
         (["stick", "--steppers", "fast"], "unknown stepper"),
         (["stick", "--engines", "fast"], "unknown engine"),
         (["stick", "--steppers", "none"], "no stepper and no engine"),
-        (["stick", "--out", "no/such/folder/x.json"], "no folder"),
+        (["stick", "--out", "no/such/folder/x.json"], "is not there; make it first"),
     ],
 )
 def test_bad_words_end_with_one_line_and_status_2(words, said, capsys):

@@ -48,7 +48,7 @@ def test_a_long_call_is_seen():
 
 
 #: Documented in spite of their underscore: named tuples, ctypes, IPython, sys and os.
-DOCUMENTED = {"_replace", "_fields_", "_repr_html_", "_current_frames", "_exit"}
+DOCUMENTED = {"_asdict", "_replace", "_fields_", "_repr_html_", "_current_frames", "_exit"}
 PRIVATE = re.compile(r"_[a-zA-Z]\w*")
 
 
