@@ -10,7 +10,8 @@
     a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
-    all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`
+    all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`; all together LAST times
+                                Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -47,6 +48,7 @@ SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
+LAST = 200.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
 BAND = 100  # half bandwidth up to which `direct` comes first
 SURE = 4.0  # times the counted cost, within which nine in ten end
@@ -175,8 +177,14 @@ class Tree:
         yield from self.factorisations(MOST)
         # What follows where these fail has its line here.
         self.add_rows()
+        unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
+        spent = self.begun + MOST * unit
         for k in range(TURNS):
-            yield from self.in_turn(2.0**k)
+            for stage in self.in_turn(2.0**k):
+                spent += stage.cost
+                if spent > LAST * unit:
+                    return
+                yield stage
 
     def factorisations(self, times: float) -> Iterator[Stage]:
         """Newton's method for so many times its counted cost."""
