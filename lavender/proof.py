@@ -175,6 +175,7 @@ class _Operator:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
         self.columns = self.rows.tocsc() if problem.matrix is None else None
         self.target, self.v = self._targets()
+        self._mass: dict[Any, Any] = {}  # M^-1
 
     def _targets(self) -> tuple[FloatArray, FloatArray | None]:
         """What b was made of, target - J v*: a target that is nothing but rounding is 0. (b, None) of a matrix."""
@@ -185,6 +186,9 @@ class _Operator:
         target = problem.b + self.rows @ v
         dust = 4.0 * UNIT * (abs(self.rows) @ abs(v) * (1 + np.diff(self.rows.indptr)) + abs(problem.b))
         return np.where(abs(target) <= dust, 0.0, target), v
+
+    def soft(self, row: int) -> bool:
+        return self.columns is not None and bool(self.problem.compliance[row] > 0.0)
 
     def bias(self, kind: Any) -> list[Any]:
         """b of exact numbers."""
@@ -199,7 +203,9 @@ class _Operator:
         generalized = self.problem.generalized
         if generalized is None:
             return _matrix(kind, self.inverse) * right
-        return _matrix(kind, generalized.mass).solve(right)
+        if type(kind) not in self._mass:
+            self._mass[type(kind)] = _matrix(kind, generalized.mass).inv()
+        return self._mass[type(kind)] * right
 
     def block(self, kind: Any, which: Any) -> Any:
         """A of these rows and columns."""
@@ -218,10 +224,23 @@ class _Operator:
             a[k, k] += kind.number(float(self.problem.compliance[i]))
         return a
 
+    def pattern(self, which: Any) -> Any:
+        """Where A of these rows and columns may be other than 0: where it is a sum of products, none of which may cancel."""
+        if self.columns is None:
+            return (self.rows[which][:, which] != 0).astype(float)
+        generalized = self.problem.generalized
+        inner = (self.inverse if generalized is None else sp.csr_array(generalized.mass)) != 0
+        if generalized is not None:
+            label = sp.csgraph.connected_components(inner, directed=False)[1]
+            inner = sp.coo_array((np.ones(len(label)), (np.arange(len(label)), label))).tocsr()
+            inner = inner @ inner.T
+        j = (self.rows[which] != 0).astype(float)
+        return j @ inner.astype(float) @ j.T
+
     def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
         """w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
-        at = np.flatnonzero([x != 0 for x in impulse])
+        at = np.flatnonzero([not x == 0 for x in impulse])  # a ball about 0 is not 0 (and `!=` of it not certain)
         if self.columns is None:
             a = _times(kind, self.rows, impulse, at)
         else:
@@ -236,6 +255,36 @@ class _Operator:
             x + number(t) * y - b if t else x - b
             for x, t, y, b in zip(a, theta, impulse, self.bias(kind), strict=True)
         ]
+
+
+    def semidefinite(self) -> bool:
+        """Proof that x.A x >= 0 for every x, of exact numbers."""
+        problem = self.problem
+        if problem.matrix is not None:
+            return _semidefinite(problem.dense())
+        if problem.generalized is not None:
+            return _semidefinite(problem.generalized.mass.toarray())
+        return bool((problem.rows.inv_mass >= 0.0).all()) and _semidefinite(problem.rows.inv_inertia)
+
+
+def _semidefinite(a: FloatArray) -> bool:
+    """Whether Cholesky of symmetric matrices (..., n, n) less c I runs through, c what it may round.
+
+    S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.
+    """
+    if not (a == np.swapaxes(a, -1, -2)).all():
+        return False
+    n = a.shape[-1]
+    eye, empty = np.eye(n), ~(a != 0.0).any(axis=-1)
+    scale = abs(a).max(axis=(-1, -2), keepdims=True, initial=0.0)
+    a = a / np.exp2(np.ceil(np.log2(np.where(scale > 0.0, scale, 1.0)))) + empty[..., None] * eye
+    trace = np.trace(a, axis1=-2, axis2=-1)[..., None, None]
+    try:
+        # Twice as much: of the trace, of the subtraction and of what underflows, too.
+        np.linalg.cholesky(a - 2.0 * (n + 3) * UNIT * np.maximum(trace, 1.0) * eye)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 class _Balls:
@@ -390,7 +439,7 @@ class _Search:
     def _islands(self, free: Any) -> list[Any]:
         if not len(free):
             return []
-        graph = abs(self.problem.csr[free][:, free])
+        graph = self.operator.pattern(free)
         block = np.searchsorted(self.problem.cones.ptr, free, side="right")
         together = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
         graph = graph + together @ together.T
@@ -411,19 +460,28 @@ class _Search:
             j = j[:, np.union1d(unknown, np.flatnonzero(fixed))]
         else:
             still &= set(np.flatnonzero(self.problem.compliance == 0.0).tolist())
-        touching = np.array([b.first for b in self.blocks if b.touches and not b.loaded], np.int64)
+        touches = (b for b in self.blocks if b.touches and not b.loaded)
+        touching = np.array([b.first for b in touches if not (b.at and self.operator.soft(b.first))], np.int64)
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
         first, numerical = _pivots(j[rows].toarray())
         if numerical == len(rows) and not len(touching):
             return unknown
-        rows = np.concatenate([rows[first], touching])
-        kept, contradict = (rows[k] for k in _dependencies(self.flint, j[rows], self.operator.target[rows]))
+        own = rows[first]
+        while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
+            rows = np.concatenate([own, touching])
+            kept, contradict = (
+                rows[k] for k in _dependencies(self.flint, j[rows], self.operator.target[rows])
+            )
+            left = np.setdiff1d(touching, kept)
+            if len(left) == len(touching):
+                break
+            touching = left
         wrong = np.setdiff1d(contradict, touching)
         if len(wrong):
             self._open(wrong)
-        self.still = np.setdiff1d(touching, np.concatenate([kept, contradict]))
+        self.still = np.setdiff1d(touching, contradict)
         return np.setdiff1d(unknown, np.setdiff1d(rows, kept))
 
     def _open(self, rows: Any) -> None:
@@ -431,7 +489,10 @@ class _Search:
         opened = False
         for block in self.blocks:
             if block.loaded and block.first in rows and not block.parts:
-                block.loaded, opened = False, True
+                low, high = float(self.problem.cones.lower[block.first]), float(self.problem.cones.upper[block.first])
+                if low == -math.inf and high == math.inf:
+                    continue
+                block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
         if opened:
             raise _Recase
         names = tuple(self.problem.row_name(int(r)) for r in rows)
@@ -476,44 +537,55 @@ class _Search:
                     out[place[first]] -= s
             return matrix(n, 1, out), speeds
 
-        def slope(x: Any, speeds: Any) -> Any:
-            """F' over a box."""
-            out = matrix(a)
+        def slope(x: Any, speeds: Any, left: Any, right: Any, other: Any) -> Any:
+            """F' = left A + right over a box, into two matrices of 1 and 0."""
             for (first, part), (w, s) in zip(parts, speeds, strict=True):
-                at = [place[r] for r in part.rows]
-                share = [
-                    number(c) * number(c) * w[k, 0] / s for k, c in zip(at, part.reach, strict=True)
-                ]  # ds = share . dw
+                at = [(place[r], number(c) * number(c)) for r, c in zip(part.rows, part.reach, strict=True)]
+                share = [c2 * w[k, 0] / s for k, c2 in at]  # ds = share . dw
                 normal = x[place[first], 0] if first in place else lam[first]
-                ds = [sum((share[q] * a[k, j] for q, k in enumerate(at)), number(0.0)) for j in range(n)]
-                for k, c in zip(at, part.reach, strict=True):
-                    c2 = number(c) * number(c)
-                    for j in range(n):
-                        out[k, j] = x[k, 0] * ds[j] + c2 * normal * a[k, j]
-                    out[k, k] += s
+                for k, c2 in at:
+                    for (q, _), ds in zip(at, share, strict=True):
+                        left[k, q] = other(x[k, 0] * ds + (c2 * normal if q == k else 0))
+                    right[k, k] = other(s)
                     if first in place:
-                        out[k, place[first]] += c2 * w[k, 0]
+                        right[k, place[first]] = other(c2 * w[k, 0])
                 if self.cone and first in place:
-                    for j in range(n):
-                        out[place[first], j] -= ds[j]
-            return out
+                    for (q, _), ds in zip(at, share, strict=True):
+                        left[place[first], q] = other(-ds)
 
+        def near(x: Any, speeds: Any) -> FloatArray:
+            left, right = np.eye(n), np.zeros((n, n))
+            slope(x, speeds, left, right, float)
+            return left @ floats + right
+
+        def over(x: Any, speeds: Any) -> Any:
+            if not parts:
+                return a
+            left, right = matrix(unit), matrix(n, n)
+            slope(x, speeds, left, right, number)
+            return left * a + right
+
+        floats = np.asarray(self.problem.csr[which][:, which].toarray())
+        unit = matrix(n, n, np.eye(n).ravel().tolist())
         x = matrix(n, 1, [number(float(self.given[r])) for r in which.tolist()])
-        inverse = None
-        for step in range(12):
+        inverse, precise = None, False
+        last = math.inf
+        for step in range(30):
             value, speeds = f(x)
             if any(not (s > 0) for _, s in speeds):
                 break  # its case is wrong, or on the border
             if inverse is None or (parts and step < 3):
-                inverse = self._inverse(slope(x, speeds))
+                inverse = self._inverse(near(x, speeds))
+            if inverse is None:
+                inverse, precise = self._inverse_of_balls(over(x, speeds)), True
             move = (inverse * value).mid()
             x = (x - move).mid()
-            size = max(abs(float(q)) for q in x.entries())
-            if (
-                max(abs(float(q)) for q in move.entries()) <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size
-                and step > 1
-            ):
+            size, moved = _largest(x), _largest(move)
+            if step > 1 and moved <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size:
                 break
+            if step > 4 and moved > 0.1 * last and not precise:
+                inverse, precise = self._inverse_of_balls(over(x, speeds)), True
+            last = moved
         value, speeds = f(x)
         still = [part for (_, part), (_, s) in zip(parts, speeds, strict=True) if not s > 0]
         for part in still:
@@ -522,17 +594,14 @@ class _Search:
             raise _Recase
         newton = inverse * value
         radius = [2.0 * _up(q) for q in newton.entries()]
-        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * max(
-            abs(float(q)) for q in x.entries()
-        )
-        unit = matrix(n, n, [float(i == j) for i in range(n) for j in range(n)])
+        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * _largest(x) + 2.0**-900
         wide = [max(q, 1e-6 * least) for q in radius]
         for _ in range(EXTENT):
             ball = matrix(n, 1, [number(0.0, q) for q in wide])
             box = x + ball
             value, speeds = f(box)
             if all(s > 0 for _, s in speeds):
-                away = (unit - inverse * slope(box, speeds)) * ball - newton
+                away = (unit - inverse * over(box, speeds)) * ball - newton
                 reach = [_up(q) for q in away.entries()]
                 if all(q < p for q, p in zip(reach, wide, strict=True)):
                     for r in which.tolist():
@@ -548,19 +617,19 @@ class _Search:
             "proves a zero: the equations are singular to rounding, or the answer is too far from a solution"
         )
 
-    def _inverse(self, slope: Any) -> Any:
-        n = slope.nrows()
-        middle = np.array([float(q.mid()) for q in slope.entries()]).reshape(n, n)
+    def _inverse(self, middle: FloatArray) -> Any:
+        n = len(middle)
         with np.errstate(all="ignore"):
             scale = np.sqrt(np.maximum(abs(middle).max(axis=0), np.finfo(float).tiny))
             row = np.maximum(abs(middle / scale).max(axis=1), np.finfo(float).tiny)
-        try:
-            inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
-        except np.linalg.LinAlgError:
-            inverse = np.full((n, n), np.nan)
-        good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
-        if good:
-            return self.flint.arb_mat(n, n, inverse.ravel().tolist())
+            try:
+                inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
+            except np.linalg.LinAlgError:
+                return None
+            good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
+        return self.flint.arb_mat(n, n, inverse.ravel().tolist()) if good else None
+
+    def _inverse_of_balls(self, slope: Any) -> Any:
         try:
             return slope.mid().inv().mid()
         except ZeroDivisionError:
@@ -607,7 +676,7 @@ class _Search:
                     sign = (
                         _sign(w[r] * w[r] - speeds[0])
                         if len(speeds) == 1
-                        else _sign(w[r] - sum((s.sqrt() for s in speeds), 0 * w[r]))
+                        else _sign(w[r] - sum((self._root(s) for s in speeds), self.flint.arb(0)))
                     )
                 if sign < 0:
                     block.loaded = changed = True
@@ -632,6 +701,11 @@ class _Search:
                     border.append(block)
         return None if changed else border
 
+    def _root(self, square: Any) -> Any:
+        """A ball that holds the root; a ball of a square may reach below 0."""
+        square = self.flint.arb(square)
+        return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
+
     def _told(self, lam: list[Any], w: list[Any]) -> Enclosure:
         kind = _Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
@@ -641,9 +715,8 @@ class _Search:
         if len(self.family):
             names = tuple(self.problem.row_name(int(r)) for r in self.family)
             reason = f"the impulses of {_listed(names)} are one of a family"
-        unique = self.problem.law != "coulomb" and self.problem.is_semidefinite
-        if self.problem.law == "coulomb":
-            unique = uniqueness(self.problem.disk).proved
+        convex = self.problem.law != "coulomb"
+        unique = self.operator.semidefinite() if convex else uniqueness(self.problem.disk).proved
         return Enclosure(True, off, speed, unique, reason, read_only(np.array([float(x.mid()) for x in lam])))
 
 
@@ -657,7 +730,12 @@ def _listed(names: tuple[str, ...]) -> str:
 
 def _up(x: Any) -> float:
     """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
-    return float(abs(x).upper()) * (1.0 + 2.0**-50)
+    up = abs(x).upper()
+    return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
+
+
+def _largest(x: Any) -> float:
+    return max((abs(float(q)) for q in x.entries()), default=0.0)
 
 
 def _squared(x: Any) -> Any:
