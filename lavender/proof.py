@@ -569,23 +569,22 @@ class _Search:
         unit = matrix(n, n, np.eye(n).ravel().tolist())
         x = matrix(n, 1, [number(float(self.given[r])) for r in which.tolist()])
         inverse, precise = None, False
-        last = math.inf
+        moved = last = math.inf
         for step in range(30):
             value, speeds = f(x)
             if any(not (s > 0) for _, s in speeds):
                 break  # its case is wrong, or on the border
-            if inverse is None or (parts and step < 3):
-                inverse = self._inverse(near(x, speeds))
+            precise = precise or (step > 6 and moved > 0.1 * last)
+            if inverse is None or moved > (1e-3 if parts else 0.1) * last or (parts and step < 3):
+                inverse = None if precise else self._inverse(near(x, speeds))
             if inverse is None:
                 inverse, precise = self._inverse_of_balls(over(x, speeds)), True
             move = (inverse * value).mid()
             x = (x - move).mid()
-            size, moved = _largest(x), _largest(move)
-            if step > 1 and moved <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size:
+            size, last, moved = _largest(x), moved, _largest(move)
+            enough = moved <= 2.0 ** (-0.75 * self.flint.ctx.prec) * size
+            if step > 1 and (enough or (precise and step > 9 and moved > 0.1 * last)):
                 break
-            if step > 4 and moved > 0.1 * last and not precise:
-                inverse, precise = self._inverse_of_balls(over(x, speeds)), True
-            last = moved
         value, speeds = f(x)
         still = [part for (_, part), (_, s) in zip(parts, speeds, strict=True) if not s > 0]
         for part in still:
