@@ -48,6 +48,7 @@ BITS = (128, 256)  # of the balls: what the first leave undecided the second try
 UNIT = 2.0**-53
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
+SMALL = 32  # unknowns that are not parted into islands
 ROUNDS = 30  # changes of cases, as in an active-set method
 EXTENT = 10  # enlargements of X
 
@@ -173,9 +174,10 @@ class _Operator:
         self.rows = problem.csr if problem.matrix is not None else problem.jacobian
         if problem.matrix is None and problem.rows is not None:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
-        self.columns = self.rows.tocsc() if problem.matrix is None else None
+        self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
         self.target, self.v = self._targets()
-        self._mass: dict[Any, Any] = {}  # M^-1
+        self._mass: dict[Any, Any] = {}  # M^-1, by kind of number
+        self._bias: dict[Any, list[Any]] = {}  # b
 
     def _targets(self) -> tuple[FloatArray, FloatArray | None]:
         """What b was made of, target - J v*: a target that is nothing but rounding is 0. (b, None) of a matrix."""
@@ -188,15 +190,18 @@ class _Operator:
         return np.where(abs(target) <= dust, 0.0, target), v
 
     def soft(self, row: int) -> bool:
-        return self.columns is not None and bool(self.problem.compliance[row] > 0.0)
+        return self.transposed is not None and bool(self.problem.compliance[row] > 0.0)
 
     def bias(self, kind: Any) -> list[Any]:
         """b of exact numbers."""
+        if type(kind) in self._bias:
+            return self._bias[type(kind)]
         out = [kind.number(x) for x in self.target.tolist()]
-        if self.v is None:
-            return out
-        moved = _times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
-        return [x - y for x, y in zip(out, moved, strict=True)]
+        if self.v is not None:
+            moved = _times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
+            out = [x - y for x, y in zip(out, moved, strict=True)]
+        self._bias[type(kind)] = out
+        return out
 
     def weighed(self, kind: Any, right: Any) -> Any:
         """M^-1 times a matrix of balls or rationals (nv, k)."""
@@ -209,7 +214,7 @@ class _Operator:
 
     def block(self, kind: Any, which: Any) -> Any:
         """A of these rows and columns."""
-        if self.columns is None:
+        if self.transposed is None:
             return _matrix(kind, self.rows[which][:, which])
         part = self.rows[which]
         used = np.unique(part.indices)
@@ -226,7 +231,7 @@ class _Operator:
 
     def pattern(self, which: Any) -> Any:
         """Where A of these rows and columns may be other than 0: where it is a sum of products, none of which may cancel."""
-        if self.columns is None:
+        if self.transposed is None:
             return (self.rows[which][:, which] != 0).astype(float)
         generalized = self.problem.generalized
         inner = (self.inverse if generalized is None else sp.csr_array(generalized.mass)) != 0
@@ -241,10 +246,10 @@ class _Operator:
         """w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
         at = np.flatnonzero([not x == 0 for x in impulse])  # a ball about 0 is not 0 (and `!=` of it not certain)
-        if self.columns is None:
+        if self.transposed is None:
             a = _times(kind, self.rows, impulse, at)
         else:
-            pulled = _times(kind, self.rows.T.tocsr(), impulse, at)
+            pulled = _times(kind, self.transposed, impulse, at)
             if problem.generalized is None:
                 moved = _times(kind, self.inverse, pulled, None)
             else:
@@ -437,8 +442,8 @@ class _Search:
         return lam, self.operator.slack(kind, lam)
 
     def _islands(self, free: Any) -> list[Any]:
-        if not len(free):
-            return []
+        if len(free) <= SMALL:
+            return [free] if len(free) else []
         graph = self.operator.pattern(free)
         block = np.searchsorted(self.problem.cones.ptr, free, side="right")
         together = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
@@ -456,7 +461,7 @@ class _Search:
             if self.cone and block.parts and any(part.slides for part in block.parts):
                 still.discard(block.first)
         j = self.operator.rows
-        if self.operator.columns is None:
+        if self.operator.transposed is None:
             j = j[:, np.union1d(unknown, np.flatnonzero(fixed))]
         else:
             still &= set(np.flatnonzero(self.problem.compliance == 0.0).tolist())
