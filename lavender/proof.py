@@ -370,7 +370,7 @@ class _Search:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
             for _ in range(ROUNDS):
-                key = tuple((b.loaded, b.at, tuple(p.slides for p in b.parts or ())) for b in self.blocks)
+                key = tuple((b.loaded, b.at, b.touches, tuple(p.slides for p in b.parts or ())) for b in self.blocks)
                 if key in tried:
                     turned = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
@@ -665,6 +665,8 @@ class _Search:
                     sign = _sign(w[r]) * (1 if block.at == low else -1)
                     if sign < 0:
                         block.loaded = changed = True
+                    elif not sign and not block.touches:
+                        block.touches = changed = True
                     elif not sign and r not in self.still:
                         border.append(block)
                 continue
@@ -684,6 +686,8 @@ class _Search:
                     )
                 if sign < 0:
                     block.loaded = changed = True
+                elif not sign and not block.touches:
+                    block.touches = changed = True
                 elif not sign and ((self.cone and block.parts) or r not in self.still):
                     border.append(block)
                 continue
