@@ -48,6 +48,7 @@ BITS = (128, 256)  # of the balls: what the first leave undecided the second try
 UNIT = 2.0**-53
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
+PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
 SMALL = 32  # unknowns that are not parted into islands
 ROUNDS = 30  # changes of cases, as in an active-set method
 EXTENT = 10  # enlargements of X
@@ -65,7 +66,7 @@ class Enclosure:
     unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `lavender.motion.uniqueness`
     reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
-    borders: tuple[str, ...] = ()  # blocks that stand on the border of two cases, by name
+    borders: tuple[str, ...] = ()  # degenerate blocks by name: between two cases, dependent to rounding, or singular
 
     def __str__(self) -> str:
         if not self.proven:
@@ -476,9 +477,11 @@ class _Search:
         own = rows[first]
         while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
             rows = np.concatenate([own, touching])
-            kept, contradict = (
-                rows[k] for k in _dependencies(self.flint, j[rows], self.operator.target[rows])
-            )
+            try:
+                found = _dependencies(self.flint, j[rows], self.operator.target[rows])
+            except _Tangled as tangled:
+                raise self._named(rows[tangled.args[0]], "depend on each other to rounding, not exactly") from None
+            kept, contradict = (rows[k] for k in found)
             left = np.setdiff1d(touching, kept)
             if len(left) == len(touching):
                 break
@@ -500,12 +503,12 @@ class _Search:
                 block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
         if opened:
             raise _Recase
+        raise self._named(rows, "depend on other rows to rounding and contradict them in the last bits")
+
+    def _named(self, rows: Any, words: str) -> _Undecided:
         names = tuple(self.problem.row_name(int(r)) for r in rows)
-        raise _Undecided(
-            f"{_listed(names)}: depend on other rows to rounding and contradict them in the last bits; which carry "
-            "load hangs on these (a compliance on them decides it)",
-            names,
-        )
+        words += "; which carry load hangs on these (a compliance on them decides it)"
+        return _Undecided(f"{_listed(names)}: {words}", names)
 
     def _island(self, kind: Any, which: Any, lam: list[Any], base: list[Any]) -> None:
         """Enclose the impulses of `which`, by (2), into `lam`."""
@@ -583,7 +586,12 @@ class _Search:
             if inverse is None or moved > (1e-3 if parts else 0.1) * last or (parts and step < 3):
                 inverse = None if precise else self._inverse(near(x, speeds))
             if inverse is None:
-                inverse, precise = self._inverse_of_balls(over(x, speeds)), True
+                try:
+                    if n > PRECISE:
+                        raise ZeroDivisionError
+                    inverse, precise = over(x, speeds).mid().inv().mid(), True
+                except ZeroDivisionError:
+                    raise self._singular(which, near(x, speeds)) from None
             move = (inverse * value).mid()
             x = (x - move).mid()
             size, last, moved = _largest(x), moved, _largest(move)
@@ -616,10 +624,7 @@ class _Search:
                 wide = [0.25 * p for p in wide]
             if not all(math.isfinite(q) for q in wide):
                 break
-        raise _Undecided(
-            f"no box around the {n} impulses of {self.problem.row_name(int(which[0]))} and what it is coupled with "
-            "proves a zero: the equations are singular to rounding, or the answer is too far from a solution"
-        )
+        raise self._singular(which, near(x, speeds))
 
     def _inverse(self, middle: FloatArray) -> Any:
         n = len(middle)
@@ -633,11 +638,19 @@ class _Search:
             good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
         return self.flint.arb_mat(n, n, inverse.ravel().tolist()) if good else None
 
-    def _inverse_of_balls(self, slope: Any) -> Any:
-        try:
-            return slope.mid().inv().mid()
-        except ZeroDivisionError:
-            raise _Undecided("the equations of its cases are singular") from None
+    def _singular(self, which: Any, slope: FloatArray) -> _Undecided:
+        """Names the blocks whose impulses the equations do not fix, if they are singular."""
+        rows = which[:0]
+        if np.isfinite(slope).all():
+            _, size, direction = np.linalg.svd(slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT))
+            if size[-1] <= 1e-12 * size[0]:
+                rows = which[abs(direction[-1]) > 0.1 * abs(direction[-1]).max()]
+        words = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
+        if len(rows):
+            words = "their equations are singular to rounding; a family of solutions, or one between two cases"
+        first = self.problem.cones.ptr[np.searchsorted(self.problem.cones.ptr, rows, side="right") - 1]
+        names = tuple(dict.fromkeys(self.problem.row_name(int(r)) for r in first))
+        return _Undecided(f"{_listed(names) or f'{len(which)} impulses that are coupled'}: {words}", names)
 
     # -- inequalities ---------------------------------------------------------------------------
 
@@ -728,6 +741,10 @@ class _Search:
         return Enclosure(True, off, speed, unique, reason, read_only(np.array([float(x.mid()) for x in lam])))
 
 
+class _Tangled(Exception):
+    """Rows that depend on each other to rounding, by no simple quotients."""
+
+
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
 
@@ -785,7 +802,7 @@ def _dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
             if found is not None:
                 break
         else:
-            raise _Undecided("rows that depend on each other to rounding by no simple quotients")
+            raise _Tangled(rows)
         kept.append(rows[found[0]])
         contradict.append(rows[found[1]])
     return np.sort(np.concatenate(kept)), np.sort(np.concatenate(contradict))
