@@ -66,7 +66,9 @@ class Enclosure:
     unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `lavender.motion.uniqueness`
     reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
-    borders: tuple[str, ...] = ()  # degenerate blocks by name: between two cases, dependent to rounding, or singular
+    borders: tuple[
+        str, ...
+    ] = ()  # degenerate blocks by name: between two cases, dependent to rounding, or singular
 
     def __str__(self) -> str:
         if not self.proven:
@@ -231,7 +233,7 @@ class _Operator:
         return a
 
     def pattern(self, which: Any) -> Any:
-        """Where A of these rows and columns may be other than 0: where it is a sum of products, none of which may cancel."""
+        """Where A of these rows and columns may be other than 0: float64 may round a sum of products to 0."""
         if self.transposed is None:
             return (self.rows[which][:, which] != 0).astype(float)
         generalized = self.problem.generalized
@@ -246,7 +248,8 @@ class _Operator:
     def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
         """w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
-        at = np.flatnonzero([not x == 0 for x in impulse])  # a ball about 0 is not 0 (and `!=` of it not certain)
+        # A ball about 0 is not 0; `!=` would have to be certain.
+        at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
         if self.transposed is None:
             a = _times(kind, self.rows, impulse, at)
         else:
@@ -261,7 +264,6 @@ class _Operator:
             x + number(t) * y - b if t else x - b
             for x, t, y, b in zip(a, theta, impulse, self.bias(kind), strict=True)
         ]
-
 
     def semidefinite(self) -> bool:
         """Proof that x.A x >= 0 for every x, of exact numbers."""
@@ -370,8 +372,11 @@ class _Search:
         try:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
+            exactly = False  # in rational numbers, once balls cannot tell
             for _ in range(ROUNDS):
-                key = tuple((b.loaded, b.at, b.touches, tuple(p.slides for p in b.parts or ())) for b in self.blocks)
+                key = tuple(
+                    (b.loaded, b.at, b.touches, tuple(p.slides for p in b.parts or ())) for b in self.blocks
+                )
                 if key in tried:
                     turned = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
@@ -383,10 +388,11 @@ class _Search:
                     lam, w = self._solve()
                 except _Recase:
                     continue
-                borders = self._changed(lam, w)
-                if borders and self.exact:
-                    exact, w_exact = self._solve(_Rationals(self.flint))
-                    borders = self._changed(exact, w_exact)
+                if not (exactly and self.exact):
+                    borders = self._changed(lam, w)
+                    exactly = bool(borders) and self.exact
+                if exactly:
+                    borders = self._changed(*self._solve(_Rationals(self.flint)))
                 if borders == []:
                     return self._told(lam, w)
                 if borders:
@@ -467,7 +473,9 @@ class _Search:
         else:
             still &= set(np.flatnonzero(self.problem.compliance == 0.0).tolist())
         touches = (b for b in self.blocks if b.touches and not b.loaded)
-        touching = np.array([b.first for b in touches if not (b.at and self.operator.soft(b.first))], np.int64)
+        touching = np.array(
+            [b.first for b in touches if not (b.at and self.operator.soft(b.first))], np.int64
+        )
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
@@ -480,7 +488,12 @@ class _Search:
             try:
                 found = _dependencies(self.flint, j[rows], self.operator.target[rows])
             except _Tangled as tangled:
-                raise self._named(rows[tangled.args[0]], "depend on each other to rounding, not exactly") from None
+                if len(touching):
+                    touching = touching[:0]
+                    continue
+                raise self._named(
+                    rows[tangled.args[0]], "depend on each other to rounding, not exactly"
+                ) from None
             kept, contradict = (rows[k] for k in found)
             left = np.setdiff1d(touching, kept)
             if len(left) == len(touching):
@@ -497,7 +510,10 @@ class _Search:
         opened = False
         for block in self.blocks:
             if block.loaded and block.first in rows and not block.parts:
-                low, high = float(self.problem.cones.lower[block.first]), float(self.problem.cones.upper[block.first])
+                low, high = (
+                    float(self.problem.cones.lower[block.first]),
+                    float(self.problem.cones.upper[block.first]),
+                )
                 if low == -math.inf and high == math.inf:
                     continue
                 block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
@@ -642,12 +658,16 @@ class _Search:
         """Names the blocks whose impulses the equations do not fix, if they are singular."""
         rows = which[:0]
         if np.isfinite(slope).all():
-            _, size, direction = np.linalg.svd(slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT))
+            _, size, direction = np.linalg.svd(
+                slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
+            )
             if size[-1] <= 1e-12 * size[0]:
                 rows = which[abs(direction[-1]) > 0.1 * abs(direction[-1]).max()]
         words = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
         if len(rows):
-            words = "their equations are singular to rounding; a family of solutions, or one between two cases"
+            words = (
+                "their equations are singular to rounding; a family of solutions, or one between two cases"
+            )
         first = self.problem.cones.ptr[np.searchsorted(self.problem.cones.ptr, rows, side="right") - 1]
         names = tuple(dict.fromkeys(self.problem.row_name(int(r)) for r in first))
         return _Undecided(f"{_listed(names) or f'{len(which)} impulses that are coupled'}: {words}", names)

@@ -21,7 +21,9 @@ import lavender as lv
 from lavender import proof
 
 getcontext().prec = 60
-SLACK = Fraction(1, 10**25)  # of the largest number of the problem: the centre is 1e-30 from the exact solution
+SLACK = Fraction(
+    1, 10**25
+)  # of the largest number of the problem: the centre is 1e-30 from the exact solution
 KINDS = ("row", "contact", "spin", "round", "box", "ellipse", "rolling", "pair", "normal", "frictionless")
 WHOLE = {1: ([5], 5), 2: ([3, 4], 5), 3: ([1, 2, 2], 3), 4: ([1, 2, 2, 4], 5), 5: ([1, 1, 1, 2, 3], 4)}
 
@@ -31,7 +33,9 @@ def cones_of(kind, rng):
     mu = 2.0 ** int(rng.integers(-2, 2))
     two = [([1, 2], [mu, mu])]
     if kind == "row":
-        low, high = [(-np.inf, np.inf), (0.0, np.inf), (-64.0, 64.0), (3.0, 3.0), (-np.inf, 8.0)][rng.integers(5)]
+        low, high = [(-np.inf, np.inf), (0.0, np.inf), (-64.0, 64.0), (3.0, 3.0), (-np.inf, 8.0)][
+            rng.integers(5)
+        ]
         return lv.Cones.bounded([low], [high]), []
     if kind == "normal":
         return lv.Cones.contacts(mu, tangents=0), []
@@ -134,7 +138,9 @@ def exact_slack(problem, x):
     mass = np.diag(problem.generalized.mass.toarray()).tolist()  # planted ones are diagonal
     moved = [p / Fraction(q) for p, q in zip(pulled, mass, strict=True)]
     return [
-        sum((p * q for p, q in zip(row, moved, strict=True) if p), Fraction(0)) + Fraction(t) * y - Fraction(b)
+        sum((p * q for p, q in zip(row, moved, strict=True) if p), Fraction(0))
+        + Fraction(t) * y
+        - Fraction(b)
         for row, t, y, b in zip(j, problem.compliance.tolist(), x, problem.b.tolist(), strict=True)
     ]
 
@@ -236,12 +242,19 @@ def attack(seed):
         return label, False, None if found.reason else "no reason"
     size = 1 + max(map(abs, centre.x), default=0) ** 2
     words, amount = violation(problem, centre.x)
-    off = max((abs(p - Fraction(q)) for p, q in zip(centre.x, given.tolist(), strict=True)), default=Fraction(0))
+    off = max(
+        (abs(p - Fraction(q)) for p, q in zip(centre.x, given.tolist(), strict=True)), default=Fraction(0)
+    )
     own = exact_slack(problem, [Fraction(q) for q in given.tolist()])
-    moved = max((abs(p - q) for p, q in zip(exact_slack(problem, centre.x), own, strict=True)), default=Fraction(0))
+    moved = max(
+        (abs(p - q) for p, q in zip(exact_slack(problem, centre.x), own, strict=True)), default=Fraction(0)
+    )
     if amount > SLACK * size:
         return label, True, f"{words} is off by {float(amount):.1e}"
-    if off > Fraction(found.impulse_radius) + SLACK * size or moved > Fraction(found.velocity_radius) + SLACK * size:
+    if (
+        off > Fraction(found.impulse_radius) + SLACK * size
+        or moved > Fraction(found.velocity_radius) + SLACK * size
+    ):
         return label, True, f"{float(off):.3e} outside {found.impulse_radius:.3e}"
     if found.unique and way != "rounded":
         gap = max(abs(p - q) for p, q in zip(exact_slack(problem, [Fraction(q) for q in exact.tolist()]),
