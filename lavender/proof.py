@@ -121,8 +121,9 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
     for bits in BITS:
         with _balls(bits) as flint:
-            found = _Search(flint, problem, given).run()
-        if found.proven:
+            search = _Search(flint, problem, given)
+            found = search.run()
+        if found.proven or search.singular:
             break
     return found
 
@@ -335,6 +336,7 @@ class _Search:
         self.operator, self.cone = _Operator(problem), problem.law == "cone"
         self.blocks = self._cases()
         self.family: Any = np.zeros(0, np.int64)
+        self.singular = False  # in float64: more bits do not help
         self.still: Any = np.zeros(0, np.int32)  # rows of blocks that touch: w = 0, by rows it depends on
 
     # -- cases ----------------------------------------------------------------------------------
@@ -662,6 +664,7 @@ class _Search:
                 slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
             )
             if size[-1] <= 1e-12 * size[0]:
+                self.singular = True
                 rows = which[abs(direction[-1]) > 0.1 * abs(direction[-1]).max()]
         words = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
         if len(rows):
