@@ -49,6 +49,7 @@ UNIT = 2.0**-53
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
 PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
+SLOW = 1e-9  # of the largest b: a speed that an answer may have where the solution sticks
 SMALL = 32  # unknowns that are not parted into islands
 ROUNDS = 30  # changes of cases, as in an active-set method
 EXTENT = 10  # enlargements of X
@@ -594,7 +595,7 @@ class _Search:
         floats = np.asarray(self.problem.csr[which][:, which].toarray())
         unit = matrix(n, n, np.eye(n).ravel().tolist())
         x = matrix(n, 1, [number(float(self.given[r])) for r in which.tolist()])
-        inverse, precise = None, False
+        start, inverse, precise = x, None, False
         moved = last = math.inf
         for step in range(30):
             value, speeds = f(x)
@@ -642,7 +643,15 @@ class _Search:
                 wide = [0.25 * p for p in wide]
             if not all(math.isfinite(q) for q in wide):
                 break
-        raise self._singular(which, near(x, speeds))
+        # What hardly slides at the answer may stick.
+        _, speeds_given = f(start)
+        hardly = SLOW * float(abs(self.problem.b).max())
+        slow = [part for (_, part), (_, s) in zip(parts, speeds_given, strict=True) if not s > hardly]
+        for part in slow:
+            part.slides = False
+        if slow:
+            raise _Recase
+        raise self._singular(which, near(start, speeds_given))
 
     def _inverse(self, middle: FloatArray) -> Any:
         n = len(middle)
