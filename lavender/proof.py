@@ -48,6 +48,9 @@ BITS = (128, 256)  # of the balls: what the first leave undecided the second try
 UNIT = 2.0**-53
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
+PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
+SLOW = 1e-9  # of the largest b: a speed that an answer may have where the solution sticks
+SMALL = 32  # unknowns that are not parted into islands
 ROUNDS = 30  # changes of cases, as in an active-set method
 EXTENT = 10  # enlargements of X
 
@@ -64,7 +67,9 @@ class Enclosure:
     unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `lavender.motion.uniqueness`
     reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
-    borders: tuple[str, ...] = ()  # blocks that stand on the border of two cases, by name
+    borders: tuple[
+        str, ...
+    ] = ()  # degenerate blocks by name: between two cases, dependent to rounding, or singular
 
     def __str__(self) -> str:
         if not self.proven:
@@ -117,8 +122,9 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
     for bits in BITS:
         with _balls(bits) as flint:
-            found = _Search(flint, problem, given).run()
-        if found.proven:
+            search = _Search(flint, problem, given)
+            found = search.run()
+        if found.proven or search.singular:
             break
     return found
 
@@ -173,8 +179,10 @@ class _Operator:
         self.rows = problem.csr if problem.matrix is not None else problem.jacobian
         if problem.matrix is None and problem.rows is not None:
             self.inverse = problem.rows.inverse_mass_matrix().tocsr()
-        self.columns = self.rows.tocsc() if problem.matrix is None else None
+        self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
         self.target, self.v = self._targets()
+        self._mass: dict[Any, Any] = {}  # M^-1, by kind of number
+        self._bias: dict[Any, list[Any]] = {}  # b
 
     def _targets(self) -> tuple[FloatArray, FloatArray | None]:
         """What b was made of, target - J v*: a target that is nothing but rounding is 0. (b, None) of a matrix."""
@@ -186,24 +194,32 @@ class _Operator:
         dust = 4.0 * UNIT * (abs(self.rows) @ abs(v) * (1 + np.diff(self.rows.indptr)) + abs(problem.b))
         return np.where(abs(target) <= dust, 0.0, target), v
 
+    def soft(self, row: int) -> bool:
+        return self.transposed is not None and bool(self.problem.compliance[row] > 0.0)
+
     def bias(self, kind: Any) -> list[Any]:
         """b of exact numbers."""
+        if type(kind) in self._bias:
+            return self._bias[type(kind)]
         out = [kind.number(x) for x in self.target.tolist()]
-        if self.v is None:
-            return out
-        moved = _times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
-        return [x - y for x, y in zip(out, moved, strict=True)]
+        if self.v is not None:
+            moved = _times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
+            out = [x - y for x, y in zip(out, moved, strict=True)]
+        self._bias[type(kind)] = out
+        return out
 
     def weighed(self, kind: Any, right: Any) -> Any:
         """M^-1 times a matrix of balls or rationals (nv, k)."""
         generalized = self.problem.generalized
         if generalized is None:
             return _matrix(kind, self.inverse) * right
-        return _matrix(kind, generalized.mass).solve(right)
+        if type(kind) not in self._mass:
+            self._mass[type(kind)] = _matrix(kind, generalized.mass).inv()
+        return self._mass[type(kind)] * right
 
     def block(self, kind: Any, which: Any) -> Any:
         """A of these rows and columns."""
-        if self.columns is None:
+        if self.transposed is None:
             return _matrix(kind, self.rows[which][:, which])
         part = self.rows[which]
         used = np.unique(part.indices)
@@ -218,14 +234,28 @@ class _Operator:
             a[k, k] += kind.number(float(self.problem.compliance[i]))
         return a
 
+    def pattern(self, which: Any) -> Any:
+        """Where A of these rows and columns may be other than 0: float64 may round a sum of products to 0."""
+        if self.transposed is None:
+            return (self.rows[which][:, which] != 0).astype(float)
+        generalized = self.problem.generalized
+        inner = (self.inverse if generalized is None else sp.csr_array(generalized.mass)) != 0
+        if generalized is not None:
+            label = sp.csgraph.connected_components(inner, directed=False)[1]
+            inner = sp.coo_array((np.ones(len(label)), (np.arange(len(label)), label))).tocsr()
+            inner = inner @ inner.T
+        j = (self.rows[which] != 0).astype(float)
+        return j @ inner.astype(float) @ j.T
+
     def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
         """w = A lambda - b of all rows."""
         problem, number = self.problem, kind.number
-        at = np.flatnonzero([x != 0 for x in impulse])
-        if self.columns is None:
+        # A ball about 0 is not 0; `!=` would have to be certain.
+        at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
+        if self.transposed is None:
             a = _times(kind, self.rows, impulse, at)
         else:
-            pulled = _times(kind, self.rows.T.tocsr(), impulse, at)
+            pulled = _times(kind, self.transposed, impulse, at)
             if problem.generalized is None:
                 moved = _times(kind, self.inverse, pulled, None)
             else:
@@ -236,6 +266,35 @@ class _Operator:
             x + number(t) * y - b if t else x - b
             for x, t, y, b in zip(a, theta, impulse, self.bias(kind), strict=True)
         ]
+
+    def semidefinite(self) -> bool:
+        """Proof that x.A x >= 0 for every x, of exact numbers."""
+        problem = self.problem
+        if problem.matrix is not None:
+            return _semidefinite(problem.dense())
+        if problem.generalized is not None:
+            return _semidefinite(problem.generalized.mass.toarray())
+        return bool((problem.rows.inv_mass >= 0.0).all()) and _semidefinite(problem.rows.inv_inertia)
+
+
+def _semidefinite(a: FloatArray) -> bool:
+    """Whether Cholesky of symmetric matrices (..., n, n) less c I runs through, c what it may round.
+
+    S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.
+    """
+    if not (a == np.swapaxes(a, -1, -2)).all():
+        return False
+    n = a.shape[-1]
+    eye, empty = np.eye(n), ~(a != 0.0).any(axis=-1)
+    scale = abs(a).max(axis=(-1, -2), keepdims=True, initial=0.0)
+    a = a / np.exp2(np.ceil(np.log2(np.where(scale > 0.0, scale, 1.0)))) + empty[..., None] * eye
+    trace = np.trace(a, axis1=-2, axis2=-1)[..., None, None]
+    try:
+        # Twice as much: of the trace, of the subtraction and of what underflows, too.
+        np.linalg.cholesky(a - 2.0 * (n + 3) * UNIT * np.maximum(trace, 1.0) * eye)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 class _Balls:
@@ -278,6 +337,7 @@ class _Search:
         self.operator, self.cone = _Operator(problem), problem.law == "cone"
         self.blocks = self._cases()
         self.family: Any = np.zeros(0, np.int64)
+        self.singular = False  # in float64: more bits do not help
         self.still: Any = np.zeros(0, np.int32)  # rows of blocks that touch: w = 0, by rows it depends on
 
     # -- cases ----------------------------------------------------------------------------------
@@ -315,8 +375,11 @@ class _Search:
         try:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
+            exactly = False  # in rational numbers, once balls cannot tell
             for _ in range(ROUNDS):
-                key = tuple((b.loaded, b.at, tuple(p.slides for p in b.parts or ())) for b in self.blocks)
+                key = tuple(
+                    (b.loaded, b.at, b.touches, tuple(p.slides for p in b.parts or ())) for b in self.blocks
+                )
                 if key in tried:
                     turned = [
                         b for b, one, other in zip(self.blocks, key, before, strict=True) if one != other
@@ -328,10 +391,11 @@ class _Search:
                     lam, w = self._solve()
                 except _Recase:
                     continue
-                borders = self._changed(lam, w)
-                if borders and self.exact:
-                    exact, w_exact = self._solve(_Rationals(self.flint))
-                    borders = self._changed(exact, w_exact)
+                if not (exactly and self.exact):
+                    borders = self._changed(lam, w)
+                    exactly = bool(borders) and self.exact
+                if exactly:
+                    borders = self._changed(*self._solve(_Rationals(self.flint)))
                 if borders == []:
                     return self._told(lam, w)
                 if borders:
@@ -388,9 +452,9 @@ class _Search:
         return lam, self.operator.slack(kind, lam)
 
     def _islands(self, free: Any) -> list[Any]:
-        if not len(free):
-            return []
-        graph = abs(self.problem.csr[free][:, free])
+        if len(free) <= SMALL:
+            return [free] if len(free) else []
+        graph = self.operator.pattern(free)
         block = np.searchsorted(self.problem.cones.ptr, free, side="right")
         together = sp.coo_array((np.ones(len(free)), (np.arange(len(free)), block))).tocsr()
         graph = graph + together @ together.T
@@ -407,23 +471,41 @@ class _Search:
             if self.cone and block.parts and any(part.slides for part in block.parts):
                 still.discard(block.first)
         j = self.operator.rows
-        if self.operator.columns is None:
+        if self.operator.transposed is None:
             j = j[:, np.union1d(unknown, np.flatnonzero(fixed))]
         else:
             still &= set(np.flatnonzero(self.problem.compliance == 0.0).tolist())
-        touching = np.array([b.first for b in self.blocks if b.touches and not b.loaded], np.int64)
+        touches = (b for b in self.blocks if b.touches and not b.loaded)
+        touching = np.array(
+            [b.first for b in touches if not (b.at and self.operator.soft(b.first))], np.int64
+        )
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
         first, numerical = _pivots(j[rows].toarray())
         if numerical == len(rows) and not len(touching):
             return unknown
-        rows = np.concatenate([rows[first], touching])
-        kept, contradict = (rows[k] for k in _dependencies(self.flint, j[rows], self.operator.target[rows]))
+        own = rows[first]
+        while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
+            rows = np.concatenate([own, touching])
+            try:
+                found = _dependencies(self.flint, j[rows], self.operator.target[rows])
+            except _Tangled as tangled:
+                if len(touching):
+                    touching = touching[:0]
+                    continue
+                raise self._named(
+                    rows[tangled.args[0]], "depend on each other to rounding, not exactly"
+                ) from None
+            kept, contradict = (rows[k] for k in found)
+            left = np.setdiff1d(touching, kept)
+            if len(left) == len(touching):
+                break
+            touching = left
         wrong = np.setdiff1d(contradict, touching)
         if len(wrong):
             self._open(wrong)
-        self.still = np.setdiff1d(touching, np.concatenate([kept, contradict]))
+        self.still = np.setdiff1d(touching, contradict)
         return np.setdiff1d(unknown, np.setdiff1d(rows, kept))
 
     def _open(self, rows: Any) -> None:
@@ -431,15 +513,21 @@ class _Search:
         opened = False
         for block in self.blocks:
             if block.loaded and block.first in rows and not block.parts:
-                block.loaded, opened = False, True
+                low, high = (
+                    float(self.problem.cones.lower[block.first]),
+                    float(self.problem.cones.upper[block.first]),
+                )
+                if low == -math.inf and high == math.inf:
+                    continue
+                block.loaded, block.at, opened = False, low if math.isfinite(low) else high, True
         if opened:
             raise _Recase
+        raise self._named(rows, "depend on other rows to rounding and contradict them in the last bits")
+
+    def _named(self, rows: Any, words: str) -> _Undecided:
         names = tuple(self.problem.row_name(int(r)) for r in rows)
-        raise _Undecided(
-            f"{_listed(names)}: depend on other rows to rounding and contradict them in the last bits; which carry "
-            "load hangs on these (a compliance on them decides it)",
-            names,
-        )
+        words += "; which carry load hangs on these (a compliance on them decides it)"
+        return _Undecided(f"{_listed(names)}: {words}", names)
 
     def _island(self, kind: Any, which: Any, lam: list[Any], base: list[Any]) -> None:
         """Enclose the impulses of `which`, by (2), into `lam`."""
@@ -476,43 +564,58 @@ class _Search:
                     out[place[first]] -= s
             return matrix(n, 1, out), speeds
 
-        def slope(x: Any, speeds: Any) -> Any:
-            """F' over a box."""
-            out = matrix(a)
+        def slope(x: Any, speeds: Any, left: Any, right: Any, other: Any) -> Any:
+            """F' = left A + right over a box, into two matrices of 1 and 0."""
             for (first, part), (w, s) in zip(parts, speeds, strict=True):
-                at = [place[r] for r in part.rows]
-                share = [
-                    number(c) * number(c) * w[k, 0] / s for k, c in zip(at, part.reach, strict=True)
-                ]  # ds = share . dw
+                at = [(place[r], number(c) * number(c)) for r, c in zip(part.rows, part.reach, strict=True)]
+                share = [c2 * w[k, 0] / s for k, c2 in at]  # ds = share . dw
                 normal = x[place[first], 0] if first in place else lam[first]
-                ds = [sum((share[q] * a[k, j] for q, k in enumerate(at)), number(0.0)) for j in range(n)]
-                for k, c in zip(at, part.reach, strict=True):
-                    c2 = number(c) * number(c)
-                    for j in range(n):
-                        out[k, j] = x[k, 0] * ds[j] + c2 * normal * a[k, j]
-                    out[k, k] += s
+                for k, c2 in at:
+                    for (q, _), ds in zip(at, share, strict=True):
+                        left[k, q] = other(x[k, 0] * ds + (c2 * normal if q == k else 0))
+                    right[k, k] = other(s)
                     if first in place:
-                        out[k, place[first]] += c2 * w[k, 0]
+                        right[k, place[first]] = other(c2 * w[k, 0])
                 if self.cone and first in place:
-                    for j in range(n):
-                        out[place[first], j] -= ds[j]
-            return out
+                    for (q, _), ds in zip(at, share, strict=True):
+                        left[place[first], q] = other(-ds)
 
+        def near(x: Any, speeds: Any) -> FloatArray:
+            left, right = np.eye(n), np.zeros((n, n))
+            slope(x, speeds, left, right, float)
+            return left @ floats + right
+
+        def over(x: Any, speeds: Any) -> Any:
+            if not parts:
+                return a
+            left, right = matrix(unit), matrix(n, n)
+            slope(x, speeds, left, right, number)
+            return left * a + right
+
+        floats = np.asarray(self.problem.csr[which][:, which].toarray())
+        unit = matrix(n, n, np.eye(n).ravel().tolist())
         x = matrix(n, 1, [number(float(self.given[r])) for r in which.tolist()])
-        inverse = None
-        for step in range(12):
+        start, inverse, precise = x, None, False
+        moved = last = math.inf
+        for step in range(30):
             value, speeds = f(x)
             if any(not (s > 0) for _, s in speeds):
                 break  # its case is wrong, or on the border
-            if inverse is None or (parts and step < 3):
-                inverse = self._inverse(slope(x, speeds))
+            precise = precise or (step > 6 and moved > 0.1 * last)
+            if inverse is None or moved > (1e-3 if parts else 0.1) * last or (parts and step < 3):
+                inverse = None if precise else self._inverse(near(x, speeds))
+            if inverse is None:
+                try:
+                    if n > PRECISE:
+                        raise ZeroDivisionError
+                    inverse, precise = over(x, speeds).mid().inv().mid(), True
+                except ZeroDivisionError:
+                    raise self._singular(which, near(x, speeds)) from None
             move = (inverse * value).mid()
             x = (x - move).mid()
-            size = max(abs(float(q)) for q in x.entries())
-            if (
-                max(abs(float(q)) for q in move.entries()) <= 2.0 ** (8 - self.flint.ctx.prec // 2) * size
-                and step > 1
-            ):
+            size, last, moved = _largest(x), moved, _largest(move)
+            enough = moved <= 2.0 ** (-0.75 * self.flint.ctx.prec) * size
+            if step > 1 and (enough or (precise and step > 9 and moved > 0.1 * last)):
                 break
         value, speeds = f(x)
         still = [part for (_, part), (_, s) in zip(parts, speeds, strict=True) if not s > 0]
@@ -522,17 +625,14 @@ class _Search:
             raise _Recase
         newton = inverse * value
         radius = [2.0 * _up(q) for q in newton.entries()]
-        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * max(
-            abs(float(q)) for q in x.entries()
-        )
-        unit = matrix(n, n, [float(i == j) for i in range(n) for j in range(n)])
+        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * _largest(x) + 2.0**-900
         wide = [max(q, 1e-6 * least) for q in radius]
         for _ in range(EXTENT):
             ball = matrix(n, 1, [number(0.0, q) for q in wide])
             box = x + ball
             value, speeds = f(box)
             if all(s > 0 for _, s in speeds):
-                away = (unit - inverse * slope(box, speeds)) * ball - newton
+                away = (unit - inverse * over(box, speeds)) * ball - newton
                 reach = [_up(q) for q in away.entries()]
                 if all(q < p for q, p in zip(reach, wide, strict=True)):
                     for r in which.tolist():
@@ -543,28 +643,46 @@ class _Search:
                 wide = [0.25 * p for p in wide]
             if not all(math.isfinite(q) for q in wide):
                 break
-        raise _Undecided(
-            f"no box around the {n} impulses of {self.problem.row_name(int(which[0]))} and what it is coupled with "
-            "proves a zero: the equations are singular to rounding, or the answer is too far from a solution"
-        )
+        # What hardly slides at the answer may stick.
+        _, speeds_given = f(start)
+        hardly = SLOW * float(abs(self.problem.b).max())
+        slow = [part for (_, part), (_, s) in zip(parts, speeds_given, strict=True) if not s > hardly]
+        for part in slow:
+            part.slides = False
+        if slow:
+            raise _Recase
+        raise self._singular(which, near(start, speeds_given))
 
-    def _inverse(self, slope: Any) -> Any:
-        n = slope.nrows()
-        middle = np.array([float(q.mid()) for q in slope.entries()]).reshape(n, n)
+    def _inverse(self, middle: FloatArray) -> Any:
+        n = len(middle)
         with np.errstate(all="ignore"):
             scale = np.sqrt(np.maximum(abs(middle).max(axis=0), np.finfo(float).tiny))
             row = np.maximum(abs(middle / scale).max(axis=1), np.finfo(float).tiny)
-        try:
-            inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
-        except np.linalg.LinAlgError:
-            inverse = np.full((n, n), np.nan)
-        good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
-        if good:
-            return self.flint.arb_mat(n, n, inverse.ravel().tolist())
-        try:
-            return slope.mid().inv().mid()
-        except ZeroDivisionError:
-            raise _Undecided("the equations of its cases are singular") from None
+            try:
+                inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
+            except np.linalg.LinAlgError:
+                return None
+            good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
+        return self.flint.arb_mat(n, n, inverse.ravel().tolist()) if good else None
+
+    def _singular(self, which: Any, slope: FloatArray) -> _Undecided:
+        """Names the blocks whose impulses the equations do not fix, if they are singular."""
+        rows = which[:0]
+        if np.isfinite(slope).all():
+            _, size, direction = np.linalg.svd(
+                slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
+            )
+            if size[-1] <= 1e-12 * size[0]:
+                self.singular = True
+                rows = which[abs(direction[-1]) > 0.1 * abs(direction[-1]).max()]
+        words = "no box proves a zero: the answer is too far from a solution, or two solutions are near"
+        if len(rows):
+            words = (
+                "their equations are singular to rounding; a family of solutions, or one between two cases"
+            )
+        first = self.problem.cones.ptr[np.searchsorted(self.problem.cones.ptr, rows, side="right") - 1]
+        names = tuple(dict.fromkeys(self.problem.row_name(int(r)) for r in first))
+        return _Undecided(f"{_listed(names) or f'{len(which)} impulses that are coupled'}: {words}", names)
 
     # -- inequalities ---------------------------------------------------------------------------
 
@@ -592,6 +710,8 @@ class _Search:
                     sign = _sign(w[r]) * (1 if block.at == low else -1)
                     if sign < 0:
                         block.loaded = changed = True
+                    elif not sign and not block.touches:
+                        block.touches = changed = True
                     elif not sign and r not in self.still:
                         border.append(block)
                 continue
@@ -607,10 +727,12 @@ class _Search:
                     sign = (
                         _sign(w[r] * w[r] - speeds[0])
                         if len(speeds) == 1
-                        else _sign(w[r] - sum((s.sqrt() for s in speeds), 0 * w[r]))
+                        else _sign(w[r] - sum((self._root(s) for s in speeds), self.flint.arb(0)))
                     )
                 if sign < 0:
                     block.loaded = changed = True
+                elif not sign and not block.touches:
+                    block.touches = changed = True
                 elif not sign and ((self.cone and block.parts) or r not in self.still):
                     border.append(block)
                 continue
@@ -632,6 +754,11 @@ class _Search:
                     border.append(block)
         return None if changed else border
 
+    def _root(self, square: Any) -> Any:
+        """A ball that holds the root; a ball of a square may reach below 0."""
+        square = self.flint.arb(square)
+        return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
+
     def _told(self, lam: list[Any], w: list[Any]) -> Enclosure:
         kind = _Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
@@ -641,10 +768,13 @@ class _Search:
         if len(self.family):
             names = tuple(self.problem.row_name(int(r)) for r in self.family)
             reason = f"the impulses of {_listed(names)} are one of a family"
-        unique = self.problem.law != "coulomb" and self.problem.is_semidefinite
-        if self.problem.law == "coulomb":
-            unique = uniqueness(self.problem.disk).proved
+        convex = self.problem.law != "coulomb"
+        unique = self.operator.semidefinite() if convex else uniqueness(self.problem.disk).proved
         return Enclosure(True, off, speed, unique, reason, read_only(np.array([float(x.mid()) for x in lam])))
+
+
+class _Tangled(Exception):
+    """Rows that depend on each other to rounding, by no simple quotients."""
 
 
 class _Recase(Exception):
@@ -657,7 +787,12 @@ def _listed(names: tuple[str, ...]) -> str:
 
 def _up(x: Any) -> float:
     """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
-    return float(abs(x).upper()) * (1.0 + 2.0**-50)
+    up = abs(x).upper()
+    return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
+
+
+def _largest(x: Any) -> float:
+    return max((abs(float(q)) for q in x.entries()), default=0.0)
 
 
 def _squared(x: Any) -> Any:
@@ -699,7 +834,7 @@ def _dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
             if found is not None:
                 break
         else:
-            raise _Undecided("rows that depend on each other to rounding by no simple quotients")
+            raise _Tangled(rows)
         kept.append(rows[found[0]])
         contradict.append(rows[found[1]])
     return np.sort(np.concatenate(kept)), np.sort(np.concatenate(contradict))
