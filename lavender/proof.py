@@ -122,7 +122,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
     for bits in BITS:
         with _balls(bits) as flint:
-            search = _Search(flint, problem, given)
+            search = Search(flint, problem, given)
             found = search.run()
         if found.proven or search.singular:
             break
@@ -171,7 +171,7 @@ class _Undecided(Exception):
         self.borders = borders
 
 
-class _Operator:
+class Operator:
     """A of float64 numbers that are taken as exact: its rows times impulses, and blocks of it, in numbers of a kind."""
 
     def __init__(self, problem: Problem) -> None:
@@ -297,7 +297,7 @@ def _semidefinite(a: FloatArray) -> bool:
     return True
 
 
-class _Balls:
+class Balls:
     def __init__(self, flint: Any) -> None:
         self.number, self.matrix = flint.arb, flint.arb_mat
 
@@ -329,12 +329,12 @@ def _times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
     return out
 
 
-class _Search:
+class Search:
     """Cases of all blocks, their equations, and the changes of cases that inequalities ask for."""
 
     def __init__(self, flint: Any, problem: Problem, given: FloatArray) -> None:
         self.flint, self.problem, self.given = flint, problem, given
-        self.operator, self.cone = _Operator(problem), problem.law == "cone"
+        self.operator, self.cone = Operator(problem), problem.law == "cone"
         self.blocks = self._cases()
         self.family: Any = np.zeros(0, np.int64)
         self.singular = False  # in float64: more bits do not help
@@ -397,14 +397,21 @@ class _Search:
                 if exactly:
                     borders = self._changed(*self._solve(_Rationals(self.flint)))
                 if borders == []:
-                    return self._told(lam, w)
+                    return self.told(lam, w)
                 if borders:
                     raise self._undecided(
                         borders, f"on the border of two cases, closer than {self.flint.ctx.prec} bits tell"
                     )
             raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
         except _Undecided as undecided:
-            return Enclosure(False, math.inf, math.inf, False, str(undecided), None, undecided.borders)
+            return Enclosure(
+                proven=False,
+                impulse_radius=math.inf,
+                velocity_radius=math.inf,
+                unique=False,
+                reason=str(undecided),
+                borders=undecided.borders,
+            )
 
     def _undecided(self, blocks: list[_Block], words: str) -> _Undecided:
         names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))
@@ -428,7 +435,7 @@ class _Search:
 
     def _solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
         """Balls that hold a zero of the equations, or the zero in rationals: impulses and slack of all rows."""
-        kind = _Balls(self.flint) if kind is None else kind
+        kind = Balls(self.flint) if kind is None else kind
         self.number = kind.number
         unknown, fixed = self._unknown()
         free = self._independent(unknown, fixed)
@@ -624,7 +631,7 @@ class _Search:
         if still:
             raise _Recase
         newton = inverse * value
-        radius = [2.0 * _up(q) for q in newton.entries()]
+        radius = [2.0 * upper_end(q) for q in newton.entries()]
         least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * _largest(x) + 2.0**-900
         wide = [max(q, 1e-6 * least) for q in radius]
         for _ in range(EXTENT):
@@ -633,7 +640,7 @@ class _Search:
             value, speeds = f(box)
             if all(s > 0 for _, s in speeds):
                 away = (unit - inverse * over(box, speeds)) * ball - newton
-                reach = [_up(q) for q in away.entries()]
+                reach = [upper_end(q) for q in away.entries()]
                 if all(q < p for q, p in zip(reach, wide, strict=True)):
                     for r in which.tolist():
                         lam[r] = x[place[r], 0] + number(0.0, reach[place[r]])
@@ -695,8 +702,8 @@ class _Search:
             if block.parts is None:
                 low, high = float(cones.lower[r]), float(cones.upper[r])
                 if block.loaded:
-                    below = _sign(lam[r] - number(low)) if math.isfinite(low) else 1
-                    above = _sign(number(high) - lam[r]) if math.isfinite(high) else 1
+                    below = sign_of(lam[r] - number(low)) if math.isfinite(low) else 1
+                    above = sign_of(number(high) - lam[r]) if math.isfinite(high) else 1
                     if below < 0 or above < 0:
                         block.loaded, block.at, changed = False, low if below < 0 else high, True
                     elif not below or not above:
@@ -707,7 +714,7 @@ class _Search:
                             True,
                         )
                 elif low < high:
-                    sign = _sign(w[r]) * (1 if block.at == low else -1)
+                    sign = sign_of(w[r]) * (1 if block.at == low else -1)
                     if sign < 0:
                         block.loaded = changed = True
                     elif not sign and not block.touches:
@@ -720,14 +727,14 @@ class _Search:
                 for p in block.parts
             ]
             if not block.loaded:
-                sign = _sign(w[r])
+                sign = sign_of(w[r])
                 if (
                     self.cone and sign > 0
                 ):  # w_n >= sum s; one root of the sum of squares where there is one part
                     sign = (
-                        _sign(w[r] * w[r] - speeds[0])
+                        sign_of(w[r] * w[r] - speeds[0])
                         if len(speeds) == 1
-                        else _sign(w[r] - sum((self._root(s) for s in speeds), self.flint.arb(0)))
+                        else sign_of(w[r] - sum((self._root(s) for s in speeds), self.flint.arb(0)))
                     )
                 if sign < 0:
                     block.loaded = changed = True
@@ -736,7 +743,7 @@ class _Search:
                 elif not sign and ((self.cone and block.parts) or r not in self.still):
                     border.append(block)
                 continue
-            sign = _sign(lam[r])
+            sign = sign_of(lam[r])
             if sign <= 0:
                 block.loaded, block.touches, changed = False, not sign, True
                 continue
@@ -747,7 +754,7 @@ class _Search:
                     (_squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)),
                     0 * lam[r],
                 )
-                sign = _sign(lam[r] * lam[r] - y)
+                sign = sign_of(lam[r] * lam[r] - y)
                 if sign < 0:
                     part.slides = changed = True
                 elif not sign:
@@ -759,18 +766,25 @@ class _Search:
         square = self.flint.arb(square)
         return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
 
-    def _told(self, lam: list[Any], w: list[Any]) -> Enclosure:
-        kind = _Balls(self.flint)
+    def told(self, lam: list[Any], w: list[Any]) -> Enclosure:
+        kind = Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
-        off = max((_up(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
-        speed = max((_up(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
+        off = max((upper_end(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
+        speed = max((upper_end(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
         reason = ""
         if len(self.family):
             names = tuple(self.problem.row_name(int(r)) for r in self.family)
             reason = f"the impulses of {_listed(names)} are one of a family"
         convex = self.problem.law != "coulomb"
         unique = self.operator.semidefinite() if convex else uniqueness(self.problem.disk).proved
-        return Enclosure(True, off, speed, unique, reason, read_only(np.array([float(x.mid()) for x in lam])))
+        return Enclosure(
+            proven=True,
+            impulse_radius=off,
+            velocity_radius=speed,
+            unique=unique,
+            reason=reason,
+            impulse=read_only(np.array([float(x.mid()) for x in lam])),
+        )
 
 
 class _Tangled(Exception):
@@ -785,7 +799,7 @@ def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")
 
 
-def _up(x: Any) -> float:
+def upper_end(x: Any) -> float:
     """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
     up = abs(x).upper()
     return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
@@ -799,7 +813,7 @@ def _squared(x: Any) -> Any:
     return x * x
 
 
-def _sign(x: Any) -> int:
+def sign_of(x: Any) -> int:
     """+1 where certainly x >= 0, -1 where certainly x < 0, else 0."""
     return 1 if x >= 0 else -1 if x < 0 else 0
 

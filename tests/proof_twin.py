@@ -199,7 +199,7 @@ class Centre:
     """Catches the balls that a proof ends with, as Fractions of their middles."""
 
     def __enter__(self):
-        self.told = proof._Search._told
+        self.told = proof.Search.told
 
         def told(search, lam, w):
             self.x = [
@@ -208,11 +208,11 @@ class Centre:
             self.radius = max((float(q.rad()) for q in lam if isinstance(q, search.flint.arb)), default=0.0)
             return self.told(search, lam, w)
 
-        proof._Search._told = told
+        proof.Search.told = told
         return self
 
     def __exit__(self, *_):
-        proof._Search._told = self.told
+        proof.Search.told = self.told
 
 
 def _parts(flint, q):

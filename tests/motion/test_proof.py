@@ -204,7 +204,7 @@ def sign_of_upper_end(x):
     return 1 if (x.upper() if isinstance(x, flint.arb) else x) >= 0 else -1
 
 
-@pytest.mark.parametrize(("name", "turned"), [("_up", lower_end), ("_sign", sign_of_upper_end)])
+@pytest.mark.parametrize(("name", "turned"), [("upper_end", lower_end), ("sign_of", sign_of_upper_end)])
 def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, turned):
     monkeypatch.setattr(proof, name, turned)
     assert not told_of_hairs() or any(proof_twin.attack(seed)[2] for seed in range(50))
@@ -220,6 +220,6 @@ def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
 
 def test_a_ball_about_zero_counts():
     """w of a row that another moves by at most 1: [-1, 1] holds it."""
-    operator = proof._Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
-    w = operator.slack(proof._Balls(flint), [flint.arb(0, 1), flint.arb(0)])
+    operator = proof.Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
+    w = operator.slack(proof.Balls(flint), [flint.arb(0, 1), flint.arb(0)])
     assert w[1].contains(0.75) and w[0].contains(-1.5)
