@@ -26,6 +26,7 @@ NAMES = (
     "original",
     "page",
     "peers",
+    "piles",
     "planted",
     "shapes",
     "stability",

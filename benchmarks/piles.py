@@ -15,6 +15,8 @@ import numpy as np
 
 import lavender as lv
 
+__all__ = ["command"]
+
 DT = 1 / 60  # s
 NEAR = 0.02  # m, a gap that is a contact already
 WALLS = ((1, 1), (0, 1), (0, -1), (2, 1), (2, -1))  # axis and side: floor, and four walls
@@ -73,12 +75,12 @@ class Pile:
         return lv.Problem.from_rows(rows, target=target.ravel(), mu=self.mu, key=key)
 
 
-@click.command()
+@click.command("piles")
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
 @click.argument("seeds", type=int, nargs=-1, required=True)
 @click.option("--steps", default=260, show_default=True)
 @click.option("--every", default=20, show_default=True)
-def main(out: Path, seeds: tuple[int, ...], steps: int, every: int) -> None:
+def command(out: Path, seeds: tuple[int, ...], steps: int, every: int) -> None:
     """Step piles of balls and keep problems of theirs as files OUT/pileSEED_STEP.npz."""
     out.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
@@ -87,12 +89,8 @@ def main(out: Path, seeds: tuple[int, ...], steps: int, every: int) -> None:
             problem = pile.problem()
             if step >= 60 and step % every == 0:
                 problem.save(out / f"pile{seed}_{step:04d}.npz")
-            start = problem.carry(before.impulse_array(impulse), before.key) if before is not None else None
+            start = problem.carry((before, impulse)) if before is not None else None
             impulse = lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse
             pile.velocity, before = problem.velocity(impulse).reshape(-1, 6), problem
             pile.place += DT * pile.velocity[:, :3]
         click.echo(f"pile{seed}: {len(pile.mass)} balls, mu {pile.mu}, {problem.m} rows in the last step")
-
-
-if __name__ == "__main__":
-    main()
