@@ -129,6 +129,12 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     return found
 
 
+def require() -> None:
+    """Raise SolverUnavailable where python-flint is not installed."""
+    with _balls(BITS[0]):
+        pass
+
+
 @contextmanager
 def _balls(bits: int) -> Iterator[Any]:
     try:
@@ -357,7 +363,7 @@ class Search:
             if cones.kind[i] == ROW:
                 for r in range(first, end):
                     low, high, x = cones.lower[r], cones.upper[r], lam[r] - w[r] / d[r]
-                    inside = low < x < high or (low == -math.inf and high == math.inf)
+                    inside = (low < x or low == -math.inf) and (x < high or high == math.inf)
                     out.append(_Block(i, r, None, inside, float(low if x <= low else high)))
                 continue
             own = parts.get(i, [])
@@ -771,6 +777,8 @@ class Search:
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
         off = max((upper_end(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
         speed = max((upper_end(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
+        if not (math.isfinite(off) and math.isfinite(speed)):
+            raise _Undecided("no bound of the impulses is finite")
         reason = ""
         if len(self.family):
             names = tuple(self.problem.row_name(int(r)) for r in self.family)

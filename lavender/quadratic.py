@@ -52,7 +52,7 @@ def solve_qp(
         Relative error to reach: of the constraint problem, and where P is singular `QPSolution.error` of the program.
     time_limit : float, optional, s
     **options
-        Of the solver.
+        Of the solver; impulse= starts from the impulses of a program before (`answer.solution.impulse`).
 
     Returns
     -------
@@ -80,7 +80,8 @@ def solve_qp(
     if qp is None:
         raise InputError("problem is not a quadratic program: make it with Problem.from_qp")
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
-    solution = solve(problem, solver, tol=tol, time_limit=time_limit, **options)
+    start = options.pop("impulse", None)
+    solution = solve(problem, solver, tol=tol, time_limit=time_limit, impulse=start, **options)
     answer = best = qp.solution(solution)
     centre, tightest, before = None, tol, np.inf
     if qp.proximal is None and _distance(answer) <= NEAR:

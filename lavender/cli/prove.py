@@ -26,14 +26,20 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     """
     from lavender.bench.cases import resolve
     from lavender.proof import prove as enclose
+    from lavender.proof import require
+    from lavender.registry import get
     from lavender.solve import solve
 
     one_thread()
+    get(solver)  # refused before anything is read, as is a missing package
+    require()
     unmet = missing = False
     for item in resolve(list(files)):
         try:
-            found = enclose(item.problem, solve(item.problem, solver, tol=tol))
-            click.echo(f"{item.name}: {found}")
+            solution = solve(item.problem, solver, tol=tol)
+            found = enclose(item.problem, solution)
+            short = "" if solution.success else f"; {solver}: {solution.status.name}"
+            click.echo(f"{item.name}: {found}{short}")
             unmet |= not found.proven
         except LavenderError as error:
             click.echo(f"{item.name}: {error}", err=True)

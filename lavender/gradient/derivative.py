@@ -31,6 +31,7 @@ __all__ = ["Derivative", "Tangent", "Unique", "derivative"]
 ACCEPTED = 1e-8  # relative residual of an answer that is differentiated, or its floor
 DENSE = 400  # rows of the system up to which it is dense
 UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
+CONTRADICTS = 1e-3  # of the lengths of a change and of a probe: what the two have in common
 MANY = 10.0  # errors of the answer within which a switch counts as one: they are estimates of first order
 U = 2.0**-53
 
@@ -225,13 +226,32 @@ class Derivative:
     def _bodies(self) -> Any:
         return Bodies(self)
 
-    def _solve(self, r: FloatArray) -> FloatArray:
-        """G x = r of all rows."""
+    def _solve(self, r: FloatArray, exactly: bool = False) -> FloatArray:
+        """G x = r of all rows; `exactly`: or an error where there is no x."""
         out, at = r.copy(), self._places
         out[at] = 0.0
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
-        out[at] = self._solver.solve((r - known)[at])
+        right = (r - known)[at]
+        if exactly and self._singular and self._contradicts(right):
+            self.refuse_alone("no derivative along this change exists")
+        out[at] = self._solver.solve(right)
         return out
+
+    def _contradicts(self, right: FloatArray) -> bool:
+        """Whether G x = r has no solution."""
+        size = CONTRADICTS * float(np.linalg.norm(right))
+        return any(abs(float(q @ right)) > size * float(np.linalg.norm(q)) for q in self._system.probes(True))
+
+    def refuse_alone(self, words: str) -> None:
+        """Of what changes one row of several that share a load."""
+        off = np.flatnonzero(~self.unique.target)
+        if len(off):
+            some = ", ".join(self.problem.row_name(int(i)) for i in off[:3])
+            raise CapabilityError(
+                f"{words}: {some}{', ...' if len(off) > 3 else ''} share a load with other rows and cannot change "
+                "alone, where one of them would open. By v_free, mu and masses there is one; with a compliance on "
+                "these rows by all data"
+            )
 
     # -- both ways -------------------------------------------------------------------------------
 
@@ -346,7 +366,7 @@ class Derivative:
             free = given["v_free"].ravel()
             push += self._along(free)
             dv = dv + free
-        dz = self._solve(r - n.times(push / self._root))
+        dz = self._solve(r - n.times(push / self._root), True)
         impulse = dz / self._root
         slack = self._a(impulse) + push
         if dv is not None:

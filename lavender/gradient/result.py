@@ -29,11 +29,16 @@ INPUTS = {
 }
 
 
+# A change of these at one of several rows that share a load contradicts the others.
+ALONE = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
+
+
 class Gradient:
     """Gradients of a scalar by the data of a problem, of cotangents of its solution: `Derivative.vjp`.
 
     Each is worked out when first asked for, and has the shape of the data; its unit is the scalar's over the data's.
-    What a problem has no data of is refused (CapabilityError).
+    What a problem has no data of is refused (CapabilityError), and where rows share a load in many ways
+    (`Derivative.unique.target`) what changes one of them alone: targets, J, arms, compliance.
 
         b, target            (m,): by b as it is given; by the target of a problem with J and M, the same
         v_free               (nv,) or (n, 6): by v*, b = target - J v* following
@@ -72,6 +77,8 @@ class Gradient:
                 raise CapabilityError(
                     f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
                 )
+            if name in ALONE:
+                self._of.refuse_alone(f"no derivative by {name} exists here")
             if name in BODIES:
                 self._kept |= self._of._bodies.back(self)
             else:

@@ -157,8 +157,9 @@ class Operators(ProblemData):
                 f"A would have up to {most:.3g} entries, more than 32-bit indices reach: use a solver that takes "
                 "J and M as they are (operator 'generalized')"
             )
-        y = self.whitened
-        indptr, indices, data = assemble.gram(y.data, y.indices, y.indptr, y.shape[1], self.compliance)
+        assert self.generalized is not None
+        y = self.metric.whitened()  # without SciPy, which a first solve under a limit has no time to load
+        indptr, indices, data = assemble.gram(*y, self.generalized.nv, self.compliance)
         return read_only(indptr), read_only(indices), read_only(data)
 
     @once

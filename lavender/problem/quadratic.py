@@ -78,6 +78,11 @@ class QPSolution:
     impulse: FloatArray = field(repr=False)  # (m,) lambda
     qp: QuadraticProgram = field(repr=False)
 
+    def __str__(self) -> str:
+        how = "" if self.solution is None else f"{self.solution.status.name}, "
+        words = "unbounded" if self.ray is not None else "solved" if self.found else "not solved"
+        return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
+
     @cached_property
     def _parts(self) -> tuple[FloatArray, ...]:
         qp, of = self.qp, self.qp.generalized
@@ -113,12 +118,16 @@ class QPSolution:
     def error(self) -> float:
         """The largest of the three, each relative to what it is the sum of; 0 is a solution.
 
-        The primal residual over the largest of |J x| and |target|; the dual one over the largest of |q|, |P x|,
-        |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the sums of |lambda| and |x|.
+        The primal residual over the largest of |J x| and |target|, where all targets are 0 of 1e-3 |J v*| too; the dual
+        one over the largest of |q|, |P x|, |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the
+        sums of |lambda| and |x|.
         """
         px, jx, force = self._parts
         q, target = self.qp.q, self.qp.target
         rows = max(np.abs(target).max(initial=0.0), np.abs(jx).max(initial=0.0))
+        if not target.any():  # x = 0 may be the solution
+            of = self.qp.generalized
+            rows = max(rows, FLAT * np.abs(of.velocity_of(of.v_free)).max(initial=0.0))
         heaviest = np.abs(self.qp.generalized.operator.mass[2]).max(initial=0.0)
         curved = FLAT * heaviest * np.abs(self.x).max(initial=0.0)
         forces = max(curved, *(np.abs(part).max(initial=0.0) for part in (px, q, force)))

@@ -108,6 +108,8 @@ def operator(problem: Problem) -> Any:
 def sweep_work(problem: Problem) -> int:
     """Rough number of multiply-adds of one sweep, over what it runs over (`Data.work`), without forming that."""
     entries = _entries(problem)
+    if entries is None and problem.generalized is not None and not reads_whitened(problem):
+        entries = min(int(problem.metric.entries_of_a), problem.m**2)
     return int(swept(problem).work) if entries is None else entries + 4 * problem.m
 
 

@@ -38,7 +38,7 @@ from lavender.solution import Claim, Status
 from lavender.solvers import costs
 from lavender.solvers.certify import certify
 from lavender.solvers.newton import ROWS, NewtonState
-from lavender.solvers.setup_times import sweeping
+from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Relaxation, Step, Sweeps, setup_time
@@ -96,7 +96,9 @@ class Tree:
         if get("newton").refuses(problem) is not None or self.is_late:
             return found
         for name in ("newton", "newton over rows"):
-            if name == "newton over rows" and (self.is_late or not self._rows_may_pay(found.get("newton"))):
+            if name == "newton over rows" and (
+                self.is_late or not self._rows_may_pay(found.get("newton")) or self._forms_late()
+            ):
                 continue
             try:
                 found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
@@ -110,11 +112,19 @@ class Tree:
             return False
         return costs.newton_cost(costs.formed(self.problem), self.law) < over.cost
 
+    def _forms_late(self) -> bool:
+        """Rows of an A of J and M are not there in time, with what of SciPy reads them."""
+        return self.deadline.is_set and self.deadline.passed(
+            over_rows(self.problem) + 3.0 * forming(self.problem)
+        )
+
     def add_rows(self) -> None:
         """Rows of A, where velocities of J and M have failed."""
         problem, name = self.problem, "newton over rows"
         over_velocities = self.states and problem.generalized is not None and name not in self.states
         if over_velocities and problem.m <= ROWS and not problem.cones.has_round and not self.is_late:
+            if self._forms_late():
+                return
             self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
 
     @cached_property

@@ -19,9 +19,9 @@ from typing import Any
 
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
+from lavender.solvers.setup_times import formed_once
 
 __all__ = [
-    "FORMED",
     "RATES",
     "SWEEPS",
     "Count",
@@ -36,7 +36,6 @@ __all__ = [
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
 STEPS = 4.0  # over generalised velocities for each factorisation elsewhere
-FORMED = 10.0  # ns for each entry of an A that is formed of J and M
 SWEEPS = 100.0  # that a problem is counted to take: Newton's method comes first where its cost is less
 
 
@@ -83,4 +82,6 @@ def formed(problem: Problem) -> Count:
     """What Newton's method over rows of an A that is formed of J and M costs at least."""
     m = float(problem.m)
     entries = min(float(problem.metric.entries_of_a), m * m)
-    return Count("dense", 0.0 if entries < 0.5 * m * m else m**3 / 3.0, entries, m, FORMED * entries)
+    return Count(
+        "dense", 0.0 if entries < 0.5 * m * m else m**3 / 3.0, entries, m, 1e9 * formed_once(problem)
+    )

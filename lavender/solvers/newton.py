@@ -36,10 +36,10 @@ from lavender.problem import OPERATORS, Problem
 from lavender.registry import SolverSpec
 from lavender.residuals import at_floor, quick
 from lavender.solution import Claim, Status, counted
-from lavender.solvers.costs import FORMED, STEPS, Count, factorisations, newton_cost
+from lavender.solvers.costs import STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.setup_times import entries_of, over_bodies, over_rows, over_velocities
+from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.newton.solve import COUNTED, OUTCOMES
@@ -76,7 +76,7 @@ class NewtonState:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
             return Count("bodies", system.cost, read, float(problem.m))
-        made = 0.0 if problem.generalized is None else FORMED * entries_of(problem)
+        made = 0.0 if problem.generalized is None else 1e9 * formed_once(problem)
         return Count(
             "dense" if system.dense else "panels",
             system.multiply_adds,

@@ -49,6 +49,11 @@ def forming(problem: Problem) -> float:
     """A, where it is not known yet."""
     if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:
         return 0.0
+    return formed_once(problem)
+
+
+def formed_once(problem: Problem) -> float:
+    """A of J and M or bodies, known or not: a count of the data alone."""
     if problem.rows is None:
         entries = PRODUCT * float(problem.metric.products_of_a)
     else:

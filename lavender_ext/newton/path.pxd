@@ -18,7 +18,7 @@ not on the curve, however small a step is. Which c leads to a solution soon nobo
 each from the start. eps is a compliance: without it, redundant contacts share their load as tau^2 / z says, which no
 factor sees.
 """
-from libc.math cimport exp, fabs, log, pow, sqrt
+from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
@@ -28,6 +28,45 @@ from lavender_ext.newton.elements cimport elements_t, invert_small
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
 from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
 from lavender_ext.newton.system cimport OF_NATURAL, all_finite, solve_natural, system_factor, system_times
+
+
+cdef inline double exponential(double x) noexcept nogil:
+    """e^x to 1e-15 by a sum, with the same bits on every machine: those of the C library differ."""
+    cdef double k = floor(x * 1.4426950408889634 + 0.5), r, term = 1.0, total = 1.0
+    cdef int i, n
+    if not -700.0 < x < 700.0:
+        return 0.0 if x < 0.0 else 1e304
+    n = <int>k
+    r = x - k * 0.6931471803691238 - k * 1.9082149292705877e-10  # ln 2 in two parts
+    for i in range(1, 16):
+        term *= r / i
+        total += term
+    for i in range(n):
+        total *= 2.0
+    for i in range(-n):
+        total *= 0.5
+    return total
+
+
+cdef inline double logarithm(double x) noexcept nogil:
+    """ln x to 1e-15, the same: 2 artanh((m - 1) / (m + 1)) of x = m 2^k, |m| near 1; x > 0."""
+    cdef double k = 0.0, y, square, term, total = 0.0
+    cdef int i
+    for i in range(1100):
+        if x > 1.4142135623730951:
+            x *= 0.5
+            k += 1.0
+        elif x < 0.7071067811865476:
+            x *= 2.0
+            k -= 1.0
+        else:
+            break
+    y = (x - 1.0) / (x + 1.0)
+    square, term = y * y, y
+    for i in range(12):
+        total += term / (2 * i + 1)
+        term *= square
+    return 2.0 * total + k * 0.6931471805599453
 
 
 cdef enum:                      # where a path stands
@@ -234,7 +273,7 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = n.exchange.z, n.exchange.hz, n.exchange.kept, n.ip.everything
     memset(x.z, 0, m * sizeof(double))
     x.size = sqrt(inner(n.s.e.g, n.s.e.g, m) / m)
-    x.start = x.l = log(3.0 * x.size)
+    x.start = x.l = logarithm(3.0 * x.size)
     x.exact = 3e-3
     x.near = 1e-2
     x.h = 0.5
@@ -312,7 +351,7 @@ cdef inline bint corrected(newton_t* n) noexcept nogil:
     """One factor, and what follows with it; whether n.u is on the curve. Otherwise x.found says how far it was, inf: no more."""
     cdef path_t* x = &n.path
     cdef int32_t j, _, m = n.s.e.m
-    cdef double tau = exp(x.next), dl, found, other
+    cdef double tau = exponential(x.next), dl, found, other
     if not path_factor(n, n.u, tau):
         x.previous = -1.0
         return False
@@ -330,7 +369,7 @@ cdef inline bint corrected(newton_t* n) noexcept nogil:
         x.next += dl
         if _ == SIMPLIFIED:
             break
-        smooth(n, n.u, exp(x.next), False)
+        smooth(n, n.u, exponential(x.next), False)
         solve_natural(&n.s, n.f, n.dz)
         for j in range(m):
             n.dz[j] = -n.dz[j]
@@ -359,7 +398,7 @@ cdef inline void accept(newton_t* n) noexcept nogil:
     x.l = x.next
     new_tangent(n, False)
     x.points += 1
-    found = pow(0.2 / (x.found if x.found > 1e-9 else 1e-9), 1.0 / 3.0)
+    found = exponential(logarithm(0.2 / (x.found if x.found > 1e-9 else 1e-9)) / 3.0)
     x.h *= 2.0 if found > 2.0 else 0.5 if found < 0.5 else found
     x.shorter = 0
     x.at = STEPPING
@@ -379,8 +418,8 @@ cdef inline void accept(newton_t* n) noexcept nogil:
 cdef inline double change_of_tangent(newton_t* n) noexcept nogil:
     """By a step of length 1."""
     cdef path_t* x = &n.path
-    smooth(n, x.z, exp(x.l), True)
-    return change(n, x.t, exp(x.l)) + fabs(x.tl)
+    smooth(n, x.z, exponential(x.l), True)
+    return change(n, x.t, exponential(x.l)) + fabs(x.tl)
 
 
 cdef inline void go_path(newton_t* n) noexcept nogil:
@@ -390,11 +429,11 @@ cdef inline void go_path(newton_t* n) noexcept nogil:
     cdef double found, tau, dl
     if x.at == TRYING:
         x.at = STEPPING
-    if done(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < log(1e-13 * x.size):
+    if done(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < logarithm(1e-13 * x.size):
         leave(n)
         return
     if x.at == STARTING:
-        tau = exp(x.l)
+        tau = exponential(x.l)
         x.used += 1
         if x.used > FIRST_STEPS or not path_factor(n, x.z, tau):
             leave(n)
@@ -410,9 +449,9 @@ cdef inline void go_path(newton_t* n) noexcept nogil:
         return
     if x.at == REPEATING:
         x.used += 1
-        if path_factor(n, x.z, exp(x.l)):
+        if path_factor(n, x.z, exponential(x.l)):
             dl = across_tangent(n)
-            found = change(n, n.dz, exp(x.l))
+            found = change(n, n.dz, exponential(x.l))
             if found < 0.5:
                 for j in range(m):
                     x.z[j] += n.dz[j]

@@ -6,7 +6,7 @@ asked for, is left to the caller.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
-from libc.math cimport INFINITY, fabs, log10, sqrt
+from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 

@@ -367,3 +367,25 @@ def test_an_order_of_elimination_changes_nothing():
     assert one.full("J") == pytest.approx(two.full("J")[:, turn], rel=1e-8, abs=1e-10)
     both = lv.derivatives([p], [solved(p)]).vjp(velocity=[y], impulse=[c])[0]
     assert np.array_equal(both.v_free, one.v_free)
+
+
+def test_what_changes_one_of_several_rows_that_share_a_load_is_refused():
+    """A box that slides on four corners: raise one, and it stands on three; which ones depends on the sign."""
+    at = [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    jac = np.array([np.r_[d, np.cross(r, d)] for r in at for d in np.eye(3)[[2, 0, 1]]])
+    mass, free = np.diag([1.0, 1.0, 1.0, 1 / 6, 1 / 6, 1 / 6]), [1.0, 0.3, -0.1, 0.0, 0.0, 0.0]
+    p = lv.Problem.from_jacobian(jac, mass, free, cones=lv.Cones.contacts(0.5, count=4))
+    d = lv.derivative(p, lv.solve(p, tol=1e-13))
+    g = d.vjp(velocity=np.eye(6)[0])
+    for name in ("b", "target", "J", "compliance"):
+        with pytest.raises(lv.CapabilityError, match="share a load"):
+            getattr(g, name)
+    with pytest.raises(lv.CapabilityError, match="share a load"):
+        d.jvp(target=np.eye(12)[0])
+    # All corners together, the velocity, friction: these are told, and as adjoints.
+    change = {"v_free": np.arange(6.0), "mu": np.ones(4), "target": np.tile([1.0, 0.0, 0.0], 4)}
+    found = {name: d.jvp(**{name: x}).velocity[0] for name, x in change.items()}
+    assert np.sum(g.v_free * change["v_free"]) == pytest.approx(found["v_free"])
+    assert np.sum(g.mu * change["mu"]) == pytest.approx(found["mu"])
+    # It is lifted by 1 m/s more: 1 N s of normal impulse more, which slows it down along w_t by half of that.
+    assert found["target"] == pytest.approx(-0.5 * 1.0 / np.hypot(1.0, 0.3))

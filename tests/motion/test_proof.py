@@ -223,3 +223,30 @@ def test_a_ball_about_zero_counts():
     operator = proof.Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
     w = operator.slack(proof.Balls(flint), [flint.arb(0, 1), flint.arb(0)])
     assert w[1].contains(0.75) and w[0].contains(-1.5)
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        lv.Problem.lcp([[0.0]], [1.0]),
+        lv.Problem.linear([[0.0]], [1.0]),
+        lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]),
+        lv.Problem.lcp([[0.0, 1.0], [-1.75, 0.0]], [1.25, 0.5]),
+    ],
+)
+def test_an_infinite_impulse_is_no_solution(problem):
+    """0 lambda >= 1: an infinite impulse had met it."""
+    for x in (np.zeros(problem.m), np.ones(problem.m)):
+        found = lv.prove(problem, x)
+        assert not found.proven and found.impulse is None
+
+
+def test_the_command_refuses_what_it_does_not_know(capsys):
+    from lavender.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["prove", "stack(n=2)", "--solver", "foo"])
+    assert ended.value.code == 2 and "foo" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["prove", "stack(n=64)", "--solver", "pgs"])
+    assert "pgs: MAX_ITERATIONS" in capsys.readouterr().out or ended.value.code == 0

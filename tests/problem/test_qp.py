@@ -303,3 +303,26 @@ def test_arrays_are_copied_and_copies_are_programs_too():
     for other in (copy.copy(problem), pickle.loads(pickle.dumps(problem))):
         assert other == problem
         assert lv.solve_qp(other).x.tobytes() == x.tobytes()
+
+
+def test_a_solution_at_zero_is_found():
+    """The primal residual had been relative to |J x|, which is rounding there."""
+    rng = np.random.default_rng(0)
+    for n in (2, 5, 20):
+        root = rng.normal(size=(n, n))
+        answer = lv.solve_qp(
+            lv.Problem.from_qp(root @ root.T + np.eye(n), rng.uniform(0.1, 1.0, n), lb=np.zeros(n))
+        )
+        held = np.abs(answer.x).max()
+        if held < 1e-9:
+            assert answer.found and str(answer).startswith("solved")
+    answer = lv.solve_qp(lv.Problem.from_qp(np.eye(2), [1.0, 1.0], lb=[0.0, 0.0]))
+    assert answer.found and np.abs(answer.x).max() < 1e-9
+
+
+def test_a_program_starts_from_the_impulses_of_the_one_before():
+    for p in (np.diag([1.0, 0.0]), np.eye(2)):
+        problem = lv.Problem.from_qp(p, [1.0, 1.0], lb=[-0.5, -0.5])
+        cold = lv.solve_qp(problem)
+        warm = lv.solve_qp(problem, impulse=cold.solution.impulse)
+        assert warm.found and np.allclose(warm.x, cold.x, atol=1e-9)

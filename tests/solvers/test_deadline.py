@@ -375,3 +375,17 @@ print(list(lv.registry.specs())[:3], list(lv.registry.specs())[-1], lv.registry.
     assert "lavender.solvers.jacobi" in second and "external" not in second and "lemke" not in second
     # The order of the table, whoever was asked for first.
     assert third.startswith("['auto', 'direct', 'newton']") and third.endswith("True")
+
+
+@pytest.mark.parametrize(("contacts", "velocities"), [(60, 120), (100, 200), (200, 300)])
+def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatch):
+    """A of dense J and M had been formed to count what it costs: 5 times the limit, and nothing found."""
+    rng = np.random.default_rng(0)
+    jac, root = rng.normal(size=(3 * contacts, velocities)), rng.normal(size=(velocities, velocities))
+    mass = root @ root.T / velocities + 0.1 * np.eye(velocities)
+    problem = lv.Problem.from_jacobian(
+        jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
+    )
+    limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming(problem)
+    lv.solve(problem, time_limit=limit)
+    assert "_compressed" not in vars(problem)
