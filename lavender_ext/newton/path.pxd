@@ -33,7 +33,7 @@ from lavender_ext.newton.system cimport OF_NATURAL, all_finite, solve_natural, s
 cdef inline double exponential(double x) noexcept nogil:
     """e^x to 1e-15 by a sum, with the same bits on every machine: those of the C library differ."""
     cdef double k = floor(x * 1.4426950408889634 + 0.5), r, term = 1.0, total = 1.0
-    cdef int i, n
+    cdef int i, _i, n
     if not -700.0 < x < 700.0:
         return 0.0 if x < 0.0 else 1e304
     n = <int>k
@@ -41,9 +41,9 @@ cdef inline double exponential(double x) noexcept nogil:
     for i in range(1, 16):
         term *= r / i
         total += term
-    for i in range(n):
+    for _i in range(n):
         total *= 2.0
-    for i in range(-n):
+    for _i in range(-n):
         total *= 0.5
     return total
 
@@ -51,8 +51,8 @@ cdef inline double exponential(double x) noexcept nogil:
 cdef inline double logarithm(double x) noexcept nogil:
     """ln x to 1e-15, the same: 2 artanh((m - 1) / (m + 1)) of x = m 2^k, |m| near 1; x > 0."""
     cdef double k = 0.0, y, square, term, total = 0.0
-    cdef int i
-    for i in range(1100):
+    cdef int i, _i
+    for _i in range(1100):
         if x > 1.4142135623730951:
             x *= 0.5
             k += 1.0

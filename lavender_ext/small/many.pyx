@@ -15,7 +15,7 @@ import numpy as np
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
-from lavender_ext.core.problem cimport MADE, Data, entries_of, made_t, make_numbers
+from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
