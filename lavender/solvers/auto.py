@@ -23,6 +23,7 @@ if SURE times the counted cost is left, and sweeps keep the time in which nobody
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 
@@ -125,7 +126,8 @@ class Tree:
         if over_velocities and problem.m <= ROWS and not problem.cones.has_round and not self.is_late:
             if self._forms_late():
                 return
-            self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
+            with suppress(*BREAKDOWN):
+                self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
 
     @cached_property
     def newton(self) -> float:
