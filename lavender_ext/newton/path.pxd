@@ -90,12 +90,12 @@ cdef enum:
 
 cdef inline double wide_of(int32_t k) noexcept nogil:
     """c of the k-th path."""
-    return 3.0 if k == 0 else 10.0 if k == 1 else 1.0 if k == 2 else 0.3
+    return 3.0 if k < 1 else 10.0 if k < 2 else 1.0 if k < 3 else 0.3  # not ==, of which compilers make a table
 
 
 cdef inline int32_t steps_of(int32_t k) noexcept nogil:
     """Factorisations of the k-th path at most."""
-    return 350 if k == 0 else 250 if k == 1 else 500 if k == 2 else 400
+    return 350 if k < 1 else 250 if k < 2 else 500 if k < 3 else 400
 
 
 cdef inline double path_compliance() noexcept nogil:
