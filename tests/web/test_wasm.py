@@ -184,7 +184,7 @@ def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
 
 
 def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="is not there; make it first"):
         pages.build_module(tmp_path / "none" / "a.wasm")
 
 
@@ -311,4 +311,4 @@ def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
 def test_command_says_why_it_cannot_build(tmp_path):
     done = command("build", tmp_path / "none" / "a.wasm")
     assert done.returncode == 2
-    assert "does not exist" in done.stderr
+    assert "is not there; make it first" in done.stderr
