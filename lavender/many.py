@@ -569,7 +569,7 @@ def _starts(given: Any, impulse: Any, impulses: Any, errors: str) -> tuple[Any, 
             return True
         bad = np.flatnonzero(~np.isfinite(start))[0]
         unusable[i] = InputError(
-            f"world {i}: its start is {start[bad]} N s at row {bad}; a finite one is needed"
+            f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
         )
         if errors == "raise":
             raise unusable[i]
