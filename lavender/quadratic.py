@@ -82,8 +82,8 @@ def solve_qp(
     qp = getattr(problem, "qp", None)
     if qp is None:
         raise InputError(
-            "problem is not a quadratic program: make each with Problem.from_qp; what updated() or a file gives knows the "
-            "constraint problem alone"
+            "problem is not a quadratic program: make it with Problem.from_qp; what updated() or a file gives "
+            "knows the constraint problem alone"
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
