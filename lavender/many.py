@@ -115,11 +115,11 @@ class _Many:
     def __len__(self) -> int:
         return len(self.problems)
 
-    def _chosen(self, i: Any) -> Any:
+    def __getitem__(self, i: Any) -> Any:
         """Of world i, or a list of several."""
         i = places(i, len(self))
         if isinstance(i, list):
-            return [self._chosen(j) for j in i]
+            return [self[j] for j in i]
         if i in self.faults:
             raise self.faults[i]
         return self._one(i)
@@ -289,7 +289,7 @@ class Solutions(_Many, Sequence[Solution]):
     @overload
     def __getitem__(self, i: Any) -> list[Solution]: ...
     def __getitem__(self, i: Any) -> Any:
-        return self._chosen(i)
+        return super().__getitem__(i)
 
     def _one(self, i: int) -> Solution:
         if i not in self._kept:
@@ -362,13 +362,6 @@ class Residuals(_Many):
         _Many._keep(self, i, found)
         self._nothing[i] = found.nothing_to_do
         self._worlds.numbers[NUMBER["rhs_energy"], i] = found.energy_rhs
-
-    @overload
-    def __getitem__(self, i: int) -> Residual: ...
-    @overload
-    def __getitem__(self, i: Any) -> list[Residual]: ...
-    def __getitem__(self, i: Any) -> Any:
-        return self._chosen(i)
 
     def _one(self, i: int) -> Residual:
         return residual(self.problems[i], self._impulse[self._rows(i)], self.precision[i], self.threshold)
