@@ -110,6 +110,16 @@ def shape_of(what: str, value: Any) -> tuple[int, ...]:
         raise InputError(f"{what} is not an array of numbers ({error})") from None
 
 
+def places(i: Any, n: int) -> int | list[int]:
+    """What an index names of n things: a whole number one of them; a slice, a mask (n,) or whole numbers a list."""
+    if isinstance(i, slice):
+        return list(range(*i.indices(n)))
+    if hasattr(i, "__index__") and np.ndim(i) == 0:
+        return range(n)[i]
+    chosen: list[int] = np.arange(n)[list(i)].tolist()
+    return chosen
+
+
 def number(
     what: str, value: object, *, low: float = -np.inf, high: float = np.inf, above: float | None = None
 ) -> float:

@@ -11,7 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative, precision_of
+from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative, places, precision_of
 from lavender.cones import Cones
 from lavender.errors import InputError
 from lavender.generalized import ASYMMETRY, ASYMMETRY32
@@ -22,6 +22,7 @@ from lavender_ext.small.many import PLACE, Worlds
 
 __all__ = ["Batch"]
 
+ERRORS = ("raise", "status")
 MADE = {np.dtype(np.float32), np.dtype(np.float64)}
 
 
@@ -209,7 +210,8 @@ class Batch(Sequence[Problem]):
         made._make = make
         if first is not None and first.rows is not None:
             made.precision, made.velocity_shape = first.precision, (n, 6 * first.rows.n_bodies)
-            made.at[:, PLACE["velocity"]] = 6 * first.rows.n_bodies * np.arange(n)
+            nv = 6 * first.rows.n_bodies
+            made.at[:, PLACE["velocities"]], made.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
         return made
 
     @classmethod
@@ -222,6 +224,7 @@ class Batch(Sequence[Problem]):
         return made
 
     _make: Callable[[int], Problem] | None = None
+    names_of: Callable[[int], Sequence[str]] | None = None  # of the blocks of a world
     _shared = True
 
     # -- blocks ----------------------------------------------------------------------------------------
@@ -242,11 +245,14 @@ class Batch(Sequence[Problem]):
         self._shared = False
         first = _firsts(sizes)
         if len(self) and first[-1] + sizes[-1] != cones.n_rows:
-            raise InputError(
-                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed, or "
-                f"{sizes[0]} of each"
+            each = (
+                f", or {sizes[0]} of each"
                 if (sizes == sizes[0]).all()
-                else f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed"
+                else "; one Cones of each world goes only where all have as many rows: give a list of them"
+            )
+            raise InputError(
+                f"cones have {cones.n_rows} rows; {first[-1] + sizes[-1]} of all worlds are needed, without what "
+                f"pads them{each}"
             )
         ends = first + sizes
         block, last = np.searchsorted(cones.ptr, first), np.searchsorted(cones.ptr, ends)
@@ -280,19 +286,19 @@ class Batch(Sequence[Problem]):
     @overload
     def __getitem__(self, i: int) -> Problem: ...
     @overload
-    def __getitem__(self, i: slice) -> list[Problem]: ...
+    def __getitem__(self, i: Any) -> list[Problem]: ...
     def __getitem__(self, i: Any) -> Any:
-        """World i as a `Problem`, made of copies; InputError where its numbers are no problem's."""
-        if isinstance(i, slice):
-            return [self[j] for j in range(*i.indices(self._n))]
-        i = range(self._n)[i]
+        """World i as a `Problem`, made of copies, or a list of several; InputError where numbers are no problem's."""
+        i = places(i, self._n)
+        if isinstance(i, list):
+            return [self[j] for j in i]
         if self._make is not None:
             return self._make(i)
         jac, mass, free, target, soft, mu = (self._part(i, which) for which in range(6))
         own = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
         return Problem.from_jacobian(
             jac, mass, free, target=target, cones=own, compliance=soft, friction=self.friction,
-            precision=self.precision,
+            precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
 
     def _part(self, i: int, which: int) -> Any:
@@ -320,9 +326,9 @@ class Batch(Sequence[Problem]):
         first, m = (int(self.at[i, PLACE[name]]) for name in ("row", "rows"))
         return slice(first, first + m)
 
-    def impulses(self, name: str, given: Any, *, finite: bool = True) -> FloatArray:
-        """Impulses of all worlds [N s], of the batch's shape, as a new flat array."""
-        array = as_array(name, given, self.shape, finite=finite, unit="N s")
+    def impulses(self, name: str, given: Any) -> FloatArray:
+        """Impulses of all worlds [N s], of the batch's shape, finite or not, as a new flat array."""
+        array = as_array(name, given, self.shape, finite=False, unit="N s")
         return array.reshape(-1).copy()
 
     def worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
@@ -346,6 +352,12 @@ class Batch(Sequence[Problem]):
 
 
 # -- what is given ------------------------------------------------------------------------------------
+
+
+def check_errors(errors: str) -> None:
+    """What is done about a world that is bad."""
+    if errors not in ERRORS:
+        raise InputError(f"errors is {errors!r}; {' or '.join(map(repr, ERRORS))} is needed")
 
 
 def _numbers(name: str, x: Any) -> np.ndarray:

@@ -14,9 +14,9 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, number, whole_number
+from lavender._arrays import FloatArray, as_array, number, places, whole_number
 from lavender._derived import cached_property
-from lavender.batch import Batch
+from lavender.batch import Batch, check_errors
 from lavender.deadline import NEVER, Deadline
 from lavender.errors import InputError, LavenderError
 from lavender.loop import LEAST
@@ -25,12 +25,12 @@ from lavender.registry import SolverSpec, get
 from lavender.residuals import AT_REST, ENOUGH, Residual, judged, residual, verdict_of
 from lavender.solution import Solution, Status, uninterrupted
 from lavender.solve import COUNTED, check_budget, check_taken, rest_of, seconds_of, solve, unjudged
+from lavender_ext.judge.measure import all_finite
 from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds
 
 __all__ = ["Residuals", "Solutions", "residual_many", "solve_many"]
 
 DONE_ALL = -1  # of `Hand`: there are no more worlds
-ERRORS = ("raise", "status")
 LATE = 1e-5  # s, that the judge is given for a world whose turn comes too late
 UNREAD = 4e-5  # s, of one that he reads later
 NO_TURN = "the time limit was over before its turn: the start, unjudged"
@@ -45,6 +45,7 @@ class _Many:
         """Of a batch, or of problems; starts: flat impulses [N s] of the batch, or (m,) or None of each problem."""
         self.problems: Sequence[Problem] = given
         self.faults: dict[int, LavenderError] = {}
+        self._unusable: dict[int, LavenderError] = {}  # starts, which go on as doing nothing
         if isinstance(given, Batch):
             place, self._sizes, self._first = given.at, given.at[:, PLACE["rows"]], given.at[:, PLACE["row"]]
             self._impulse = np.zeros(int(np.prod(given.shape))) if cold else starts
@@ -114,11 +115,18 @@ class _Many:
     def __len__(self) -> int:
         return len(self.problems)
 
-    def _at(self, i: Any) -> int:
-        i = range(len(self))[i]
+    def __getitem__(self, i: Any) -> Any:
+        """Of world i, or a list of several."""
+        i = places(i, len(self))
+        if isinstance(i, list):
+            return [self[j] for j in i]
         if i in self.faults:
             raise self.faults[i]
-        return i
+        return self._one(i)
+
+    def _one(self, i: int) -> Any:
+        """Of a world whose data are a problem's."""
+        raise NotImplementedError
 
     def _run(
         self, turn: Callable[[Hand], int], alone: Callable[[int], None], threads: int, errors: str
@@ -153,6 +161,7 @@ class _Many:
             single(i)  # which finds the words
         if self.faults and errors == "raise":
             raise self.faults[min(self.faults)]
+        self.faults.update(self._unusable)
         for i in self.faults:
             self._worlds.numbers[:, i] = np.nan
 
@@ -165,15 +174,17 @@ class _Many:
 class Solutions(_Many, Sequence[Solution]):
     """Results of `solve_many`, in arrays; `many[i]` is the `Solution` of world i.
 
+    `many[many.success]`, `many[2:5]` and `many[[0, 7]]` are lists of them; faults of those that are REFUSED are raised.
+
     Parameters
     ----------
     impulse : N s
         Of a stacked batch (n, m), 0 beyond the rows of a world that has fewer; else of all rows, where `ptr` says which
-        world they are of.
+        world they are of. NaN of a world that is REFUSED, like all its numbers; its counts are 0.
     status : (n,) of Status
         REFUSED where the data of a world are no problem's.
     relative, energy, velocity_error, floor : (n,)
-        Of the judge: -, sqrt J, m/s, -. NaN of a world that is REFUSED.
+        Of the judge: -, sqrt J, m/s, -.
     worst_row, iterations : (n,) int
     tol : float, -
     faults : dict
@@ -201,10 +212,12 @@ class Solutions(_Many, Sequence[Solution]):
         """v+ [m/s, rad/s]: of a stacked batch (n, nv); else of all worlds one after the other, none of a matrix."""
         if isinstance(self.problems, Batch):
             return self._velocity.reshape(self.problems.velocity_shape)  # type: ignore[union-attr]
-        of = [(p, i) for i, p in enumerate(self.problems) if p.matrix is None and i not in self.faults]
-        return np.concatenate(
-            [np.zeros(0), *(p.velocity(self._impulse[self._rows(i)]).ravel() for p, i in of)]
-        )
+        found = [np.zeros(0)]
+        for i, p in enumerate(self.problems):
+            if p.matrix is None:
+                own = p.velocity(p._start if i in self.faults else self._impulse[self._rows(i)]).ravel()
+                found.append(np.full_like(own, np.nan) if i in self.faults else own)
+        return np.concatenate(found)
 
     @cached_property
     def status(self) -> np.ndarray:
@@ -262,14 +275,23 @@ class Solutions(_Many, Sequence[Solution]):
             first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
+    def empty_refused(self) -> None:
+        """What stands in the arrays for worlds that are REFUSED is no answer."""
+        for i in self.faults:
+            self._impulse[self._rows(i)] = np.nan
+            self._worlds.counts[i], self._worlds.worst[i] = 0, -1
+            if isinstance(self.problems, Batch) and self._velocity is not None and self._velocity.size:
+                first, n = (int(self.problems.at[i, PLACE[name]]) for name in ("velocity", "velocities"))
+                self._velocity[first : first + n] = np.nan
+
     @overload
     def __getitem__(self, i: int) -> Solution: ...
     @overload
-    def __getitem__(self, i: slice) -> list[Solution]: ...
+    def __getitem__(self, i: Any) -> list[Solution]: ...
     def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return [self[j] for j in range(*i.indices(len(self)))]
-        i = self._at(i)
+        return super().__getitem__(i)
+
+    def _one(self, i: int) -> Solution:
         if i not in self._kept:
             self._kept[i] = self._solution(i)
         return self._kept[i]
@@ -341,8 +363,7 @@ class Residuals(_Many):
         self._nothing[i] = found.nothing_to_do
         self._worlds.numbers[NUMBER["rhs_energy"], i] = found.energy_rhs
 
-    def __getitem__(self, i: int) -> Residual:
-        i = self._at(i)
+    def _one(self, i: int) -> Residual:
         return residual(self.problems[i], self._impulse[self._rows(i)], self.precision[i], self.threshold)
 
     def __repr__(self) -> str:
@@ -382,8 +403,8 @@ def solve_many(
         Limit of the whole call on the wall clock. Worlds take their turns in order, each with all of the time left;
         those whose turn comes too late keep their start, with status TIME_LIMIT.
     errors : {"raise", "status"}
-        Of a world whose data are refused (NaN, an M that is not definite, a negative mu): raise what is wrong with the
-        first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
+        Of a world whose data or start are refused (NaN, an M that is not definite, a negative mu): raise what is wrong
+        with the first, or go on and give it the status REFUSED; `Solutions.faults` has the words.
 
     Returns
     -------
@@ -404,8 +425,9 @@ def solve_many(
     spec, limit = get(solver), seconds_of(time_limit)
     deadline = NEVER if limit == np.inf else Deadline(limit)
     check_budget(spec, tol, max_iter)
-    starts = _starts(given, impulse, impulses)
+    starts, unusable = _starts(given, impulse, impulses, errors)
     made = Solutions(given, starts, starts is None, tol, spec)
+    made._unusable = unusable
     # What the results of those to come take is kept free.
     if deadline.is_set:
         deadline.keep(
@@ -443,6 +465,7 @@ def solve_many(
 
     begin = perf_counter()
     made._run(turn, alone, threads, errors)
+    made.empty_refused()
     made._seconds = (perf_counter() - begin) / max(1, len(given))
     if not isinstance(given, Batch):
         made._worlds.remember(made._data)
@@ -499,15 +522,10 @@ def residual_many(
     threshold = number("threshold", threshold, low=0.0)
     threads = whole_number("threads", threads, 1, None)
     if isinstance(given, Batch):
-        starts: Any = given.impulses("impulses", impulses, finite=False)
+        starts: Any = given.impulses("impulses", impulses)
         words = len(given) * [given.precision if precision is None else precision]
     else:
-        if len(impulses) != len(given):
-            raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
-        starts = [
-            as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
-            for i, (p, x) in enumerate(zip(given, impulses, strict=True))
-        ]
+        starts = _of_each(given, impulses)
         words = [p.precision if precision is None else precision for p in given]
     made = Residuals(given, starts, words, threshold)
     single = isinstance(given, Batch) and "float32" in words
@@ -521,8 +539,7 @@ def residual_many(
 
 def _given(problems: Any, errors: str) -> Any:
     """A batch, or a list of problems."""
-    if errors not in ERRORS:
-        raise InputError(f"errors is {errors!r}; {' or '.join(map(repr, ERRORS))} is needed")
+    check_errors(errors)
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):
@@ -533,17 +550,49 @@ def _given(problems: Any, errors: str) -> Any:
     return given
 
 
-def _starts(given: Any, impulse: Any, impulses: Any) -> Any:
-    """Flat impulses of a batch, or of each problem (m,) or None; None: doing nothing everywhere."""
+def _starts(given: Any, impulse: Any, impulses: Any, errors: str) -> tuple[Any, dict[int, LavenderError]]:
+    """Flat impulses of a batch, or of each problem (m,) or None; None: doing nothing everywhere.
+
+    Beside what is wrong with those that are not finite, in whose place stands doing nothing.
+    """
+    unusable = dict[int, LavenderError]()
+
+    def is_usable(i: int, start: FloatArray) -> bool:
+        if all_finite(start):
+            return True
+        bad = np.flatnonzero(~np.isfinite(start))[0]
+        unusable[i] = InputError(
+            f"world {i}: impulse [N s] is {start[bad]} at row {bad}; a finite start is needed"
+        )
+        if errors == "raise":
+            raise unusable[i]
+        return False
+
     if isinstance(given, Batch):
         if impulses is not None:
             raise InputError(
                 "impulses are of a list of problems; give impulse=, one array of the whole batch"
             )
-        return None if impulse is None else given.impulses("impulse", impulse)
+        if impulse is None:
+            return None, unusable
+        flat = given.impulses("impulse", impulse)
+        if not all_finite(flat):
+            for i in range(len(given)):
+                rows = given.rows_of(i)
+                if not is_usable(i, flat[rows]):
+                    flat[rows] = 0.0
+        return flat, unusable
     if impulse is not None:
         raise InputError("impulse is of one problem; give impulses=, one for each (None where there is none)")
-    if impulses is not None and len(impulses) != len(given):
+    starts = [p.guess for p in given] if impulses is None else _of_each(given, impulses)
+    return [x if x is None or is_usable(i, x) else None for i, x in enumerate(starts)], unusable
+
+
+def _of_each(given: Any, impulses: Any) -> list[Any]:
+    """Impulses (m,) [N s] of each problem, its guess where there are none."""
+    if len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
-    each = [None] * len(given) if impulses is None else impulses
-    return [p.guess if x is None else p.impulse_array(x) for p, x in zip(given, each, strict=True)]
+    return [
+        p.guess if x is None else as_array(f"impulses of world {i}", x, (p.m,), finite=False, unit="N s")
+        for i, (p, x) in enumerate(zip(given, impulses, strict=True))
+    ]

@@ -25,11 +25,14 @@ __all__ = ["solve_qp"]
 STEPS = 50  # proximal steps
 SLOW = 0.1  # where a step leaves more than this of the error, the next has
 SOFTER = 0.1  # this share of D, as long as
-FARTHEST = 1e4  # v* is no further than this, over |x|: rounding of v* is an error of x
+ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, the next step has more of D
+SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
+IDLE = 10  # steps in a row without a smaller error, after which no other is made
 TIGHTEST = 1e-15  # tol of a step
 TINY = 1e-300
-NEAR = 10.0  # |v*| over |x| up to which a residual relative to v* is one relative to x
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
+# Nothing better comes of the same problem; of another centre something may.
+ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
 UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
 
 
@@ -49,7 +52,7 @@ def solve_qp(
     solver : str
         As in `lavender.solve`.
     tol : float
-        Relative error to reach: of the constraint problem, and where P is singular `QPSolution.error` of the program.
+        `QPSolution.error` to reach.
     time_limit : float, optional, s
     **options
         Of the solver; impulse= starts from the impulses of a program before (`answer.solution.impulse`).
@@ -78,13 +81,16 @@ def solve_qp(
     """
     qp = getattr(problem, "qp", None)
     if qp is None:
-        raise InputError("problem is not a quadratic program: make it with Problem.from_qp")
+        raise InputError(
+            "problem is not a quadratic program: make it with Problem.from_qp; what updated() or a file gives "
+            "knows the constraint problem alone"
+        )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
     solution = solve(problem, solver, tol=tol, time_limit=time_limit, impulse=start, **options)
-    answer = best = qp.solution(solution)
-    centre, tightest, before = None, tol, np.inf
-    if qp.proximal is None and _distance(answer) <= NEAR:
+    answer = best = qp.solution(solution, tol=tol)
+    centre, tightest, before, idle = None, tol, np.inf, 0
+    if answer.error <= tol and qp.proximal is None:
         return answer
     for _ in range(STEPS):
         ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
@@ -93,11 +99,13 @@ def solve_qp(
         if solution.status in ENDS:
             return answer
         left = end - perf_counter()
-        if solution.status is Status.TIME_LIMIT or answer.error <= tol or left <= 0.0:
+        if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH[qp.proximal is not None]:
             break
         if qp.proximal is not None:
             slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
-            qp = qp.around(centre, SOFTER if slow and _distance(answer) <= FARTHEST else 1.0)
+            rough = ROUNDING * _distance(answer) > answer.error
+            soft = slow and qp.proximal.max() > SOFTEST * np.abs(qp.generalized.operator.mass[2]).max()
+            qp = qp.around(centre, 1.0 / SOFTER if rough else SOFTER if soft else 1.0)
             general = qp.generalized
             problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
         # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
@@ -107,8 +115,11 @@ def solve_qp(
             break
         tightest, limit = inner, None if time_limit is None else left
         solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
-        answer = qp.solution(solution)
+        answer = qp.solution(solution, tol=tol)
+        idle = 0 if answer.error < best.error else idle + 1
         best = min(best, answer, key=lambda one: one.error)
+        if idle == IDLE:
+            break
     return best
 
 

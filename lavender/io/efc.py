@@ -20,10 +20,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lavender._arrays import FloatArray, as_array, number, precision_of, whole_number
-from lavender.batch import Batch
+from lavender.batch import Batch, check_errors
 from lavender.cones import CONTACT, ROUND, ROW, Cones
 from lavender.errors import CapabilityError, InputError
 from lavender.io import mujoco as single
+from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]
 
@@ -132,7 +133,7 @@ def from_efc(
     return Imported(batch, lam if scale is None else lam / scale)
 
 
-def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
+def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str = "raise") -> Imported:
     """The problems of many states of one MuJoCo model, by `mj_forward` on each, and MuJoCo's own answers.
 
     Parameters
@@ -143,16 +144,19 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
         qpos and qvel, or what `mj_getState` gives.
     threads : int
         `mj_forward` at the same time; the results do not depend on it.
+    errors : {"raise", "status"}
+        Of a state that is not finite: raise, or make it a world without rows whose v_free is NaN, which `solve_many`
+        and `residual_many` refuse by its number, or pass with the same word.
 
     Returns
     -------
     Imported
-        `batch[i]` is the problem that `from_mujoco` makes of state i, to rounding.
+        `batch[i]` is the problem that `from_mujoco` makes of state i, to rounding, each row of an equality a block.
 
     Raises
     ------
     InputError
-        Another model, or states of another size.
+        Another model, states of another size, or one that is not finite.
     CapabilityError
         An integrator whose constraint problem is not of M.
     """
@@ -170,7 +174,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
 
         model = copy.copy(model)
         model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
-    given = np.ascontiguousarray(as_array("states", states, (None, None)))
+    check_errors(errors)
+    given = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = given.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}
     for kind in (mj.mjtState.mjSTATE_FULLPHYSICS, mj.mjtState.mjSTATE_INTEGRATION):
@@ -179,13 +184,19 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
         raise InputError(f"states have {size} numbers each; one of {sorted(kinds)} is needed")
     n, elliptic = len(given), model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC
     found: list[Any] = [None] * n
-    free, smooth = np.empty((n, model.nv)), np.empty((n, model.nv))
-    mass = np.empty((n, len(mj.MjData(model).M)))
+    held: list[Any] = [np.zeros(0, np.int32)] * n  # what names are made of
+    free, smooth = np.full((n, model.nv), np.nan), np.zeros((n, model.nv))
+    mass = np.zeros((n, len(mj.MjData(model).M)))
+    mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
+    none = [np.zeros(0) for _ in OF_ROWS]
     todo = iter(range(n))
 
     def work(_: int) -> None:
         data = mj.MjData(model)
         for i in todo:
+            if not all_finite(given[i]):
+                found[i] = none
+                continue
             mj.mj_setState(model, data, given[i], kinds[size])
             mj.mj_forward(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
@@ -194,6 +205,8 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
                 c = data.contact
                 arrays += [c.efc_address.copy(), c.dim.copy(), c.friction.copy()]
             found[i] = arrays
+            contact = data.contact if data.ncon else single.NO_CONTACT
+            held[i] = np.concatenate([data.efc_type, data.efc_id, contact.dim, np.ravel(contact.geom)])
 
     threads = whole_number("threads", threads, 1, None)
     if threads == 1:
@@ -201,7 +214,9 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1) -> Imported:
     else:
         with ThreadPoolExecutor(min(threads, max(n, 1))) as pool:
             list(pool.map(work, range(min(threads, max(n, 1)))))
-    return _gathered(model, found, mass, free, smooth, elliptic)
+    made = _gathered(model, found, mass, free, smooth, elliptic)
+    made.batch.names_of = lambda i: single._words(mj, model, held[i], len(found[i][1]), 1)
+    return made
 
 
 def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any, elliptic: bool) -> Imported:

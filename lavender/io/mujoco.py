@@ -383,7 +383,7 @@ def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArra
     return Cones._of(blocks), scale, key, held
 
 
-def _words(mj: Any, model: Any, held: IntArray, m: int) -> list[str]:
+def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = export.JOINED) -> list[str]:
     types, ids, contacts = held[:m].tolist(), held[m : 2 * m].tolist(), (len(held) - 2 * m) // 3
     dim = held[2 * m : 2 * m + contacts]
     geom = held[2 * m + contacts : 2 * m + 3 * contacts].reshape(-1, 2)
@@ -397,7 +397,7 @@ def _words(mj: Any, model: Any, held: IntArray, m: int) -> list[str]:
             while i + size < len(types) and types[i + size] == of and ids[i + size] == which:
                 size += 1
             name = _name(mj, model, "EQUALITY", which, "equality")
-            names += [name] if size <= export.JOINED else [f"{name}, edge {edge}" for edge in range(size)]
+            names += [name] if size <= joined else [f"{name}, edge {edge}" for edge in range(size)]
         elif of == kinds.mjCNSTR_FRICTION_DOF:
             joint = int(model.dof_jntid[which])
             axis = which - int(model.jnt_dofadr[joint])

@@ -67,6 +67,8 @@ class QPSolution:
         Of the constraint problem: status, work, certificate.
     ray : (n,), or None
         A direction in which the objective falls for ever, |ray| = 1 in its largest entry: the program is unbounded.
+    tol : float
+        The error that was asked for.
     """
 
     x: FloatArray
@@ -77,10 +79,13 @@ class QPSolution:
     ray: FloatArray | None
     impulse: FloatArray = field(repr=False)  # (m,) lambda
     qp: QuadraticProgram = field(repr=False)
+    tol: float = 1e-6
 
     def __str__(self) -> str:
         how = "" if self.solution is None else f"{self.solution.status.name}, "
-        words = "unbounded" if self.ray is not None else "solved" if self.found else "not solved"
+        words = (
+            "unbounded" if self.ray is not None else "solved" if self.found else f"not solved to {self.tol:g}"
+        )
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
 
     @cached_property
@@ -137,8 +142,8 @@ class QPSolution:
 
     @property
     def found(self) -> bool:
-        """Whether the error is at most 1e-6 and the program is not unbounded."""
-        return self.ray is None and self.error <= 1e-6
+        """Whether the error is at most `tol` and the program is not unbounded."""
+        return self.ray is None and self.error <= self.tol
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,14 +223,16 @@ class QuadraticProgram:
                 z = whole
         return y, z, box
 
-    def solution(self, solution: Any, ray: FloatArray | None = None) -> QPSolution:
-        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,)."""
+    def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
+        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,), found if the error is at most tol."""
         given = getattr(solution, "impulse", None)
         impulse = as_array("impulse", solution, (len(self.target),)) if given is None else given
         x = self.generalized.v_free + self.generalized.change(impulse)
         found = None if given is None else solution
         y, z, box = self.multipliers(impulse)
-        return QPSolution(x=x, y=y, z=z, z_box=box, solution=found, ray=ray, impulse=impulse, qp=self)
+        return QPSolution(
+            x=x, y=y, z=z, z_box=box, solution=found, ray=None, impulse=impulse, qp=self, tol=tol
+        )
 
     def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
         """A direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""

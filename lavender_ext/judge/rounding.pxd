@@ -79,13 +79,17 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
             data[i] += z[k] * z[k] * f[k]
         data[i] *= unit
         impulse[i] = velocities[i] = 0.0
-        for j in range(m):
+        # A_ij stands for A_ji, and is not asked for between two rows that do not push.
+        for j in range(i + 1):
+            if lam[i] == 0.0 and lam[j] == 0.0:
+                continue
             s = jac_row(g, j, z) + (g.compliance[i] if i == j else 0.0)
-            impulse[i] += s * s * (lam[j] * lam[j])
-            if not rigid:
-                velocities[i] += s * s * off[j]
-        impulse[i] *= unit
-        velocities[i] *= unit
+            s *= unit * s
+            impulse[i] += s * (lam[j] * lam[j])
+            velocities[i] += 0.0 if rigid else s * off[j]
+            if i != j:
+                impulse[j] += s * (lam[i] * lam[i])
+                velocities[j] += 0.0 if rigid else s * off[i]
 
 
 cdef inline double relative_size(const blocks_t* p, const double* square, double e0, double v0) noexcept nogil:

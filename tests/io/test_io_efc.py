@@ -39,6 +39,10 @@ def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
         data = forwarded(model, state)
         problem = lv.io.from_mujoco(model, data)
         own = batch[i]
+        # Of an equality each row has a name of its own here, and a normal alone needs no word for it.
+        held = int(np.count_nonzero(data.efc_type == mj.mjtConstraint.mjCNSTR_EQUALITY))
+        words = [[p.row_name(k).removesuffix(", normal") for k in range(p.m)] for p in (problem, own)]
+        assert words[0][held:] == words[1][held:] and all("equality" in word for word in words[1][:held])
         # Rows of an equality are blocks of their own here, and a normal alone is a row: the same bounds.
         for name in ("lower", "upper", "friction_rows"):
             assert getattr(own.cones, name).tolist() == getattr(problem.cones, name).tolist(), name
@@ -53,6 +57,24 @@ def test_a_state_of_many_is_the_problem_of_one(cone, condim, jacobian):
         )
         one = lv.residual(problem, single.impulse(model, data))
         assert found.velocity_error[i] == pytest.approx(one.velocity, rel=1e-3, abs=1e-9)
+
+
+def test_a_state_that_is_not_finite_harms_no_other():
+    model = mj.MjModel.from_xml_string(scene())
+    states = states_of(model, 5)
+    clean = lv.io.from_mujoco_many(model, states)
+    spoiled = states.copy()
+    spoiled[1, -1], spoiled[3, 0] = np.nan, np.inf
+    with pytest.raises(lv.InputError, match="states"):
+        lv.io.from_mujoco_many(model, spoiled)
+    batch, impulse = lv.io.from_mujoco_many(model, spoiled, errors="status")
+    with pytest.raises(lv.InputError, match="world 1: v_free"):
+        lv.solve_many(batch)
+    many = lv.solve_many(batch, errors="status")
+    found = lv.residual_many(batch, impulse, errors="status")
+    assert sorted(many.faults) == sorted(found.faults) == [1, 3]
+    for i in (0, 2, 4):
+        assert batch[i] == clean.batch[i]
 
 
 def stacked(model, states, dtype):

@@ -176,11 +176,49 @@ def test_a_bad_world_is_named_and_harms_no_other(threads):
             assert found.verdict[i] == "" and np.isnan(found.relative[i]) and i in found.faults
             with pytest.raises(lv.InputError, match=f"world {i}:"):
                 many[i]
+            # A zero would look like an answer.
+            assert np.isnan(many.impulse[i]).all() and np.isnan(many.velocity[i]).all()
+            assert many.iterations[i] == 0 and many.worst_row[i] == -1
         else:
             assert many.impulse[i].tobytes() == clean.impulse[i].tobytes()
             assert found.relative[i] == clean.relative[i]
     with pytest.raises(lv.InputError, match="'raise' or 'status'"):
         lv.solve_many(batch, errors="ignore")
+    assert [one.impulse.tobytes() for one in many[many.success]] == [
+        many.impulse[i].tobytes() for i in range(10) if i not in words
+    ]
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_start_that_is_not_finite_is_a_fault_of_its_world(listed):
+    batch = lv.Batch(*worlds(6), cones=DISKS)
+    clean = lv.solve_many(batch, tol=1e-8)
+    start = clean.impulse.copy()
+    start[2, 5], start[4] = np.nan, np.inf
+    given, starts = (list(batch), {"impulses": start}) if listed else (batch, {"impulse": start})
+    with pytest.raises(lv.InputError, match=r"world 2: impulse \[N s\] is nan at row 5"):
+        lv.solve_many(given, tol=1e-8, **starts)
+    many = lv.solve_many(given, tol=1e-8, errors="status", **starts)
+    impulse, velocity = many.impulse.reshape(6, -1), many.velocity.reshape(6, -1)
+    assert sorted(many.faults) == [2, 4] and not many.success[[2, 4]].any()
+    assert np.isnan(impulse[[2, 4]]).all() and np.isnan(velocity[[2, 4]]).all()
+    for i in (0, 1, 3, 5):
+        assert impulse[i].tobytes() == start[i].tobytes() and many.iterations[i] == 0
+
+
+def test_worlds_are_chosen_as_entries_of_an_array_are():
+    batch = lv.Batch(*worlds(5), cones=DISKS)
+    many = lv.solve_many(batch)
+    found = lv.residual_many(batch, many.impulse)
+    mask = np.array([True, False, False, True, False])
+    for which in (mask, mask.tolist(), [0, 3], np.array([0, -2]), slice(0, 5, 3)):
+        assert [one.impulse.tobytes() for one in many[which]] == [many.impulse[i].tobytes() for i in (0, 3)]
+        assert [one.relative for one in found[which]] == found.relative[[0, 3]].tolist()
+        assert batch[which] == [batch[0], batch[3]]
+    assert many[np.int64(3)] is many[3] and many[[]] == []
+    for wrong in (5, -6, mask[:4], [5], "a"):
+        with pytest.raises(IndexError):
+            many[wrong]
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -274,6 +312,7 @@ def test_worlds_whose_turn_comes_too_late_keep_their_start():
         ({"v_free": np.zeros((4, 17))}, "v_free has shape"),
         ({"target": np.zeros((4, 11))}, "target has shape"),
         ({"cones": lv.Cones.contacts(0.5, count=5)}, "48 of all worlds are needed"),
+        ({"count": [12, 9, 0, 3]}, "24 of all worlds are needed, without what pads them; .* give a list"),
         ({"cones": [DISKS] * 3}, "one for each of 4 worlds"),
         ({"count": [12, 13, 0, 1]}, "count of world 1 is 13"),
         ({"mu": np.zeros((4, 5))}, "mu has shape"),
