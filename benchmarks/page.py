@@ -19,8 +19,8 @@ from pathlib import Path
 import click
 
 from benchmarks.output import markdown
-from lavender.errors import SolverUnavailable
-from lavender.web import pages
+from lavender.base.errors import SolverUnavailable
+from lavender.sim.web import pages
 
 ADDRESSES = (
     "scene=pyramid&a=16,warm,given&b=16,warm,given&speed=1&play=1",
@@ -104,7 +104,7 @@ def measured(page, seconds):
     page.wait_for_timeout(1000 * seconds)
     found = page.evaluate("() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})")
     thread = spent(session) - before
-    dt = page.evaluate("lavender.scene.dt")
+    dt = page.evaluate("lavender.sim.scene.dt")
     page.evaluate("lavender.play(false)")
     parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
     parts["watching"] = max(parts["watching"] - parts["steps"], 0.0) / 8

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 
 import lavender as lv
-from lavender.scene.parts import rotation
+from lavender.sim.scene.parts import rotation
 
 
 def unit(rng, n=3):

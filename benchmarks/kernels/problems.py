@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.kernels import microbenchmarks
+from lavender.lab.suite.families import at_least
 from lavender.problem import Problem
-from lavender.rows import Rows
-from lavender.suite.families import at_least
+from lavender.problem.rows import Rows
 
 __all__ = ["bare_contacts", "lattice_pile", "raw_bytes", "tridiagonal"]
 

@@ -17,8 +17,8 @@ from threading import get_native_id
 from types import MappingProxyType
 from typing import Any
 
-from lavender._arrays import FloatArray, flag, whole_number
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.errors import InputError
 from lavender.problem import Problem
 
 __all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]

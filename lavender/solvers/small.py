@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
+from lavender.judge.residuals import judged, reference
+from lavender.judge.solution import Claim, Status, Turn, counted
 from lavender.problem import Problem
-from lavender.registry import SMALL_ROWS
-from lavender.residuals import judged, reference
-from lavender.solution import Claim, Status, Turn, counted
 from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
+from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.setup_times import forming
 from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender._derived import cached_property
-from lavender.certificates import check_certificate
-from lavender.deadline import Deadline
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import Deadline
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
+from lavender.judge.solution import Claim, Status, Turn
 from lavender.problem import Problem
-from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
-from lavender.solution import Claim, Status, Turn
+from lavender.problem.derived import cached_property
 from lavender.solvers.islands import islands
 from lavender.solvers.small import NO_TIME, told
 from lavender_ext.core.problem import Data

@@ -15,7 +15,7 @@ from stacks import stack
 import lavender as lv
 from lavender import bench, cli, io, registry
 from lavender import check as checking
-from lavender.bench.record import Skip, to_json
+from lavender.lab.bench.record import Skip, to_json
 
 
 @pytest.fixture
@@ -238,7 +238,7 @@ def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
 
 def test_the_time_of_a_solve_holds_no_loading_of_modules():
     code = (
-        "import sys, lavender; s = sys.modules['lavender.solve']; real = s.solve\n"
+        "import sys, lavender; s = sys.modules['lavender.solving.solve']; real = s.solve\n"
         "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
         "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
     )
@@ -464,7 +464,7 @@ def test_the_nearest_name_is_found_whatever_its_case(lavender):
 
 
 def test_cases_lists_families_with_parameters_and_reasons(lavender):
-    from lavender.suite.case import FAMILIES
+    from lavender.lab.suite.case import FAMILIES
 
     code, out, _ = lavender("cases")
     assert code == 0
@@ -578,7 +578,17 @@ def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alo
     """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
     (tmp_path / "sitecustomize.py").write_text(WORKER)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-m", "lavender", "report", "--campaign", "granular(n=2)", "--seeds", "20"]
+    command = [
+        sys.executable,
+        "-m",
+        "lavender",
+        "lab",
+        "report",
+        "--campaign",
+        "granular(n=2)",
+        "--seeds",
+        "20",
+    ]
     command += ["--workers", "2", "--solvers", "pgs", "--no-figures", "--out", str(tmp_path / "out")]
     more = {"env": environment, "capture_output": True, "text": True, "timeout": 600, "check": False}
     done = subprocess.run(command, start_new_session=True, **more)
@@ -766,19 +776,19 @@ def _must_not_begin(*_, **__):
 @pytest.mark.parametrize(
     ("words", "work"),
     [
-        ("run stack --plot {}/x.svg", "lavender.engine.Simulation.step"),
-        ("run stack --trace {}/x.csv", "lavender.engine.Simulation.step"),
-        ("run stack --film {}/x.film", "lavender.engine.Simulation.step"),
-        ("run stack --film {}/x.gif", "lavender.engine.Simulation.step"),
-        ("solve toy_stack --output {}/x.npz", "lavender.bench.resolve"),
+        ("run stack --plot {}/x.svg", "lavender.sim.engine.Simulation.step"),
+        ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
+        ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
+        ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
+        ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve"),
         ("phenomena lift --out {}/x.json", "lavender.cli.phenomena.run"),
-        ("web build {}/x.wasm", "lavender.web.compile.build"),
-        ("export c {}/sub", "lavender.export.library.source"),
-        ("export npm {}/sub", "lavender.export.library.source"),
-        ("web page {}/sub", "lavender.web.pages.module"),
-        ("report toy_stack --out {}/sub", "lavender.bench.resolve"),
-        ("report toy_stack --campaign --out {}/sub", "lavender.bench.resolve"),
-        ("run stack --record {}/sub", "lavender.engine.Simulation.step"),
+        ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
+        ("export c {}/sub", "lavender.out.library.source"),
+        ("export npm {}/sub", "lavender.out.library.source"),
+        ("web page {}/sub", "lavender.sim.web.pages.module"),
+        ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
+        ("report toy_stack --campaign --out {}/sub", "lavender.lab.bench.resolve"),
+        ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
 def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch, tmp_path, words, work):
@@ -792,10 +802,10 @@ def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch
 
 
 def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkeypatch):
-    monkeypatch.setattr("lavender.engine.Simulation.step", _must_not_begin)
+    monkeypatch.setattr("lavender.sim.engine.Simulation.step", _must_not_begin)
     code, _, err = lavender("run", "stack", "--plot", "x.plot")
     assert code == cli.EXIT_BAD_INPUT and "suffix" in err and "svg" in err
-    monkeypatch.setattr("lavender.engine.picture.which", lambda name: None)
+    monkeypatch.setattr("lavender.sim.engine.picture.which", lambda name: None)
     code, _, err = lavender("run", "stack", "--film", "x.mp4")
     assert code == cli.EXIT_BAD_INPUT and "ffmpeg" in err
 

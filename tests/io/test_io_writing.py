@@ -15,10 +15,10 @@ from worked import python
 import lavender as lv
 import lavender.cli
 from lavender import bench, io
-from lavender.bench.store import Records, Store
-from lavender.engine import run
-from lavender.engine.picture import save_picture
 from lavender.io.stored import PART, folder_for_steps, write_atomically, write_text
+from lavender.lab.bench.store import Records, Store
+from lavender.sim.engine import run
+from lavender.sim.engine.picture import save_picture
 
 resource = pytest.importorskip("resource", reason="limits, pipes and devices with names are of POSIX")
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes and devices with names are of POSIX")
@@ -252,7 +252,7 @@ def test_every_command_writes_files_under_other_names_first(tmp_path):
         import os, sys
         from lavender import cli
         from lavender.io.stored import PART
-        from lavender.web import pages
+        from lavender.sim.web import pages
         pages.module = lambda say, name: b"a module"
         here, opened = os.getcwd(), set()
 
@@ -287,7 +287,7 @@ WRITE_AND_DIE = """if True:
     import os, signal, sys
     from pathlib import Path
     from lavender.io.stored import write_atomically
-    from lavender.web import compile
+    from lavender.sim.web import compile
 
     def write(part):
         Path(part).write_bytes(b"half")

@@ -190,7 +190,7 @@ print("scipy" in sys.modules)
 LATE = """
 import os, sys
 import numpy as np, lavender as lv
-from lavender.loop import Loop
+from lavender.solving.loop import Loop
 
 class Watch:
     running = False
@@ -336,12 +336,13 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     # The names that both writers use, beside files of the package.
     names = []
     write_atomically(tmp_path / "a.c", lambda part: part.write_text(names.append(part.name) or ""))
-    code = "from pathlib import Path; from lavender.web import compile; Path.write_bytes = lambda *what: print(*what); "
+    code = "from pathlib import Path; from lavender.sim.web import compile; "
+    code += "Path.write_bytes = lambda *what: print(*what); "
     done = python(
         "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.put(Path('a.wasm'), b'')"
     )
     names += [done.stdout.split()[0], "a.h", "a.wasm"]
-    for folder in ("lavender/web", "docs"):
+    for folder in ("lavender/sim/web", "docs"):
         (tmp_path / folder).mkdir(parents=True)
         for name in names:
             (tmp_path / folder / name).write_text("")
@@ -351,7 +352,12 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     code = "from setuptools.command.egg_info import FileList; files = FileList(); "
     code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
     done = python("-c", code, cwd=tmp_path)
-    assert done.stdout.split() == ["docs/a.h", "docs/a.wasm", "lavender/web/a.h", "lavender/web/a.wasm"]
+    assert done.stdout.split() == [
+        "docs/a.h",
+        "docs/a.wasm",
+        "lavender/sim/web/a.h",
+        "lavender/sim/web/a.wasm",
+    ]
 
 
 def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_path):

@@ -97,11 +97,11 @@ def test_no_test_imports_a_conftest():
 def test_a_private_name_is_seen():
     source = """
 from lavender.solvers._plan import plan
-from lavender.solve import _claim
+from lavender.solving.solve import _claim
 import lavender._plan
 problem._state, self._state, numpy.float64, named._replace
 monkeypatch.setattr(registry, "_registered", {})
-monkeypatch.setattr("lavender.solve._claim", None)
+monkeypatch.setattr("lavender.solving.solve._claim", None)
 import _thread
 """
     assert [line for line, _ in private_names(ast.parse(source))] == [2, 3, 4, 6, 7, 5]
