@@ -23,7 +23,9 @@ from scipy.optimize import nnls
 import lavender as lv
 from benchmarks.islands import forms, fresh
 from benchmarks.output import markdown
-from lavender import _later, residuals, suite
+from lavender import suite
+from lavender.base import later as _later
+from lavender.judge import residuals
 from lavender.problem import Problem
 from lavender.solvers import setup_times
 from lavender.solvers.registry import get

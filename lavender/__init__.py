@@ -103,6 +103,7 @@ _LATER = {
 _MODULES = {
     "bench": "lavender.lab.bench",
     "engine": "lavender.sim.engine",
+    "export": "lavender.out",
     "io": "lavender.io",
     "motion": "lavender.lab.motion",
     "phenomena": "lavender.lab.phenomena",

@@ -18,7 +18,7 @@ from fractions import Fraction
 import numpy as np
 
 import lavender as lv
-from lavender import proof
+from lavender.lab import proof
 
 getcontext().prec = 60
 SLACK = Fraction(

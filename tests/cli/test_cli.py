@@ -14,7 +14,7 @@ from stacks import stack
 
 import lavender as lv
 from lavender import bench, cli, io, registry
-from lavender import check as checking
+from lavender.lab import check as checking
 from lavender.lab.bench.record import Skip, to_json
 
 

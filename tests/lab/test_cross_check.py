@@ -7,7 +7,8 @@ import pytest
 from random_problems import random_contact_problem, spd
 
 import lavender as lv
-from lavender import check, registry, suite
+from lavender import registry, suite
+from lavender.lab import check
 from lavender.lab.check import cross_check
 
 

@@ -16,7 +16,8 @@ from test_same_bits import kinds_of, of_matrix
 from tower import self_test_problem
 
 import lavender as lv
-from lavender import bench, export
+from lavender import bench
+from lavender import out as export
 from lavender.base.errors import LavenderError
 from lavender.cli import cli
 from lavender.out import vectors

@@ -17,7 +17,7 @@ from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 from tower import self_test_problem
 
 import lavender as lv
-from lavender import export
+from lavender import out as export
 from lavender.out import HEADER
 from lavender.out.header import constants
 from lavender.out.view import ARRAYS, METHODS

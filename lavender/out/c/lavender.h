@@ -242,7 +242,7 @@ LAV_API int32_t lav_islands(lav_solver *solver, int32_t *label, int32_t n);
 /* Hash of the bits of numbers, as test vectors have it. */
 LAV_API uint64_t lav_hash(const double *x, int32_t n, uint64_t seed);
 
-/* The engine of the package, stepped from a snapshot that it wrote: `lavender.out.engine_image(simulation)`. */
+/* The engine of the package, stepped from a snapshot that it wrote: `lavender.export.engine_image(simulation)`. */
 typedef struct lav_engine lav_engine;
 LAV_API int32_t lav_engine_room(const void *image, uint64_t image_bytes, uint64_t *bytes);
 LAV_API int32_t lav_engine_open(void *memory, uint64_t bytes, const void *image, uint64_t image_bytes, lav_engine **out);

@@ -13,8 +13,8 @@ from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
 from benchmarks.drawn import wild
-from lavender import generalized as coordinates
 from lavender import registry
+from lavender.problem import generalized as coordinates
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import general
 from lavender.solvers.sweeping import reads_whitened

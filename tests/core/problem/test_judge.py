@@ -13,7 +13,8 @@ from random_trees import random_general
 from scipy.linalg import block_diag
 
 import lavender as lv
-from lavender import residuals, suite
+from lavender import suite
+from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import natural_map, qp_residual
 from lavender.judge.residuals import judged, known, remember

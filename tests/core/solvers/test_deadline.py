@@ -9,7 +9,9 @@ from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from benchmarks.islands import fresh
-from lavender import deadline, registry, residuals, suite
+from lavender import registry, suite
+from lavender.base import deadline
+from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Auto, Tree
 from lavender.solvers.setup_times import forming

@@ -13,10 +13,11 @@ import pytest
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
-from lavender import many, registry, suite
+from lavender import registry, suite
 from lavender.judge.solution import Claim, Status
 from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
+from lavender.solving import many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
 

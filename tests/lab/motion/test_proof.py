@@ -8,7 +8,8 @@ import pytest
 import scipy.sparse as sp
 
 import lavender as lv
-from lavender import proof, suite
+from lavender import suite
+from lavender.lab import proof
 from tests import proof_twin
 from tests.random_problems import random_contact_problem
 

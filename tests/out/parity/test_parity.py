@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from lavender import export
+from lavender import out as export
 from lavender.base.errors import LavenderError
 
 HERE = Path(__file__).resolve().parent
