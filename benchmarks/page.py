@@ -104,7 +104,7 @@ def measured(page, seconds):
     page.wait_for_timeout(1000 * seconds)
     found = page.evaluate("() => ({...found, to: lavender.steps, passed: performance.now() - found.begun})")
     thread = spent(session) - before
-    dt = page.evaluate("lavender.sim.scene.dt")
+    dt = page.evaluate("lavender.scene.dt")
     page.evaluate("lavender.play(false)")
     parts = {name: cpu(page, session, code, 40) for name, code in PARTS.items()}
     parts["watching"] = max(parts["watching"] - parts["steps"], 0.0) / 8

@@ -38,7 +38,7 @@ def frames(preset, seconds, pace):
             "width": WIDTH,
             "height": last["y"] + last["height"] + 10 - first["y"],
         }
-        dt = page.evaluate("lavender.sim.scene.dt")
+        dt = page.evaluate("lavender.scene.dt")
         steps = 0
         for k in range(int(seconds * FRAMES)):
             due = round(k * pace / FRAMES / dt)

@@ -102,7 +102,9 @@ _LATER = {
 # Public module -> where it stands.
 _MODULES = {
     "bench": "lavender.lab.bench",
+    "cones": "lavender.problem.cones",
     "engine": "lavender.sim.engine",
+    "errors": "lavender.base.errors",
     "export": "lavender.out",
     "io": "lavender.io",
     "motion": "lavender.lab.motion",

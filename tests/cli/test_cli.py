@@ -582,7 +582,6 @@ def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alo
         sys.executable,
         "-m",
         "lavender",
-        "lab",
         "report",
         "--campaign",
         "granular(n=2)",

@@ -11,6 +11,7 @@ from random_problems import FORMS, as_matrix, good, random_contact_problem, seed
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry, suite
+from lavender.judge import residuals
 from lavender.solvers.certify import certify
 from lavender.solvers.islands import islands, restrict, rows_of
 from lavender.solvers.newton_systems import general
@@ -301,7 +302,7 @@ def test_a_start_that_solves_a_as_it_was_formed_is_judged_by_the_problem():
 def test_the_result_is_not_judged_twice(solver, monkeypatch):
     problem = lv.Problem.contact(4.0 * np.eye(90) + 0.01, np.linspace(-1.0, 1.0, 90), np.full(30, 0.5))
     found = []
-    judged = lv.residuals.judged
+    judged = residuals.judged
     monkeypatch.setattr("lavender.judge.residuals.judged", lambda *given: found.append(1) or judged(*given))
     assert lv.solve(problem, solver, max_iter=150, time_limit=10.0).success
     assert not found  # what the solver had judged last is what it hands over

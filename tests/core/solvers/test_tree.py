@@ -191,7 +191,7 @@ class Made(Step):
         self.impulse = self.log.problem.start() + self.found.pop(0)
         self.asked.append(n)
         self.offer()
-        return lv.solution.Claim(lv.Status.MAX_ITERATIONS, n)
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n)
 
 
 def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):

@@ -522,7 +522,7 @@ def test_lines_are_timed_in_turns_and_kept(tmp_path):
 def test_scipys_own_blas_has_one_thread_while_something_is_timed_though_it_is_loaded_late():
     said = python(
         "-c",
-        "from lavender.bench.running.timing import one_thread\n"
+        "from lavender.lab.bench.running.timing import one_thread\n"
         "from threadpoolctl import threadpool_info\n"
         "with one_thread():\n"
         "    import scipy.linalg.lapack\n"

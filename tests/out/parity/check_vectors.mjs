@@ -1,6 +1,6 @@
 // Test vectors solved again by the library's WebAssembly module: node check_vectors.mjs PACKAGE VECTORS
 //
-// PACKAGE is a folder of `lavender export npm`, VECTORS a vectors.bin as `lavender.export.vectors` describes it.
+// PACKAGE is a folder of `lavender export npm`, VECTORS a vectors.bin as `lavender.out.vectors` describes it.
 
 import { readFileSync } from "node:fs";
 import { join } from "node:path";

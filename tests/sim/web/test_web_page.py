@@ -549,15 +549,15 @@ def test_the_address_holds_every_setting_and_is_followed(visit):
     v.page.locator("#speed").select_option("0.05")
     assert v.js("location.hash") == "#scene=pyramid&a=12,cold,top_down&b=40,cold,random&speed=0.05&play=0"
     v.js("location.hash = '#scene=table&a=5,warm,given&b=6,warm,given&play=1'")
-    v.page.wait_for_function("lavender.sim.scene.name === 'table' && lavender.playing")
+    v.page.wait_for_function("lavender.scene.name === 'table' && lavender.playing")
     assert v.side(0).locator(".sweeps output").text_content() == "5"
     v.js("location.hash = '#no such scene'")
-    v.page.wait_for_function("lavender.sim.scene.name === 'stack'")
+    v.page.wait_for_function("lavender.scene.name === 'stack'")
     assert v.page.text_content("#failure") == 'There is no scene "no such scene": this is stack.'
     v.js("location.hash = '#half%'")  # that encodes nothing
     v.page.wait_for_function("document.querySelector('#failure').textContent.includes('half%')")
     v.js("location.hash = '#pyramid'")
-    v.page.wait_for_function("lavender.sim.scene.name === 'pyramid'")
+    v.page.wait_for_function("lavender.scene.name === 'pyramid'")
     assert v.page.locator("#failure").is_hidden()
     v.js("location.hash = '#scene=stack&a=1000,x,y&b='")  # senseless values leave what was set
     v.page.wait_for_function("!lavender.playing")
