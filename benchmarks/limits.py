@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 import lavender as lv
-from benchmarks.islands import forms, fresh
+from benchmarks.made import forms, fresh
 from benchmarks.output import markdown
 from lavender import suite
 from lavender.base import later as _later

@@ -28,7 +28,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks import drawn
-from benchmarks.islands import forms
+from benchmarks.made import forms
 from benchmarks.output import markdown, out_option, write_json
 from lavender import suite
 from lavender.judge.residuals import nothing_to_do

@@ -12,7 +12,8 @@ import numpy as np
 
 from benchmarks.clock import least, wall
 from benchmarks.kernels import microbenchmarks
-from benchmarks.kernels.problems import bare_contacts, lattice_pile, raw_bytes, tridiagonal
+from benchmarks.kernels.problems import bare_contacts, raw_bytes, tridiagonal
+from benchmarks.made import lattice_pile
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.residuals import residual

@@ -2,12 +2,16 @@
 
 import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
+from random_problems import good
 
 import lavender as lv
 import lavender.io
+from lavender.solvers.newton_systems import systems
+from lavender_ext.newton.solve import PHASES
 
 pytest.importorskip("h5py", reason="most reference problems are HDF5")
 
@@ -85,3 +89,36 @@ def test_exact_solvers_end_on_every_problem_without_friction(problem_dir, solver
             assert not problem.is_symmetric, name  # where A is not monotone either, exchanges may have no end
         else:
             assert found.success or found.status is lv.Status.FLOOR, (name, found)
+
+
+#: Real friction problems on which 20,000 sweeps fail or take thousands.
+HARD = ["fc3d_2cubes_t0", "fc3d_OneObject-i100000-499", "fc3d_LMGC_100_PR_PerioBox-i00361-60-03000"]
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_real_friction_problems(problem_dir, name):
+    pytest.importorskip("h5py")
+    solution = lv.solve(lv.load(problem_dir / f"{name}.hdf5"), "admm", tol=1e-8, max_iter=5000)
+    assert solution.success, solution
+
+
+def newton_without(problem, *phases):
+    """A solve that leaves these phases out."""
+    begun = systems.System.__init__
+
+    def begin(self, problem, solve):
+        begun(self, problem, solve)
+        solve.without = sum(PHASES[name] for name in phases)
+
+    with mock.patch.object(systems.System, "__init__", begin):
+        return lv.solve(problem, "newton", tol=1e-6)
+
+
+@pytest.mark.parametrize("step", [150, 180])
+def test_piles_that_creep_are_solved_along_a_path_through_its_folds(step, problem_dir):
+    """126 balls in a box, between stick and slip: rounds end at 1e-5, interior points at 7e-3."""
+    problem = lv.io.load(problem_dir / "engine" / f"balls_step_0{step}.npz")
+    solution = lv.solve(problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6) and "path steps" in solution.message, solution
+    other = newton_without(problem, "path")
+    assert not good(other, 1e-6) or other.work["factorisations"] > 1000, other

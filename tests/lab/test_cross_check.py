@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_problems import random_contact_problem, spd
+from random_problems import random_contact_problem, random_lcp, spd
 
 import lavender as lv
 from lavender import registry, suite
@@ -231,3 +231,90 @@ def test_a_proof_that_there_is_no_solution_counts():
     assert [row.verdict for row in table] == [check.PROVED, check.PROVED, check.NOT_SOLVED]
     assert table.reference is None
     assert not table.ok and not table.contradicted
+
+
+def says(status, **more):
+    return lv.Claim(status, 1, **more)
+
+
+def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):
+    asked = []
+
+    def run(problem, impulse):
+        asked.append(problem)
+        raise KeyboardInterrupt
+
+    name = plug_in(run)
+    for ask in (
+        lambda: lv.solve_many([random_lcp(14)] * 3, name),
+        lambda: lv.cross_check(random_lcp(14), [name, "pgs"]),
+        lambda: lv.motions(random_lcp(14)).picks([name, "pgs"]),
+    ):
+        before = len(asked)
+        with pytest.raises(KeyboardInterrupt):
+            ask()
+        assert len(asked) == before + 1
+
+
+RAY = np.array([[-0.2], [-0.7], [0.6], [2.0]])
+
+
+#: Two contacts along one ray: no impulse meets both, and larger ones only cost more digits.
+NO_MOTION = lv.Problem.contact(RAY @ RAY.T, [0.2, -1.1, 1.4, -1.9], [0.3, 0.6])
+
+
+@pytest.mark.parametrize("name", lv.available(NO_MOTION, external=False))
+def test_an_impulse_that_ran_away_is_at_no_floor(name):
+    solution = lv.solve(NO_MOTION, name)
+    assert solution.status not in (lv.Status.FLOOR, lv.Status.CONVERGED)
+    assert not solution.residual.at_floor
+    assert not solution.contradicted
+    if solution.status is not lv.Status.INFEASIBLE:
+        with pytest.raises(lv.errors.SolveFailed):
+            solution.raise_for_status()
+    assert lv.cross_check(NO_MOTION, [name])[name].verdict in ("not solved", "no solution within rounding")
+    assert not lv.motion.reference(NO_MOTION).accepted
+    if name == "auto":
+        assert solution.status is lv.Status.INFEASIBLE
+
+
+def test_an_impulse_no_better_than_none_is_excused_by_nobody():
+    problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0], guess=[1e17, -1e17])
+    assert lv.residual(problem, problem.guess).floor > 1.0
+    reference = lv.motion.adopt(problem, problem.guess)
+    assert not reference.accepted
+    assert lv.motion_error(problem, [0.5, 0.0], reference=reference).relative is None
+    assert len(lv.motions(problem)) == 0
+    assert lv.cross_check(problem, ["pgs"]).agreed == ()
+
+
+def test_cross_check_does_not_pass_an_impulse_that_is_wrong_where_nothing_was_to_do(plug_in):
+    idle = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [-1.0, -1.0])
+
+    def run(problem, impulse):
+        impulse[0] = 1e6
+        return says(lv.Status.STALLED)
+
+    name = plug_in(run)
+    assert lv.cross_check(idle, [name])[name].verdict == "not solved"
+
+
+def test_cross_check_neither_agrees_nor_fails_where_there_is_nothing_to_do():
+    table = lv.cross_check(lv.Problem.lcp(np.eye(2), [-1.0, -1.0]), ["pgs", "direct"])
+    assert [row.verdict for row in table] == ["nothing to do"] * 2
+    assert "m/s" in table["pgs"].note
+    assert table.ok
+    assert table.agreed == ()
+
+
+TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
+
+
+def test_known_tells_of_everybody_and_available_of_those_that_can():
+    known = lv.known(TINY)
+    assert set(known) == set(registry.specs())
+    assert [name for name, reason in known.items() if reason is None] == lv.available(TINY)
+    assert all(reason for reason in known.values() if reason is not None)
+    for ask in (lv.solve, lv.available, lv.known, lv.cross_check):
+        with pytest.raises(lv.InputError, match="Problem is needed"):
+            ask(np.eye(2))

@@ -9,10 +9,12 @@ import scipy.sparse as sp
 from hypothesis import given
 from kkt_truth import eliminate
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_trees import random_general
 from scipy.optimize import minimize
 
 import lavender as lv
 from lavender.lab.redundancy import redundancy
+from lavender.problem import operators
 
 
 def box_on_corners(mu=None, points=4, load=None):
@@ -290,3 +292,40 @@ def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
     )
     assert lv.redundancy(many).rank == 1200
     assert max(seen)[0] <= 5
+
+
+def test_other_forms_know_the_operator():
+    problem = random_general(2, "coulomb", compliance=False)
+    assert problem.relaxed("cone").generalized is problem.generalized
+    boxed = problem.boxed(0.7)
+    assert boxed.law == "lcp"
+    assert boxed.generalized is problem.generalized
+    form = problem.velocity_form()
+    scale = np.outer(form.scale, form.scale)
+    np.testing.assert_allclose(
+        (form.jacobian @ form.jacobian.T).toarray(), problem.dense() * scale, atol=1e-13
+    )
+    found = lv.redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(problem.dense())
+    assert found.rank < problem.m
+    assert lv.solve(problem, "pgs", order="colored", max_iter=3, tol=0.0).iterations == 3
+
+
+def test_entries_of_a_are_counted_once(monkeypatch):
+    """Rows that share all velocities of a tree meet once, not once for each of them."""
+    rng = np.random.default_rng(5)
+    jac = np.zeros((40, 30))
+    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
+    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40 + 1)
+    free = lv.Cones.free(40)
+    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
+    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
+    assert lv.redundancy(problem).rank == 1
+    twins = lv.Problem.from_jacobian(
+        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
+    )
+    assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40)
+    with pytest.raises(lv.InputError, match="J and M as they are"):
+        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -4,11 +4,13 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from random_problems import as_matrix, general, touching
 from worked import ROOT, after
 
 import lavender as lv
 from benchmarks.planted import planted, scenes, shares
 from lavender import suite
+from lavender.judge.certificates import fighting
 
 SCENES = {
     "stack": after(2, "stack", n=12, size=0.5, mass=60.0).constraint_problem(),
@@ -280,3 +282,52 @@ def test_what_is_no_problem_is_refused():
         lv.diagnose(np.eye(3))
     with pytest.raises(lv.InputError, match="shape"):
         lv.diagnose(SCENES["stack"], np.zeros(3))
+
+
+def pressed(law, form):
+    """A ball that contact 0 pushes up by 0.1 m/s and a joint of one row holds; contact 1 has no part in it.
+
+    y = 1 on both: w.y = 0 whatever the impulses, b.y = 0.1.
+    """
+    rows = touching([[-1, 0], [-1, 1]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    jac = np.zeros((1, 12))
+    jac[0, 8] = -1.0
+    rows = replace(rows, jac=jac, joint_ptr=np.array([0, 1]), joint_body=np.array([[-1, 0]]))
+    friction = {"friction": law, "tangents": 2, "mu": 0.5} if law in ("coulomb", "cone") else {"tangents": 0}
+    ends = {"lower": -np.inf, "upper": np.inf}
+    target = np.zeros(1 + 2 * (1 + friction["tangents"]))
+    target[1] = 0.1
+    problem = lv.Problem.from_rows(rows, target=target, **ends, **friction)
+    return {"bodies": problem, "J and M": general(problem), "A": as_matrix(problem)}[form]
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+@pytest.mark.parametrize("name", ["auto", "newton"])
+def test_who_fights_is_named(name, law, form):
+    problem = pressed(law, form)
+    solution = lv.solve(problem, "auto" if law == "coulomb" else name)
+    assert solution.status is lv.Status.INFEASIBLE
+    joints, contacts = fighting(problem, solution.certificate)
+    assert joints == (0,) and contacts == (1,)  # blocks
+    assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
+    found = [s for s in lv.diagnose(problem) if s.kind == "conflict"]
+    assert len(found) == 1 and found[0].blocks == (0, 1)
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+def test_the_compliance_that_is_advised_gives_an_answer(law, form):
+    problem = pressed(law, form)
+    (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")
+    soft = np.zeros(problem.m)
+    for i in range(problem.m):
+        if problem.row_name(i) in found.data["soft_rows"]:
+            soft[i] = found.data["compliance"]
+    assert np.count_nonzero(soft) == 1 and f"{found.data['compliance']:.1g} 1/kg" in found.reason
+    if form == "A":
+        softer = replace(problem, matrix=problem.dense() + np.diag(soft))
+    else:
+        softer = replace(problem, compliance=problem.compliance + soft)
+    assert lv.solve(softer).success
+    assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]

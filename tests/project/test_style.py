@@ -6,6 +6,8 @@ from pathlib import Path
 
 from worked import syntax_of_package
 
+import lavender as lv
+
 MOST = 5  # fields that a reader can tell apart by their places
 
 
@@ -105,3 +107,10 @@ monkeypatch.setattr("lavender.solving.solve._claim", None)
 import _thread
 """
     assert [line for line, _ in private_names(ast.parse(source))] == [2, 3, 4, 6, 7, 5]
+
+
+def test_dir_holds_the_public_names_alone():
+    assert dir(lv) == sorted(lv.__all__)
+    assert not {"Any", "TYPE_CHECKING", "import_module"} & set(dir(lv))
+    for name in dir(lv):
+        getattr(lv, name)

@@ -7,7 +7,7 @@ import pytest
 from random_problems import random_contact_problem, spd, touching
 
 import lavender as lv
-from lavender import registry, suite
+from lavender import registry
 from lavender.external import backends, qp_solver
 from lavender.external.running import Answer
 from lavender.judge.certificates import check_certificate
@@ -111,29 +111,6 @@ def test_nothing_to_solve(name):
     assert "decided by its bounds" in fixed.message
 
 
-@pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.parametrize("mass_ratio", [1.0, 1e4])
-def test_redundant_contacts_in_the_form_that_suits_them(name, mass_ratio):
-    # Singular A, and at 1e4 ill-conditioned: the velocity form is definite, so quadprog takes it too.
-    problem = suite.box_stack(10, mass_ratio).problem
-    solution = lv.solve(problem, name)
-    assert solution.solver.form == ("velocity" if mass_ratio > 1.0 or name in DEFINITE else "impulse")
-    assert solution.success, str(solution)
-    # The boxes come to rest: A is singular, so the velocities are what is unique.
-    speed = np.abs(problem.velocity(solution.impulse)).max()
-    assert speed <= 1e-5 * 9.81 / 60.0
-
-
-@pytest.mark.parametrize("name", installed("quadprog", "ecos"))
-def test_singular_a_in_the_impulse_form_is_an_honest_failure(name):
-    problem = suite.box_stack(3).problem
-    start = np.full(problem.m, 0.01)
-    solution = lv.solve(problem, name, form="impulse", impulse=start)
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "not positive definite" in solution.message
-    assert np.array_equal(solution.impulse, start)
-
-
 # -- what ran -----------------------------------------------------------------------------------------
 
 
@@ -165,16 +142,6 @@ def test_linear_problems_never_go_to_lsqr(name, monkeypatch):
     assert solution.success, str(solution)
     assert solution.work["backend_calls"] >= 1
     assert "LSQR" not in solution.message
-
-
-@pytest.mark.parametrize("name", BACKENDS)
-def test_backends_are_silent(name, capfd):
-    for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(6)), suite.box_stack(2).problem):
-        if registry.get(name).refuses(problem) is None:
-            lv.solve(problem, name)
-    out, err = capfd.readouterr()
-    assert out == ""
-    assert err == ""
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -249,28 +216,6 @@ def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeyp
         assert other.impulse.tobytes() == plain.impulse.tobytes()
 
 
-@pytest.mark.parametrize("name", BACKENDS)
-def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name, monkeypatch):
-    """A program was formed outside the clock: 10 ms of 8,000 rows under a limit of one."""
-    problem = suite.case("granular(n=6)").problem
-    lv.residual(problem, problem.start())
-    with monkeypatch.context() as patch:
-        patch.setattr(qp_solver.QPSolver, "prepare", None)
-        late = lv.solve(problem, name, time_limit=1e-3)
-    assert late.status is lv.Status.TIME_LIMIT and "set up" in late.message
-    assert late.setup_time < 1e-3 and not late.work
-    assert late.impulse.tobytes() == problem.start().tobytes()
-
-
-def test_a_backend_that_looks_at_the_clock_too_late_is_ended():
-    """DAQP looks at it rarely: on these rows it took seconds under a limit of a millisecond."""
-    if "daqp" not in BACKENDS:
-        pytest.skip("daqp is not installed")
-    problem = suite.case("granular(n=7)").problem
-    late = lv.solve(problem, "daqp", form="impulse", time_limit=0.02)
-    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
-
-
 def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
     if "quadprog" not in BACKENDS:
         pytest.skip("quadprog is not installed")
@@ -316,27 +261,6 @@ def test_errors_of_a_process_of_its_own_are_told():
     assert apart.message.split(";")[0] == here.message.split(";")[0]
 
 
-@pytest.mark.parametrize("name", installed("osqp", "scs", "qpalm"))
-def test_time_limit_stops_a_backend(name):
-    # Far below what the first-order methods can reach: only the clock ends this.
-    problem = suite.box_stack(30, 1e6).problem
-    solution = lv.solve(problem, name, tol=1e-13, form="impulse", max_iter=10**8, time_limit=0.2)
-    assert solution.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED), str(solution)
-
-
-@pytest.mark.parametrize(
-    "name", installed("osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone")
-)
-def test_the_iteration_budget_reaches_the_backend(name):
-    problem = suite.box_stack(10, 1e4).problem
-    solution = lv.solve(problem, name, max_iter=2, form="impulse")
-    assert solution.work["iterations"] <= 3  # qpalm counts the step it stops in
-    assert solution.status is not lv.Status.CONVERGED or solution.success
-    none = lv.solve(problem, name, max_iter=0)
-    assert none.status is lv.Status.MAX_ITERATIONS
-    assert none.work == {"backend_calls": 0}
-
-
 # -- options ------------------------------------------------------------------------------------------
 
 
@@ -358,12 +282,6 @@ def test_an_unknown_setting_is_an_input_error(name):
 def test_settings_must_be_a_mapping(name):
     with pytest.raises(lv.InputError, match="mapping"):
         lv.solve(lv.Problem.lcp(*spd(3)), name, settings=[1])
-
-
-def test_unit_diagonal_is_a_choice():
-    problem = suite.box_stack(4).problem
-    for unit in (True, False):
-        assert lv.solve(problem, "osqp", form="impulse", unit_diagonal=unit).success
 
 
 # -- failures of a backend ----------------------------------------------------------------------------

@@ -191,14 +191,6 @@ def test_a_switch_is_flagged_within_the_error_of_the_answer():
     assert rough.distance[0] < 1e-8 and rough.distance_in_errors[0] < 10.0
 
 
-def test_several_motions_are_told():
-    # Painleve's kind: friction and normal couple so that a contact may stick or lift
-    p = lv.Problem.contact(np.array([[1.0, -2.5], [-2.5, 8.0]]), [1.0, -4.0], mu=[1.0])
-    found = lv.motions(p)
-    d = lv.derivative(p, found[0].impulse)
-    assert len(d.motions) == len(found) and d.motions.all == found.all
-
-
 # -- what is refused ---------------------------------------------------------------------------------------------
 
 

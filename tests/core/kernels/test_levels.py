@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from random_problems import random_contact_problem
-from worked import after
 
 import lavender as lv
-from benchmarks.kernels import lattice_pile
+from benchmarks.made import lattice_pile
 from lavender_ext.accelerate import accelerated
 
 
@@ -68,12 +67,6 @@ def test_checks_see_the_same(name, order):
 @pytest.mark.parametrize("options", [{"order": "random"}, {"sweep": "blocks"}])
 def test_what_is_not_packed(options):
     assert swept(lattice_pile(300), "nncg", [40], **options)[2] == 0
-
-
-def test_one_chain_is_swept_one_by_one():
-    """Where each contact waits for the one before, pairs gain nothing."""
-    sim = after(5, "stack", n=40)
-    assert swept(sim.constraint_problem(), "nncg", [40])[2] == 0
 
 
 def test_hostile_numbers_do_no_harm():

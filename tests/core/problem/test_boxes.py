@@ -7,7 +7,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import as_matrix, dragged, random_boxes, seeds
+from random_problems import dragged, random_boxes, seeds
 
 import lavender as lv
 from lavender import registry
@@ -205,47 +205,4 @@ def test_no_impulse_meets_every_row():
 # -- the engine --------------------------------------------------------------------------------------------------------
 
 
-def slope(angle, turned, shape, **more):
-    """Speed [m/s] down a slope after a second, the first tangent `turned` from the way down."""
-    g, mu = 9.81, 0.5
-    down = g * np.sin(angle)
-    scene = lv.Scene(
-        gravity=(down * np.cos(turned), down * np.sin(turned), -g * np.cos(angle)), friction=mu,
-        friction_shape=shape, **more,
-    )  # fmt: skip
-    scene.add_plane()
-    scene.add_box((1.0, 1.0, 0.2), position=(0.0, 0.0, 0.1))
-    sim = lv.Simulation(scene)
-    for _ in range(120):
-        observation = sim.step()[0]
-    return float(np.linalg.norm(observation["velocities"][1, :2]))
-
-
-@pytest.mark.parametrize("more", [{}, {"stepper": "soft_step"}, {"solver": "newton"}])
-def test_a_box_grips_more_on_the_diagonal(more):
-    g, mu, root = 9.81, 0.5, np.sqrt(2.0)
-    for turned, grip in ((0.0, mu), (np.pi / 4, root * mu)):
-        below, above = np.arctan(grip) - 0.01, np.arctan(grip) + 0.05
-        assert slope(below, turned, "box", **more) < 1e-3
-        speed = g * (np.sin(above) - grip * np.cos(above)) * 1.0
-        assert slope(above, turned, "box", **more) == pytest.approx(speed, rel=0.02)
-    assert slope(np.arctan(mu) + 0.05, np.pi / 4, "disk", **more) > 0.3
-
-
-def test_what_no_scene_of_boxes_has_is_told():
-    with pytest.raises(lv.UnknownName, match="friction_shape"):
-        lv.Scene("stack", friction_shape="square")
-    for stepper in ("xpbd", "avbd"):
-        with pytest.raises(lv.InputError, match="by a disk"):
-            lv.Scene("stack", friction_shape="box", stepper=stepper)
-    with pytest.raises(lv.InputError, match="no spin friction"):
-        lv.Simulation(lv.Scene("spinner", friction_shape="box"))
-
-
 # -- files -------------------------------------------------------------------------------------------------------------
-
-
-def test_fclib_has_no_boxes(tmp_path):
-    pytest.importorskip("h5py")
-    with pytest.raises(lv.LavenderError, match="box"):
-        as_matrix(free(3)).save(tmp_path / "box.hdf5")

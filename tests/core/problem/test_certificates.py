@@ -1,6 +1,5 @@
 """What a certificate proves: no solution, or how large the impulses of every solution are."""
 
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,7 +8,7 @@ from random_problems import FORMS, as_matrix, general, random_contact_problem, t
 
 import lavender as lv
 from lavender import registry
-from lavender.judge.certificates import check_certificate, fighting, prove
+from lavender.judge.certificates import check_certificate, prove
 
 OURS = lv.available(external=False)
 OPEN = lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
@@ -208,52 +207,3 @@ def test_an_empty_row_of_bodies_may_be_dust_as_well():
 
 
 # -- who fights ------------------------------------------------------------------------------------------
-
-
-def pressed(law, form):
-    """A ball that contact 0 pushes up by 0.1 m/s and a joint of one row holds; contact 1 has no part in it.
-
-    y = 1 on both: w.y = 0 whatever the impulses, b.y = 0.1.
-    """
-    rows = touching([[-1, 0], [-1, 1]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
-    jac = np.zeros((1, 12))
-    jac[0, 8] = -1.0
-    rows = replace(rows, jac=jac, joint_ptr=np.array([0, 1]), joint_body=np.array([[-1, 0]]))
-    friction = {"friction": law, "tangents": 2, "mu": 0.5} if law in ("coulomb", "cone") else {"tangents": 0}
-    ends = {"lower": -np.inf, "upper": np.inf}
-    target = np.zeros(1 + 2 * (1 + friction["tangents"]))
-    target[1] = 0.1
-    problem = lv.Problem.from_rows(rows, target=target, **ends, **friction)
-    return {"bodies": problem, "J and M": general(problem), "A": as_matrix(problem)}[form]
-
-
-@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
-@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-@pytest.mark.parametrize("name", ["auto", "newton"])
-def test_who_fights_is_named(name, law, form):
-    problem = pressed(law, form)
-    solution = lv.solve(problem, "auto" if law == "coulomb" else name)
-    assert solution.status is lv.Status.INFEASIBLE
-    joints, contacts = fighting(problem, solution.certificate)
-    assert joints == (0,) and contacts == (1,)  # blocks
-    assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
-    found = [s for s in lv.diagnose(problem) if s.kind == "conflict"]
-    assert len(found) == 1 and found[0].blocks == (0, 1)
-
-
-@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
-@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_the_compliance_that_is_advised_gives_an_answer(law, form):
-    problem = pressed(law, form)
-    (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")
-    soft = np.zeros(problem.m)
-    for i in range(problem.m):
-        if problem.row_name(i) in found.data["soft_rows"]:
-            soft[i] = found.data["compliance"]
-    assert np.count_nonzero(soft) == 1 and f"{found.data['compliance']:.1g} 1/kg" in found.reason
-    if form == "A":
-        softer = replace(problem, matrix=problem.dense() + np.diag(soft))
-    else:
-        softer = replace(problem, compliance=problem.compliance + soft)
-    assert lv.solve(softer).success
-    assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]

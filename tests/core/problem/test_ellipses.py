@@ -8,7 +8,6 @@ from random_problems import as_matrix, dragged, random_ellipses
 
 import lavender as lv
 from lavender import registry
-from lavender.cli import main
 from lavender.judge.certificates import check_certificate
 
 OURS = [n for n in lv.available() if registry.specs()[n].own and not registry.specs()[n].external]
@@ -51,32 +50,6 @@ def test_coefficients_come_back_and_equal_ones_are_a_disk():
     t = lv.cones.project(cones, x).reshape(-1, 3)
     np.testing.assert_allclose(np.hypot(*(t[0, 1:] / mu[0])), 1.0)
     np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("make", "words"),
-    [
-        (lambda: lv.Cones.contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
-        (lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
-        (lambda: lv.Cones.contacts([(0.5, -0.2)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, np.nan)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, np.inf)]), "mu"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)]), "one for each tangent"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
-        (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
-        (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1), "bounds no spin"),
-        (lambda: lv.Cones([0, 2], [7], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
-        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
-        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [1e300], [1e12]), "mu_2 must be finite"),
-        (lambda: lv.motions(free(0)), "problem.disk"),
-        (lambda: free(0).to_findex(), "bounds its tangents together"),
-        (lambda: free(0).save("x.hdf5"), "ellipses"),
-    ],
-)
-def test_what_is_no_ellipse_or_takes_none_is_told(make, words):
-    with pytest.raises(lv.LavenderError, match=words):
-        make()
 
 
 # -- closed forms ------------------------------------------------------------------------------------------------------
@@ -166,45 +139,6 @@ def test_angular_rows_of_joints_are_weighed_as_beside_disks():
     joints = problem.cones.ptr[problem.rows.n_joints]
     assert joints > 0
     np.testing.assert_array_equal(problem.disk.metric.nu[:joints], problem.metric.nu[:joints])
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("law", LAWS)
-def test_every_door_gives_the_same(form, law, tmp_path):
-    problem = FORMS[form](1, friction=law)
-    found = lv.solve(problem, tol=1e-9)
-    assert found.success
-    assert lv.solve_many([problem, problem], tol=1e-9)[1].impulse.tobytes() == found.impulse.tobytes()
-    prepared = lv.prepare(problem, "newton")
-    first = prepared.solve(tol=1e-9).impulse
-    again = prepared.solve(replace(problem, name="again"), impulse=first, tol=1e-8)
-    assert again.success
-    np.testing.assert_allclose(again.impulse, first, rtol=1e-6, atol=1e-9)
-    assert lv.solve(problem, "newton", impulse=found.impulse, tol=1e-8, max_iter=1).success
-    path = tmp_path / "ellipse.npz"
-    problem.save(path)
-    back = lv.load(path)
-    assert back == problem
-    assert (
-        lv.residual(back, found.impulse).relative == found.residual.relative
-    )  # of the numbers that were handed out
-    with pytest.raises(SystemExit) as ended:
-        main(["reference", str(path)])
-    assert ended.value.code in (0, None)
-    best = lv.solve(problem, tol=1e-12)
-    assert best.motion_error(best).rows == 0.0
-    error = lv.motion_error(problem, 1.1 * found.impulse)
-    assert error.rows > 1e-3
-    near = lv.motion_error(problem, found.impulse)
-    assert near.rows < 1e-6
-    if law == "cone":
-        assert near.bound < 1e-6 * error.bound
-        assert lv.cross_check(problem, ["newton", "admm", "anderson"]).ok
-    np.testing.assert_array_equal(problem.carry(found), found.impulse)
-    single = np.float32(found.impulse)
-    assert lv.residual(problem, single, "float32").verdict == "at its floor"
-    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
-    assert str(lv.explain(problem))
 
 
 def test_a_certificate_comes_in_the_rows_of_the_problem():

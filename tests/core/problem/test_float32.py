@@ -1,28 +1,14 @@
 """Answers made in float32: what rounding explains, what stopped early, and data that are widened exactly."""
 
-import dataclasses
-import io
-import json
-import pickle
-
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from click.testing import CliRunner
 from hypothesis import given, settings
 from random_problems import random_contact_problem, random_lcp, seeds
 from random_trees import random_tree, tree_mass
 
 import lavender as lv
-from benchmarks.float32 import CUT, FLOOR, exchange, newton, planted, table
-from lavender.cli.entry import cli
 from lavender.judge.residuals import UNIT32, rounded
-from lavender.lab.bench import resolve
-from lavender.lab.bench.cases import describe
-from lavender.lab.bench.record import from_json, to_json
-from lavender.lab.bench.store import Records
-from lavender.lab.report.contents import engine_table
-from lavender.lab.report.engine import contestants
 
 
 def robot(seed, m=12, n=10, soft=True, number=np.float64):
@@ -100,20 +86,6 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         assert f"stopped early, {off.excess:.2g} times its floor" in str(off)
 
 
-def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
-    rng = np.random.default_rng(0)
-    b = rng.normal(size=(40, 40))
-    p = lv.Problem.lcp(b @ b.T / 40 + 0.3 * np.eye(40), rng.normal(size=40) + 1.0, precision="float32")
-    exact = lv.solve(p, tol=1e-13)
-    early = lv.solve(p, "pgs", tol=1e-13, impulse=exact.impulse.astype(np.float32), max_iter=1)
-    assert lv.residual(p, early.impulse).at_floor  # of an answer made in float32
-    assert early.status is lv.Status.MAX_ITERATIONS
-    assert not early.residual.at_floor
-    assert not lv.motion.adopt(p, early.impulse).accepted
-    for solution in (exact, lv.solve(p, max_iter=1000)):  # by a compiled call, and step by step
-        assert solution.residual.precision == "float64"
-
-
 def test_an_answer_that_is_no_better_than_none_is_wrong():
     p = robot(3)
     exact = lv.solve(p, tol=1e-10).impulse
@@ -160,27 +132,6 @@ def test_another_precision_is_told(word):
 # -- early stops, planted -----------------------------------------------------------------------------
 
 
-def test_early_stops_are_found_and_no_answer_at_its_floor_is_called_early():
-    rng = np.random.default_rng(0)
-    stops = [stop for seed in range(60) for stop in planted(robot(seed), rng)]
-    for method in ("velocities", "impulses"):
-        ended = [s for s in stops if s.kind == f"{method}: {FLOOR}"]
-        cut = [s for s in stops if s.kind == f"{method}: {CUT}"]
-        assert len(ended) == 60
-        assert len(cut) > 50
-        assert all(s.verdict == "at its floor" for s in ended)
-        assert sum(s.verdict != "at its floor" for s in cut) >= 0.95 * len(cut)
-    assert table(stops).count("\n") == 1 + len({s.kind for s in stops})
-
-
-def test_the_newtons_of_the_benchmark_solve_in_float64_what_lavender_solves():
-    p = robot(11)
-    want = lv.solve(p, tol=1e-11).impulse
-    np.testing.assert_allclose(newton(p, np.float64)[-1][1], want, rtol=0, atol=1e-8 * abs(want).max())
-    np.testing.assert_allclose(exchange(p)[-1], want, rtol=0, atol=1e-4 * abs(want).max())
-    assert newton(p, np.float32)[-1][1].dtype == np.float32
-
-
 # -- data in float32 ----------------------------------------------------------------------------------
 
 
@@ -221,35 +172,6 @@ def test_a_mass_matrix_summed_in_float32_need_not_be_symmetric_to_the_last_bit()
         lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.free(2))
 
 
-def boxes(number):
-    """One box on four corners, turned."""
-    c, s = np.cos(0.3), np.sin(0.3)
-    given = {
-        "inv_mass": [0.5], "inv_inertia": [0.7 * np.eye(3)], "v_free": [[0.1, 0.0, -0.2, 0.0, 0.3, 0.0]],
-        "normal": np.tile([s, 0.0, c], (4, 1)), "tangent": np.tile([c, 0.0, -s], (4, 1)),
-        "arm_a": np.zeros((4, 3)),
-        "arm_b": [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)],
-    }  # fmt: skip
-    given = {name: np.asarray(x, number) for name, x in given.items()}
-    return lv.Rows(contact_body=np.tile([-1, 0], (4, 1)), **given)
-
-
-def test_rows_in_float32_keep_their_precision_in_their_problem_and_its_file(tmp_path):
-    rows = boxes(np.float32)
-    assert rows.precision == "float32"
-    assert boxes(np.float64).precision == "float64"
-    assert np.array_equal(rows.arm_b, rows.arm_b.astype(np.float32))
-    problem = lv.Problem.from_rows(rows, mu=0.5)
-    assert problem.precision == "float32"
-    assert lv.residual(problem, problem.start()).precision == "float32"
-    problem.save(tmp_path / "p.npz")
-    for again in (lv.load(tmp_path / "p.npz"), pickle.loads(pickle.dumps(problem))):
-        assert again == problem
-        assert again.precision == "float32"
-    assert problem.boxed(1.0).precision == problem.relaxed().precision == "float32"
-    assert lv.Problem.from_rows(boxes(np.float64), mu=0.5).precision == "float64"
-
-
 def test_a_matrix_in_float32_already_has_no_rounding_of_data():
     a, b = [[2.0, 1.0], [1.0, 2.0]], [1.0, 0.3]
     single = lv.Problem.lcp(np.float32(a), np.float32(b), precision="float32")
@@ -257,71 +179,3 @@ def test_a_matrix_in_float32_already_has_no_rounding_of_data():
     assert lv.residual(single, impulse).rounding.data == 0.0
     other = lv.Problem.lcp(a, b)
     assert lv.residual(other, impulse, precision="float32").rounding.data > 0.0
-
-
-def test_a_file_with_another_precision_is_told(tmp_path):
-    path = tmp_path / "p.npz"
-    lv.Problem.lcp(np.eye(1), [1.0], precision="float32").save(path)
-    with np.load(path) as held:
-        entries = {name: held[name] for name in held}
-    entries["meta"] = np.frombuffer(entries["meta"].tobytes().replace(b'"float32"', b'"float16"'), np.uint8)
-    raw = io.BytesIO()
-    np.savez(raw, **entries)
-    path.write_bytes(raw.getvalue())
-    with pytest.raises(lv.InputError, match=r"precision in it is float64 or float32"):
-        lv.load(path)
-
-
-def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(tmp_path):
-    problem = robot(2)
-    exact = lv.solve(problem, tol=1e-11).impulse
-    for name, impulse in (("done", exact.astype(np.float32)), ("early", 0.9 * exact)):
-        lv.io.save(problem, tmp_path / f"{name}.npz", impulse=impulse)
-    told = ["--solvers", "pgs", "--precision", "float32"]
-    done = CliRunner().invoke(cli, ["check", str(tmp_path / "done.npz"), *told])
-    assert done.exit_code == 0, done.output
-    assert "stored answer: at its floor of float32" in " ".join(done.output.split())
-    early = CliRunner().invoke(cli, ["check", str(tmp_path / "early.npz"), *told])
-    assert early.exit_code == 1
-    assert "stored answer: stopped early, " in early.output
-    # Without the option the precision is the problem's, and the exit code that of the claims.
-    assert CliRunner().invoke(cli, ["check", str(tmp_path / "early.npz"), *told[:2]]).exit_code == 0
-    lv.io.save(problem, tmp_path / "none.npz")
-    none = CliRunner().invoke(cli, ["check", str(tmp_path / "none.npz"), *told])
-    assert isinstance(none.exception, lv.InputError)
-    assert "no file holds an answer" in str(none.exception)
-    other = CliRunner().invoke(cli, ["check", str(tmp_path / "done.npz"), "--precision", "half"])
-    assert other.exit_code == 2
-    assert "'half' is not one of 'float64', 'float32'" in other.output
-
-
-def test_a_report_shows_the_verdict_of_a_stored_answer_in_float32(tmp_path):
-    problem = dataclasses.replace(robot(2), precision="float32")
-    lv.io.save(problem, tmp_path / "early.npz", impulse=0.9 * lv.solve(problem, tol=1e-11).impulse)
-    (item,) = resolve([tmp_path / "early.npz"])
-    info = describe(item, "run")
-    assert info.stored_verdict.startswith("stopped early, ")
-    assert from_json(to_json(info)) == info
-
-
-def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
-    mujoco = pytest.importorskip("mujoco")
-    model = mujoco.MjModel.from_xml_string(
-        """<mujoco><option solver="CG" tolerance="1e-5"/><worldbody>
-        <geom type="plane" size="5 5 .1"/>
-        <body pos="0 0 .09"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
-        <body pos=".05 0 .28" euler="5 9 20"><freejoint/><geom type="box" size=".1 .1 .1"/></body>
-        </worldbody></mujoco>"""
-    )
-    found = lv.io.record(model, mujoco.MjData(model), tmp_path, 6, precision="float32")
-    assert lv.load(tmp_path / found.files[0]).precision == "float32"
-    lines = [json.loads(line) for line in (tmp_path / "engine.jsonl").read_text().splitlines()]
-    early = sum(line["verdict"] != "at its floor" for line in lines)
-    assert all(line["precision"] == "float32" and line["floor"] > 1e-9 for line in lines)
-    assert early > 0  # at its tolerance, far above the floor
-    (engine,) = contestants([str(tmp_path)], Records())
-    assert engine.early == early
-    (row,) = engine_table([engine]).texts
-    assert str(early) in row
-    with pytest.raises(lv.InputError, match="precision is 'half'"):
-        lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")

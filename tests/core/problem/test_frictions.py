@@ -5,7 +5,6 @@ import pytest
 from random_problems import touching
 
 import lavender as lv
-from lavender import bench
 
 TWO = {"inv_mass": [1.0, 0.5]}
 
@@ -50,31 +49,3 @@ def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
         touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), fine]), **TWO)
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)
-
-
-def test_things_show_themselves_shortly_and_in_notebooks():
-    problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
-    assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
-    solution = lv.solve(problem, "pgs", history=True)
-    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1))
-    for thing in (problem, solution, records):
-        assert len(repr(thing)) < 400
-        html = thing._repr_html_()
-        assert html.startswith("<table>")
-        assert "<b>" not in html
-    assert "CONVERGED" in solution._repr_html_()
-    axes = (
-        lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 2.0]), "pgs", history=True)
-        .history.plot()
-        .axes[0]
-    )
-    assert axes.get_ylabel() == "relative residual [-]"
-    with pytest.raises(lv.InputError, match="'iterations' or 'time'"):
-        solution.history.plot("x")
-
-
-def test_dir_holds_the_public_names_alone():
-    assert dir(lv) == sorted(lv.__all__)
-    assert not {"Any", "TYPE_CHECKING", "import_module"} & set(dir(lv))
-    for name in dir(lv):
-        getattr(lv, name)

@@ -12,7 +12,6 @@ from random_problems import as_matrix, seeds
 from random_trees import chain, random_general, random_tree, tree_mass
 
 import lavender as lv
-from benchmarks.drawn import wild
 from lavender import registry
 from lavender.problem import generalized as coordinates
 from lavender.solvers.newton import Newton
@@ -153,23 +152,6 @@ def test_every_way_to_give_j_and_m_is_one_problem():
         assert not made.generalized.jac.data.flags.writeable
 
 
-def test_other_forms_know_the_operator():
-    problem = random_general(2, "coulomb", compliance=False)
-    assert problem.relaxed("cone").generalized is problem.generalized
-    boxed = problem.boxed(0.7)
-    assert boxed.law == "lcp"
-    assert boxed.generalized is problem.generalized
-    form = problem.velocity_form()
-    scale = np.outer(form.scale, form.scale)
-    np.testing.assert_allclose(
-        (form.jacobian @ form.jacobian.T).toarray(), problem.dense() * scale, atol=1e-13
-    )
-    found = lv.redundancy(problem)
-    assert found.rank == np.linalg.matrix_rank(problem.dense())
-    assert found.rank < problem.m
-    assert lv.solve(problem, "pgs", order="colored", max_iter=3, tol=0.0).iterations == 3
-
-
 def test_no_velocities_no_rows_and_rows_on_nothing():
     none = lv.Problem.from_jacobian(np.zeros((0, 3)), np.eye(3), np.ones(3), cones=lv.Cones.free(0))
     assert lv.solve(none, "newton").success
@@ -239,16 +221,6 @@ def test_bounded_rows_and_equations_need_few_steps(kind):
     assert solution.iterations <= (3 if kind == "linear" else 15)  # measured: 2 and 6
     again = lv.solve(problem, "newton", tol=1e-12, impulse=solution.impulse)
     assert again.iterations == 0
-
-
-@pytest.mark.parametrize("limit", [None, 60.0])
-def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
-    problem = wild(seed=5192).problem  # 152 islands
-    cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
-    assert cut.success and cut.iterations > general.CLOCK
-    monkeypatch.setattr(general, "CLOCK", 10**6)
-    whole = lv.solve(problem, "newton", time_limit=60.0, tol=1e-9)
-    assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
 
 
 def test_slow_steps_are_few_between_two_looks_and_end_where_many_do(monkeypatch):

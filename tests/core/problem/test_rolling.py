@@ -10,7 +10,6 @@ import lavender as lv
 from lavender import registry
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import siconos_error
-from lavender.lab.motion.unique import uniqueness
 
 TAKES = [n for n in lv.available(law="coulomb") if registry.specs()[n].rolling]
 
@@ -65,19 +64,6 @@ def test_without_a_moment_it_is_the_contact_it_was():
         assert found.success, str(found)
         rest = np.setdiff1d(np.arange(problem.m), keep)
         assert not found.impulse[rest].any(), name
-
-
-def test_where_one_motion_is_proven_starts_find_no_other():
-    """Small friction and a small moment: one motion by the criterion; with much of both each one found is one."""
-    rng = np.random.default_rng(3)
-    g = rng.normal(size=(10, 12))
-    a, b = g @ g.T + 2.0 * np.eye(10), rng.normal(size=10)
-    few = lv.Problem(b, lv.Cones.contacts(0.01, rolling=0.01, count=2), a)
-    assert uniqueness(few)
-    assert not uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
-    assert len(lv.motions(few)) == 1
-    for motion in lv.motions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
-        assert motion.reference.residual.relative <= 1e-9
 
 
 def test_siconos_error_is_zero_at_the_solution_alone():

@@ -1,7 +1,6 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
 import ast
-import dataclasses
 import os
 import sys
 import sysconfig
@@ -122,26 +121,6 @@ def test_threads_prepare_each_their_own(often):
     alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
     for found in at_once(lambda: lv.prepare(problem, "block_gauss_seidel").solve(max_iter=50)):
         np.testing.assert_array_equal(found.impulse, alone.impulse)
-
-
-def test_what_is_worked_out_of_one_object_waits_for_none_of_another():
-    inside, leave, quick = threading.Event(), threading.Event(), threading.Event()
-
-    def reference():
-        inside.set()
-        assert leave.wait(600)
-
-    case = lv.suite.case("stack(n=2)")
-    first, second = (dataclasses.replace(case, solve_reference=f) for f in (reference, quick.set))
-    with ThreadPoolExecutor(2) as pool:
-        waiting = pool.submit(lambda: first.reference)
-        try:
-            assert inside.wait(600)
-            pool.submit(lambda: second.reference)
-            assert quick.wait(30)  # it may come at any time, and never does where it waits for the first
-        finally:
-            leave.set()
-        assert waiting.result() is None
 
 
 def test_no_object_has_a_property_of_functools():

@@ -6,34 +6,7 @@ import scipy.sparse as sp
 from random_problems import random_contact_problem, random_lcp, side_by_side
 
 import lavender as lv
-from benchmarks.drawn import wild
-from lavender.base.deadline import Deadline
-from lavender.lab.suite import box_stack
-from lavender.lab.suite.build import FALL
 from lavender.solvers import admm
-
-
-@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
-def test_heavy_box_on_light_ones(ratio):
-    problem = box_stack(6, ratio).problem
-    solution = lv.solve(problem, "admm", tol=1e-9)
-    assert solution.success or solution.residual.relative <= 2 * solution.residual.floor
-    # Four points carry what lies above them; velocities vanish.
-    above = np.r_[np.full(5, 1.0), ratio][::-1].cumsum()[::-1] * FALL
-    np.testing.assert_allclose(solution.impulse.reshape(6, 4).sum(1), above, rtol=1e-6)
-
-
-@pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
-def test_coulomb_with_mass_ratios(ratio, speed):
-    # Sweeps do not get below 1e-2 here in 20,000.
-    problem = box_stack(4, ratio, "coulomb", speed).problem
-    solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
-    assert solution.success, solution
-
-
-def test_iterations_do_not_grow_with_the_mass_ratio_as_sweeps_do():
-    counts = [lv.solve(box_stack(6, ratio).problem, "admm", tol=1e-8).iterations for ratio in (1.0, 1e2, 1e4)]
-    assert max(counts) < 500  # Gauss-Seidel: contraction R / (1 + R), 200,000 sweeps at 1e4
 
 
 @pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
@@ -180,19 +153,6 @@ def test_wrong_options_are_refused():
             lv.solve(problem, "admm", relaxation=alpha)
 
 
-#: Real friction problems on which 20,000 sweeps fail or take thousands.
-HARD = ["fc3d_2cubes_t0", "fc3d_OneObject-i100000-499", "fc3d_LMGC_100_PR_PerioBox-i00361-60-03000"]
-
-
-@pytest.mark.parametrize("name", HARD)
-def test_real_friction_problems(problem_dir, name):
-    pytest.importorskip("h5py")
-    import lavender.io
-
-    solution = lv.solve(lavender.io.load(problem_dir / f"{name}.hdf5"), "admm", tol=1e-8, max_iter=5000)
-    assert solution.success, solution
-
-
 @pytest.mark.parametrize("m", [0, 4])
 def test_work_is_told_once_however_a_run_is_cut(m):
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))
@@ -200,45 +160,3 @@ def test_work_is_told_once_however_a_run_is_cut(m):
     cut = lv.solve(problem, "admm", tol=0.0, max_iter=9, callback=lambda *_: False)
     assert dict(whole.work) == dict(cut.work)
     assert whole.work["factorisations"] >= 1
-
-
-def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
-    problem = box_stack(20, 10.0, "coulomb").problem
-    prepared = lv.prepare(problem, "admm")
-    solver, state = prepared.solver, prepared.state
-    impulse, made = problem.start(), state.factorisations
-    state.factor = None  # as of a problem whose first factor is large
-    solver.until(state, Deadline(-1.0))
-    claim = solver.run(state, impulse, 50, 1e-6)
-    assert claim.status is lv.Status.TIME_LIMIT
-    assert claim.iterations == 0
-    assert state.factorisations == made
-    assert "factorisation" in claim.message
-    # With time it goes on from there.
-    solver.until(state, Deadline())
-    assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
-
-
-def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
-    problem = box_stack(8, 10.0).problem
-    before = lv.solve(problem, "admm", max_iter=200, tol=1e-8)
-    monkeypatch.setattr("lavender.solvers.admm.AT_ONCE", -1.0)
-    prepared = lv.prepare(problem, "admm")
-    assert prepared.state.factor is None
-    after = prepared.solve(max_iter=200, tol=1e-8)
-    assert after.impulse.tobytes() == before.impulse.tobytes()
-    assert after.work == before.work
-
-
-def test_under_a_limit_nothing_long_is_begun_in_setting_up():
-    """A of J and M is not formed, and a matrix of many entries not analysed, where that would end too late."""
-    problem = wild(seed=109, rows=3000).problem
-    assert problem.operator == "generalized"
-    late = lv.solve(problem, "admm", time_limit=1e-4)
-    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and not late.work
-    assert not {"csr", "csr_data"} & set(problem.__dict__)
-    assert late.impulse.tobytes() == problem.start().tobytes()
-    prepared = lv.prepare(problem, "admm")
-    assert prepared.solve(time_limit=1e-4).status is lv.Status.TIME_LIMIT
-    after, whole = prepared.solve(max_iter=5), lv.solve(problem, "admm", max_iter=5)
-    assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()

@@ -51,11 +51,3 @@ def test_first_iterations_are_least_squares_over_the_last_sweeps(memory):
         dy, df = (np.diff(v, axis=0).T for v in (ys, fs))
         gamma = np.linalg.lstsq(df, fs[-1], rcond=None)[0] if df.size else np.zeros(0)
         x = y - dy @ gamma if gamma.size else y
-
-
-def test_a_step_that_goes_wrong_is_undone():
-    # Faces on faces with friction: mixing overshoots and is restarted, and the residual falls all the same.
-    problem = lv.suite.case("box_stackF(n=6, sliding=0.5)").problem
-    solution = lv.solve(problem, "anderson", tol=0.0, max_iter=400)
-    assert solution.work["restarts"] > 0
-    assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative

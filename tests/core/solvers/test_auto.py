@@ -9,12 +9,8 @@ from hypothesis import given, settings
 from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds, side_by_side, touching
 
 import lavender as lv
-from benchmarks.drawn import wild
-from lavender import registry, suite
 from lavender.judge import residuals
-from lavender.solvers.certify import certify
 from lavender.solvers.islands import islands, restrict, rows_of
-from lavender.solvers.newton_systems import general
 from lavender.solvers.solve_log import SolveLog
 
 
@@ -66,83 +62,6 @@ def test_islands_are_solved_to_their_share(friction):
         )
 
 
-@pytest.mark.parametrize(
-    "problem",
-    [
-        lambda: suite.stack(n=200).problem,
-        lambda: suite.hang(n=24).problem,
-        lambda: suite.granular(n=4).problem,
-        lambda: suite.granular(n=3, friction="coulomb").problem,
-        lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"),
-        lambda: suite.pyramid(k=6, mass_ratio=1e6).problem,
-        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem,
-        lambda: wild(seed=7921).problem,
-    ],
-)
-def test_turns_say_what_ran_and_what_came_of_it(problem):
-    problem = problem()
-    solution = lv.solve(problem, "auto", tol=1e-6)
-    assert solution.success, solution
-    work: dict[str, int] = {}
-    for turn in solution.turns:
-        name = turn.solver.removeprefix("relaxation: ").partition(" on ")[0]
-        assert name in registry.specs() and turn.solver in solution.message
-        assert not turn.after > turn.before  # the least so far; nan where nobody looked
-        for kind, count in turn.work.items():
-            work[kind] = work.get(kind, 0) + count
-    assert {kind: count for kind, count in work.items() if count} == {
-        kind: count for kind, count in solution.work.items() if count
-    }
-    assert solution.turns[-1].after == solution.residual.relative
-    begun = lv.residual(problem, problem.start()).relative
-    assert solution.turns[0].before == pytest.approx(begun, rel=1e-12)
-    assert lv.solve(problem, "newton").turns == ()
-
-
-@pytest.mark.parametrize(
-    ("seed", "law", "first"),
-    [
-        (67, "coulomb", "anderson"),  # 667 spheres in one heap: a dense factor of N costs seconds
-        (57, "coulomb", "newton"),  # 36 rows on 60 velocities
-        (57, "cone", "newton"),
-    ],
-)
-def test_islands_of_generalized_velocities_go_to_newton_where_they_are_small(seed, law, first):
-    problem = wild(seed=seed).problem.relaxed(law)
-    assert problem.generalized is not None
-    solution = lv.solve(problem, tol=1e-6)
-    assert good(solution, 1e-6)
-    assert solution.message.startswith(first)
-
-
-def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
-    problem = wild(seed=7).problem
-    kernel = general.prepare(problem)
-    monkeypatch.setattr(general, "FLOP", 1e-6)  # a machine ten thousand times slower: 40 s a step
-    claim = general.run(problem, kernel, problem.start(), 100, 1e-9, 1.0)
-    assert claim.status is lv.Status.TIME_LIMIT
-    assert claim.iterations == 0
-
-
-def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
-    problem = wild(seed=7).problem  # a step of it: 0.4 s at 1e-8 s a multiply-add
-    clock, asked = [0.0], []
-
-    class Kernel:
-        islands, largest, ends = 1, general.prepare(problem).largest, general.ENDS["spent"]
-
-        def run(self, impulse, tol, steps, again):
-            asked.append(steps)
-            clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
-            return self.ends, np.array([steps, 0, 0, 0])
-
-    monkeypatch.setattr(general, "FLOP", 1e-8)
-    monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])
-    claim = general.run(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
-    assert claim.status is lv.Status.TIME_LIMIT
-    assert set(asked) == {1} and clock[0] <= 1.0 + 0.4
-
-
 def test_what_gave_up_at_once_is_not_called_solved():
     cones = lv.Cones.contacts([0.0], 2)
     jac = np.sqrt(np.arange(1.0, 7.0)).reshape(3, 2)
@@ -164,55 +83,6 @@ def test_the_same_object_goes_the_same_way_again(seed):
     first, second = (lv.solve(problem, tol=1e-3) for _ in range(2))
     assert first.message == second.message
     assert first.impulse.tobytes() == second.impulse.tobytes()
-
-
-def test_an_island_without_a_solution_is_proof_enough():
-    """Bounds above elsewhere are in nobody's way; what the linear program finds is proven for the whole."""
-    a = np.zeros((4, 4))
-    a[:2, :2] = [[1.0, -1.0], [-1.0, 1.0]]  # y = (1, 1): A^T y = 0, b.y = 2
-    a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
-    problem = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
-    log = SolveLog(problem, 1e-6, 100)
-    log.offer(problem.start())
-    certify(log)
-    assert log.certificate is not None
-    assert not log.certificate[2:].any()
-    assert log.message == "linear program 1 certificate" and log.work == {"certificates": 1}
-    large = lv.solve(wild(seed=141).problem, tol=1e-6)  # 2,133 asymmetric rows in 108 islands
-    assert large.status is lv.Status.INFEASIBLE and not large.contradicted
-
-
-def test_budget_and_warm_start():
-    problem = suite.pyramid(k=6, friction="coulomb", sliding=0.5).problem
-    none = lv.solve(problem, "auto", tol=1e-9, max_iter=0)
-    assert none.status is lv.Status.MAX_ITERATIONS
-    assert np.array_equal(none.impulse, problem.start())
-    full = lv.solve(problem, "auto", tol=1e-8)
-    assert full.success, full
-    again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)
-    assert again.message == "the start is a solution"
-    assert again.iterations == 0
-
-
-def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):
-    """A chosen solver that was interrupted is the last one, and its iterate comes back."""
-    problem = lv.suite.case("pyramidF(k=4, mass_ratio=1e3)").problem
-    looks = interrupted_newton
-    solution = lv.solve(problem, "auto", tol=1e-12)
-    assert len(looks) == 5
-    assert solution.status is lv.Status.INTERRUPTED
-    assert solution.residual.relative <= min(looks)
-
-
-def test_a_looser_tolerance_costs_no_more():
-    # Whether the relaxation was left for good hung on where a check of its own fell: 50 times the sweeps.
-    problem = suite.granular(n=7, friction="coulomb", seed=8).problem
-    found = [lv.solve(problem, tol=tol) for tol in (1e-3, 1e-4, 1e-6)]
-    assert all(solution.success for solution in found), found
-    sweeps = [solution.work["sweeps"] for solution in found]
-    # Turns are as long as what is expected at that tolerance: in a shorter one the relaxation may begin later.
-    assert sweeps[0] <= 2.0 * sweeps[1], sweeps
-    assert sweeps[1] <= 2.0 * sweeps[2], sweeps
 
 
 def twice_touching(n):

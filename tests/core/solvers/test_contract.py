@@ -566,23 +566,3 @@ def test_an_a_that_is_too_large_is_told_before_the_start_or_not_needed(name, mon
             else:
                 assert lv.solve(problem, name, **more).residual.relative < 1.0
         assert lv.explain(problem).stages
-
-
-def test_entries_of_a_are_counted_once(monkeypatch):
-    """Rows that share all velocities of a tree meet once, not once for each of them."""
-    rng = np.random.default_rng(5)
-    jac = np.zeros((40, 30))
-    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
-    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
-    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40 + 1)
-    free = lv.Cones.free(40)
-    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
-    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
-    assert lv.redundancy(problem).rank == 1
-    twins = lv.Problem.from_jacobian(
-        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
-    )
-    assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
-    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40)
-    with pytest.raises(lv.InputError, match="J and M as they are"):
-        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -8,7 +8,6 @@ from hypothesis import assume, example, given
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
-from benchmarks.drawn import wild
 from lavender.base.lu import sparse_lu
 from lavender.judge.certificates import check_certificate
 from lavender.solvers.direct import Direct
@@ -362,14 +361,6 @@ def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
     rows = state.pivot.rows
     assert sum(claim.iterations for claim in claims) == rows.n_rounds
     assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
-
-
-def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():
-    narrow = lv.solve(wild(seed=3131).problem, "direct", tol=1e-6)
-    assert narrow.solver.form == "band" and narrow.work["sweeps"] == 4
-    sparse = lv.solve(wild(seed=3170).problem, "direct", tol=1e-6)  # 480 rows
-    assert sparse.solver.form == "sparse" and sparse.work["sweeps"] == 48
-    assert sparse.work["factorisations"] <= 3  # 6 after 4 sweeps
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from benchmarks.drawn import wild
-from lavender import suite
 from lavender.judge.certificates import check_certificate
 from lavender_ext.driver.driver import Driver
 
@@ -66,15 +64,6 @@ def test_turns_of_any_length_give_the_same_bits(seed):
             assert short[3].tobytes() == found[3].tobytes()
 
 
-def test_generalised_coordinates_are_driven_by_the_same_names():
-    for seed in (44017, 44027, 44030):
-        problem = wild(seed=seed).problem
-        assert problem.generalized is not None
-        how, done, _, impulse = driven(problem, 1e-8)
-        assert how == REACHED and done > 0
-        assert lv.residual(problem, impulse).relative <= 1e-8
-
-
 def test_rows_that_cannot_move_stay_and_push_the_others():
     a = np.array([[2.0, 0.5, 0.0], [0.5, 2.0, 0.1], [0.0, 0.1, 3.0]])
     problem = lv.Problem.lcp(a, [1.0, 1.0, 1.0], lower=[0.5, 0.0, 0.0], upper=[0.5, 0.0, np.inf])
@@ -96,21 +85,3 @@ def test_rows_that_cannot_move_stay_and_push_the_others():
         how, _, _, impulse = driven(still)
         assert how == REACHED and impulse[1] == 0.2
         assert lv.residual(still, impulse).relative <= 1e-9
-
-
-def test_a_budget_ends_it_and_a_proof_too():
-    hard = as_matrix(suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem)
-    how, done, relative, impulse = driven(hard, 1e-12, budget=3, work=1)
-    assert how == SPENT and done <= 4
-    assert lv.residual(hard, impulse).relative == pytest.approx(relative)
-    squeeze = lv.Problem.lcp(np.array([[1.0, -1.0], [-1.0, 1.0]]), [1.0, 0.5])
-    how, *_ = driven(squeeze)
-    assert how == STUCK
-
-
-def test_what_the_method_does_not_take_is_said_at_once():
-    problem = lv.Problem.contact(np.eye(3), np.ones(3), [0.5])
-    assert driven(problem) is not None
-    assert driven(wild(seed=44017).problem) is not None
-    cone = lv.Problem(np.ones(5), lv.Cones.contacts([0.5], 4), np.eye(5), friction="cone")
-    assert driven(cone) is None

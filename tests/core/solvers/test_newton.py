@@ -9,20 +9,18 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import FORMS, as_matrix, general, good, random_contact_problem, seeds
+from random_problems import FORMS, general, good, random_contact_problem, seeds
 from twins import block_diagonal
 from worked import python
 
 import lavender as lv
-from benchmarks.drawn import wild
-from lavender import suite
 from lavender.problem.cones import CONTACT_SPIN, ROW
-from lavender.solvers.newton import SPEC, Newton
+from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.factor.sparse import SparsePanels
-from lavender_ext.newton.solve import COMPLIANCE, PHASES, Layout, Solve
+from lavender_ext.newton.solve import COMPLIANCE, Layout, Solve
 
 
 def dense_h(problem):
@@ -68,29 +66,6 @@ def test_a_problem_is_scaled_by_its_definition(form, seed):
 
 
 # -- linear algebra ---------------------------------------------------------------------------------
-
-
-def test_many_bodies_on_one_leave_half_of_the_rows():
-    # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
-    # the entries of a full factor and an eighth of its work. Bounded rows as full as that stay full.
-    bounded = wild(seed=7566).problem
-    assert bounded.law == "lcp" and bounded.csr.nnz / bounded.m**2 < systems.DENSE_FILL
-    assert make_system(bounded, "impulse").dense
-    problem = wild(seed=7012).problem
-    assert problem.matrix is not None
-    assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
-    system = make_system(problem, "impulse")
-    assert not system.dense
-    assert system.sparse.work < 0.2 * problem.m**3 / 3.0
-    sparse_one = lv.solve(problem, "newton", tol=1e-9)
-    with mock.patch.multiple(systems, DENSE_FILL=0.25):
-        assert make_system(problem, "impulse").dense
-        full = lv.solve(problem, "newton", tol=1e-9)
-    assert sparse_one.success
-    assert full.success
-    np.testing.assert_allclose(
-        problem.csr @ sparse_one.impulse, problem.csr @ full.impulse, atol=1e-6 * np.abs(problem.b).max()
-    )
 
 
 def system_in(problem, form):
@@ -172,28 +147,6 @@ def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form,
     assert np.abs(f - exact).max() <= 4.0 * max(1.0, wide) * tau * (1.0 + problem.cones.mu.max())
 
 
-def newton_without(problem, *phases):
-    """A solve that leaves these phases out."""
-    begun = systems.System.__init__
-
-    def begin(self, problem, solve):
-        begun(self, problem, solve)
-        solve.without = sum(PHASES[name] for name in phases)
-
-    with mock.patch.object(systems.System, "__init__", begin):
-        return lv.solve(problem, "newton", tol=1e-6)
-
-
-@pytest.mark.parametrize("step", [150, 180])
-def test_piles_that_creep_are_solved_along_a_path_through_its_folds(step, problem_dir):
-    """126 balls in a box, between stick and slip: rounds end at 1e-5, interior points at 7e-3."""
-    problem = lv.io.load(problem_dir / "engine" / f"balls_step_0{step}.npz")
-    solution = lv.solve(problem, "newton", tol=1e-6)
-    assert good(solution, 1e-6) and "path steps" in solution.message, solution
-    other = newton_without(problem, "path")
-    assert not good(other, 1e-6) or other.work["factorisations"] > 1000, other
-
-
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
 @given(seed=seeds)
 @settings(max_examples=20)
@@ -271,42 +224,6 @@ def test_dense_factors_solve_what_numpy_solves_with_the_same_bits_at_any_width(n
         np.testing.assert_allclose(found[0], expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
-@given(seed=seeds)
-@settings(max_examples=20)
-def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
-    problem = suite.stack(n=9, mass_ratio=5.0).problem
-    z = np.random.default_rng(seed).normal(size=problem.m)
-    h, g = dense_h(problem), problem.b / np.sqrt(problem.d)
-    free = z - (h @ z - g) >= 0.0
-    rows = np.where(free[:, None], h, np.eye(problem.m))
-    expected = np.linalg.solve(rows, np.where(free, g, 0.0))
-    for form in ("velocity", "impulse", "sparse"):
-        finite, found, relative, changed = system_in(problem, form).solve.exchange(z)
-        assert finite
-        # Nine bodies: H has a condition number of some hundreds, the normal matrix 1e9 times that before refinement.
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max() + 1e-14)
-        assert changed == np.count_nonzero(free != (found - (h @ found - g) >= 0.0))
-        truth = lv.residual(problem, found / np.sqrt(problem.d)).relative
-        assert relative == pytest.approx(truth, rel=1e-6, abs=1e-12)
-
-
-@pytest.mark.parametrize("seed", [6, 70, 239, 3146])
-def test_exchanges_from_swept_impulses_take_few_factorisations(seed):
-    problem = as_matrix(wild(seed=seed).problem)
-    swept = lv.solve(problem, "anderson", tol=0.0, max_iter=60).impulse
-    solution = lv.solve(problem, "newton", impulse=swept, tol=1e-6)
-    assert good(solution, 1e-6)
-    assert solution.work["factorisations"] <= 4  # from nothing: 8 to 18
-    assert "sweeps" not in solution.work
-
-
-@pytest.mark.parametrize("seed, most", [(5080, 2), (5229, 2), (177, 2), (5122, 2), (242, 1)])
-def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, most):
-    solution = lv.solve(wild(seed=seed).problem, "newton", tol=1e-6)
-    assert good(solution, 1e-6)
-    assert solution.work["factorisations"] <= most  # interior points: 23 to 35
-
-
 def test_the_first_interior_point_keeps_what_the_linear_system_says_of_each_row():
     """Inside every bound; duals differ by H z0 - g where a row has two bounds, else all by one shift, as z does."""
     rng = np.random.default_rng(8)
@@ -341,27 +258,10 @@ def test_a_circle_of_exchanges_ends_by_count(n):
     assert int(counts["exchanges"]) <= 30, solution.message
 
 
-def test_exchanges_that_go_in_circles_are_given_up():
-    problem = wild(seed=3).problem  # rows depend on each other
-    solution = lv.solve(problem, "newton", tol=1e-6)
-    assert good(solution, 1e-6)
-    assert "exchanges" in solution.message and "interior point steps" in solution.message
-    assert solution.work["factorisations"] <= 28
-
-
 def test_no_row_free_is_no_factor():
     problem = lv.Problem.lcp(np.eye(3), -np.ones(3))
     finite, z, relative, _ = make_system(problem, "impulse").solve.exchange(-np.ones(3))
     assert finite and relative == 0.0 and not z.any()
-
-
-def test_a_narrow_matrix_is_factored_by_panels_that_do_not_fill():
-    problem = as_matrix(suite.box_stack(n=40).problem)
-    system = make_system(problem, "impulse")
-    assert not system.dense
-    assert system.sparse.work <= problem.m * 8**2  # two boxes, four points each
-    # Redundant points: A is singular, to rounding of either sign.
-    assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
 
 
 def on_bodies(k, layout, lu, wide=True):
@@ -420,16 +320,6 @@ def test_factors_of_a_graph_of_bodies_solve_what_a_dense_matrix_solves(s, few, s
     assert len(outs) == 1
 
 
-def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
-    problem = wild(seed=239).problem
-    rows = problem.rows
-    assert rows is not None and rows.inv_inertia.any()
-    system = make_system(problem, "velocity")
-    solution = lv.solve(problem, "newton", tol=1e-10)
-    assert system.layout.s == 3
-    assert good(solution, 1e-10), solution
-
-
 def test_a_chain_of_bodies_does_not_fill_in():
     rng = np.random.default_rng(5)
     n = 2000
@@ -445,40 +335,6 @@ def test_a_chain_of_bodies_does_not_fill_in():
 # -- answers ------------------------------------------------------------------------------------------
 
 
-BOXES = {
-    "pyramid": lambda ratio: suite.pyramid(k=5, mass_ratio=ratio),
-    "boxes": lambda ratio: suite.box_stack(n=8, mass_ratio=ratio),
-    "with friction": lambda ratio: suite.pyramid(k=4, mass_ratio=ratio, friction="coulomb"),
-    "sliding": lambda ratio: suite.pyramid(k=6, mass_ratio=ratio, friction="coulomb", sliding=0.5),
-    "slow": lambda ratio: suite.box_stack(n=5, mass_ratio=ratio, friction="coulomb", sliding=0.05),
-}
-
-
-@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "cone", "matrix", "auto"])
-@pytest.mark.parametrize("name", BOXES)
-def test_redundant_boxes_cold_at_every_mass_ratio(name, form, ratio):
-    problem = BOXES[name](ratio).problem
-    if form == "cone" or form == "matrix":
-        problem = problem.relaxed("cone") if form == "cone" else as_matrix(problem)
-    asked = {"form": form} if form in ("velocity", "impulse") else {}
-    solution = lv.solve(problem, "auto" if form == "auto" else "newton", tol=1e-8, **asked)
-    assert good(solution, 1e-8), solution
-    if asked and problem.law == "lcp":
-        assert solution.work["factorisations"] <= 30 and solution.solver.form == form
-
-
-def test_sliding_boxes_obey_coulomb_and_not_the_relaxation():
-    problem = suite.box_stack(n=4, friction="coulomb", sliding=0.5).problem
-    solution = lv.solve(problem, "newton", tol=1e-10)
-    assert good(solution, 1e-10), solution
-    other = lv.solve(problem.relaxed("cone"), "newton", tol=1e-10)
-    assert good(other, 1e-10), other
-    # The relaxation lifts what slides; the two velocities differ by far more than the tolerance.
-    gap = np.abs(problem.velocity(solution.impulse) - problem.velocity(other.impulse)).max()
-    assert gap > 1e-3
-
-
 def test_rows_that_cannot_move_are_left_where_they_are():
     a = np.diag([1.0, 2.0, 3.0])
     problem = lv.Problem.lcp(a, [1.0, 1.0, 1.0], lower=[0.5, 0.0, 0.0], upper=[0.5, 0.0, np.inf])
@@ -491,17 +347,6 @@ def test_rows_that_cannot_move_are_left_where_they_are():
 
 
 # -- claims -------------------------------------------------------------------------------------------
-
-
-def test_budget_and_floor_are_what_they_say():
-    problem = suite.pyramid(k=5, mass_ratio=1e6).problem
-    few = lv.solve(problem, "newton", tol=1e-12, max_iter=2)
-    assert few.status is lv.Status.MAX_ITERATIONS
-    assert few.work["factorisations"] <= 2 + 1  # an interior point start counts one
-    assert few.residual.relative <= lv.residual(problem, problem.start()).relative
-    floor = lv.solve(problem, "newton", tol=1e-16)
-    assert floor.status is lv.Status.FLOOR
-    assert not floor.contradicted
 
 
 def sparse_rows(seed, m=500, even=True, near=3):
@@ -597,35 +442,6 @@ def test_a_factor_that_fills_is_not_begun_where_time_is_short():
     assert solution.status is lv.Status.TIME_LIMIT and solution.work.get("factorisations", 0) == 0
 
 
-def test_time_limit_is_kept():
-    # Thousands of factorisations of 1 ms and more, and no end.
-    problem = suite.pyramid(k=20, mass_ratio=1e6, friction="coulomb", sliding=0.5).problem
-    counted = lv.solve(problem, "newton", tol=0.0, max_iter=200)
-    assert counted.status is lv.Status.MAX_ITERATIONS
-    solution = lv.solve(problem, "newton", tol=0.0, max_iter=10**6, time_limit=0.01)
-    assert solution.status is lv.Status.TIME_LIMIT
-    # Ended by the clock and not by its own means: counted, since how much fits into 10 ms is the machine's affair.
-    assert solution.work.get("factorisations", 0) < counted.work["factorisations"]
-    assert np.isfinite(solution.impulse).all()
-
-
-def test_ctrl_c_returns_the_best_iterate(interrupted_newton):
-    """Interrupted after the fifth turn: what was found until then is kept."""
-    problem = lv.suite.case("pyramidF(k=4)").problem
-    looks = interrupted_newton
-    solution = lv.solve(problem, "newton", tol=1e-12)
-    assert solution.status is lv.Status.INTERRUPTED
-    assert len(looks) == 5
-    assert solution.residual.relative <= min(looks) < 1.0
-
-
-def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
-    problem = suite.pyramid(k=30, friction="coulomb").problem.relaxed("cone")
-    solution = lv.solve(problem, "newton", tol=1e-9)
-    assert good(solution, 1e-9), solution
-    assert solution.work["factorisations"] <= 300, solution
-
-
 def test_rows_are_exchanged_where_an_interior_point_stops_short():
     """An asymmetric A, most rows beyond their bounds at H z = g: not tried first, but tried."""
     rng, m = np.random.default_rng(41), 80
@@ -703,26 +519,6 @@ def test_what_rolls_or_rubs_at_one_contact_alone_is_friction(seed):
         assert good(solution, 1e-9) and "Coulomb rounds" in solution.work, solution
 
 
-def test_rounds_that_gain_nothing_give_way_to_interior_points():
-    """Heavy boxes on light ones at rest: no residual below the first comes from Newton steps on the natural map.
-
-    Two rounds of 20 such steps before an interior point took 58 factorisations; the interior point takes 12.
-    """
-    problem = suite.box_stack(n=12, mass_ratio=1e6, friction="coulomb").problem
-    solution = lv.solve(problem, "newton", impulse=np.zeros(problem.m), tol=1e-6)
-    assert good(solution, 1e-6) and "De Saxce steps" in solution.message
-    assert solution.work["factorisations"] < 40
-
-
-def test_from_a_start_that_leads_nowhere_newton_begins_from_nothing_in_the_end():
-    """An asymmetric matrix after 64 sweeps: from there it takes 170 factorisations, from nothing 6."""
-    problem = wild(seed=807, rows=120).problem
-    near = lv.solve(problem, "anderson", tol=0.0, max_iter=64).impulse
-    for impulse, most in ((None, 40), (near, 400)):
-        solution = lv.solve(problem, "newton", impulse=impulse, tol=1e-6)
-        assert good(solution, 1e-6) and solution.work["factorisations"] < most, solution
-
-
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @pytest.mark.parametrize("seed", [1, 4])
@@ -742,19 +538,6 @@ def test_turns_of_one_run_give_its_bits(form, friction, seed):
     np.testing.assert_array_equal(whole, parts)
 
 
-def test_a_turn_after_the_last_of_all_steps_is_an_end(monkeypatch):
-    problem = suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem
-    newton = Newton()
-    monkeypatch.setattr("lavender.solvers.newton.SPEC", replace(SPEC, max_iter=4))
-    state, lam = newton.prepare(problem), problem.start()
-    assert newton.turn(state, lam, 2, 1e-15).status is lv.Status.MAX_ITERATIONS
-    for _ in range(3):
-        claim = newton.turn(state, lam, 2, 1e-15)
-        if claim.status is not lv.Status.MAX_ITERATIONS:
-            break
-    assert claim.status is lv.Status.STALLED
-
-
 @pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="the kernel of Linux alone tells")
 def test_large_memory_asks_for_no_huge_pages():
     """Each of them may wait for the kernel to make room: repeated solves took three times the first.
@@ -768,10 +551,10 @@ def test_large_memory_asks_for_no_huge_pages():
 WHERE = """
 import lavender as lv
 from pathlib import Path
-from lavender import suite
+from benchmarks.made import lattice_pile
 from lavender_ext.newton.solve import Solve
 
-problem = suite.granular(n=10, friction="coulomb").problem
+problem = lattice_pile(3000)
 lv.residual(problem, problem.start())
 solve = Solve(problem.metric)
 at, inside = solve.scale.ctypes.data, False

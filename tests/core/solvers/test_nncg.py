@@ -5,7 +5,6 @@ import pytest
 from random_problems import random_contact_problem, random_lcp
 
 import lavender as lv
-from lavender.lab.suite.families import granular
 
 
 def stack(n, ratio=1.0):
@@ -79,15 +78,6 @@ def test_first_iterations_by_hand(restart, kept):
         np.testing.assert_allclose(got, y, rtol=1e-9, atol=1e-12 * np.abs(y).max())  # sums in another order
         x = y + q
     assert count >= kept
-
-
-def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
-    problem = granular(n=7, friction="coulomb", seed=8).problem
-    sweeps = [
-        lv.solve(problem, "nncg", convex=60, tol=1e-6, max_iter=10_000, restart=restart).work["sweeps"]
-        for restart in ("growth", "against")
-    ]
-    assert sweeps[1] < 0.7 * sweeps[0]
 
 
 def test_wrong_options_are_refused():

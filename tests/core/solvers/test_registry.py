@@ -87,16 +87,6 @@ def test_an_unknown_name_tells_the_nearest():
         lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "pgs", max_iters=3)
 
 
-def test_known_tells_of_everybody_and_available_of_those_that_can():
-    known = lv.known(TINY)
-    assert set(known) == set(registry.specs())
-    assert [name for name, reason in known.items() if reason is None] == lv.available(TINY)
-    assert all(reason for reason in known.values() if reason is not None)
-    for ask in (lv.solve, lv.available, lv.known, lv.cross_check):
-        with pytest.raises(lv.InputError, match="Problem is needed"):
-            ask(np.eye(2))
-
-
 def test_capabilities_select():
     ordered = lv.available(law="lcp", order=True)
     assert "pgs" in ordered

@@ -16,9 +16,8 @@ from random_trees import random_general
 from scipy.sparse import block_diag
 
 import lavender as lv
-from benchmarks.drawn import wild
-from benchmarks.islands import forms, fresh, stacks
-from lavender import registry, suite
+from benchmarks.made import forms, fresh, stacks
+from lavender import registry
 from lavender.solvers.costs import newton_cost
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.small import (
@@ -141,16 +140,6 @@ def test_rows_of_zeros_leave_a_small_problem_to_the_one_call():
     assert solved == 20
 
 
-@pytest.mark.parametrize("name", suite.families())
-def test_families_of_few_rows(name):
-    problem = suite.case(name).problem
-    if problem.m > SMALL_ROWS:
-        pytest.skip("many rows")
-    for solver in SHORT:
-        if registry.get(solver).refuses(problem) is None:
-            check(problem, solver)
-
-
 def test_most_of_them_do_take_the_short_way():
     took = 0
     for kind in KINDS:
@@ -171,31 +160,6 @@ def test_small_joints_that_depend_on_each_other_are_one_shifted_factor_more(solv
     assert (found.work["factorisations"], found.work["shifts"]) == (2, 1)
 
 
-@pytest.mark.parametrize("solver", ["auto", "direct"])
-@pytest.mark.parametrize("seed", [5793, 6452, 7592])
-def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
-    problem = wild(seed=seed).problem
-    found = check(problem, solver, tol=1e-9)
-    assert found.success
-    assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
-    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
-
-
-@pytest.mark.parametrize("tol", [1e-3, 1e-9])
-@pytest.mark.parametrize("seed", [7530, 7845, 4691, 7514])  # asymmetric, long, with joints, symmetric
-def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, tol):
-    problem = wild(seed=seed).problem
-    found = check(problem, "auto", tol=tol)
-    assert found.success
-    said = re.fullmatch(
-        r"direct 4 sweeps, \d+ factorisations, (\d+) pivots -> lemke (\d+) pivots", found.message
-    )
-    assert said, found.message
-    assert found.work["pivots"] == int(said[1]) + int(said[2])
-    assert found.iterations > int(said[2])
-    assert registry.get("direct").small.solve(problem, None, tol) is None  # which is exchanges alone
-
-
 @pytest.mark.parametrize("most", [200, 293, 294])
 def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
     rng = np.random.default_rng(9)
@@ -207,13 +171,6 @@ def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
     solution = lv.solve(problem, max_iter=most)
     assert solution.iterations <= most
     assert solution.success or most < 294
-
-
-def test_small_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
-    problem = wild(seed=7375).problem
-    found = check(problem, "auto", tol=1e-6)
-    assert found.success and found.residual.relative > 1e-13
-    assert found.message.startswith("direct") and "->" not in found.message
 
 
 def test_a_late_solution_is_a_solution():
@@ -238,31 +195,6 @@ def test_round_cones_are_never_solved_over_rows_of_a():
     # What it cannot take further ends as a result, not in a solver that reads past such a block.
     hard = lv.prepare(problem, "auto").solve(tol=1e-15)
     assert np.isfinite(hard.residual.relative) and not hard.contradicted
-
-
-@pytest.mark.parametrize("seed", [6662, 7021, 7597])
-def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(seed):
-    """Forests under Coulomb's law that the one call ends, that sweeps end after it, that is not asked of it first."""
-    problem = wild(seed=seed).problem
-    assert problem.generalized is not None
-    short = check(problem, "auto", tol=1e-6)
-    assert short.success and "newton" in short.message
-    told = sum(int(count) for count in re.findall(r"(\d+) sweeps", short.message))
-    assert told == short.work.get("sweeps", 0), "sweeps that go on are counted once"
-    (together,) = lv.solve_many([replace(problem, copy=False)])
-    assert facts(together) == facts(short)
-    limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
-    assert facts(limited) == facts(short), "a limit chooses nothing"
-
-
-@pytest.mark.parametrize("seed", [1224, 1351])  # of 48 and 105 rows, where newton is stuck
-def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
-    problem = wild(seed=seed).problem
-    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.limits) is None
-    fresh = replace(problem, copy=False)
-    assert registry.get("auto").small.solve(fresh, None, 1e-6) is None
-    assert fresh.derived.vain is not None
-    check(problem, "auto", tol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(16))

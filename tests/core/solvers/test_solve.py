@@ -2,7 +2,6 @@
 
 import copy
 import dataclasses
-import itertools
 import pickle
 import signal
 import threading
@@ -13,10 +12,8 @@ import pytest
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
-from lavender import registry, suite
+from lavender import registry
 from lavender.judge.solution import Claim, Status
-from lavender.solvers.auto import Auto
-from lavender.solvers.jacobi import Jacobi
 from lavender.solving import many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
@@ -55,36 +52,12 @@ def test_nothing_ran_where_a_request_is_refused(register):
     assert ran == []
 
 
-def test_what_is_found_can_be_compared_and_kept_in_a_set():
-    for found in (
-        lambda: lv.solve(TINY, "pgs", history=True),
-        lambda: lv.solve(TINY, "pgs", history=True).history,
-        lambda: lv.solve(TINY).residual,
-        lambda: lv.redundancy(TINY),
-        lambda: lv.motion_error(dataclasses.replace(TINY), [0.0, 0.0]),
-        lambda: lv.Simulation("stack").scene.bodies[1],
-    ):
-        one, two = found(), found()
-        assert one == one and one != two and len({one, two}) == 2
-
-
 def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():
     problem = lv.Problem.lcp(np.eye(2), [5.0, 5.0], lower=1.0, upper=9.0, guess=[2.0, 3.0])
     at_start = lambda p, **more: lv.solve(p, "pgs", max_iter=0, tol=0.0, **more).impulse.tolist()  # noqa: E731
     assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
     assert at_start(problem) == [2.0, 3.0]
     assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
-
-
-def test_what_a_callback_raises_comes_through():
-    class Enough(Exception):
-        pass
-
-    def callback(n, impulse, residual):
-        raise Enough
-
-    with pytest.raises(Enough):
-        lv.solve(suite.stack(64).problem, "pgs", callback=callback)
 
 
 class Interrupted:
@@ -132,21 +105,6 @@ def test_zero_iterations_judge_the_start():
     assert solution.residual.relative == lv.residual(TINY, TINY.start()).relative == 1.0
 
 
-@pytest.mark.parametrize("limit", [None, 10.0])
-def test_with_a_time_limit_the_first_look_at_the_clock_is_after_one_iteration(monkeypatch, limit):
-    asked, own = [], Jacobi.run
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        asked.append(n)
-        return own(self, state, impulse, n, tol, time_limit)
-
-    monkeypatch.setattr(Jacobi, "run", run)
-    problem = suite.stack(8).problem
-    lv.solve(problem, "jacobi", tol=1e-12, max_iter=500, time_limit=limit)
-    assert (asked[0] == 1) == (limit is not None)
-    assert all(later <= 8 * one for one, later in itertools.pairwise(asked))
-
-
 @pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])
 @pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
 @pytest.mark.parametrize("form", FORMS)
@@ -168,23 +126,6 @@ def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
     other = copied(prepared)
     assert other.state is not prepared.state and other.options == prepared.options
     np.testing.assert_array_equal(other.solve(tol=1e-9).impulse, right.impulse)
-
-
-def test_a_set_up_that_was_stopped_begins_again(monkeypatch):
-    prepared = lv.prepare(suite.case("pyramidF(k=6)").problem, "auto")
-    prepare, calls = Auto.prepare, []
-
-    def stopped(self, problem):
-        calls.append(problem)
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-        return prepare(self, problem)
-
-    monkeypatch.setattr(Auto, "prepare", stopped)
-    with pytest.raises(KeyboardInterrupt):
-        prepared.solve(max_iter=50)
-    assert prepared.solve(max_iter=50).iterations > 0
-    assert len(calls) == 2
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")

@@ -7,7 +7,7 @@ import pytest
 from random_problems import random_contact_problem, sweeps
 
 import lavender as lv
-from benchmarks.kernels import lattice_pile
+from benchmarks.made import lattice_pile
 from lavender.problem.ordering import block_order, body_ranks
 from lavender.solvers import layout, sweeping
 from lavender_ext.sweep.threaded import Team

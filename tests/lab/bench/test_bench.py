@@ -529,3 +529,24 @@ def test_scipys_own_blas_has_one_thread_while_something_is_timed_though_it_is_lo
         "    print({pool['num_threads'] for pool in threadpool_info()})",
     ).stdout
     assert said.strip() == "{1}"
+
+
+def test_things_show_themselves_shortly_and_in_notebooks():
+    problem = lv.Problem.lcp(np.eye(1), np.ones(1), name="<b>")
+    assert repr(problem) == "<Problem '<b>', lcp, 1 row in 1 block, dense>"
+    solution = lv.solve(problem, "pgs", history=True)
+    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1))
+    for thing in (problem, solution, records):
+        assert len(repr(thing)) < 400
+        html = thing._repr_html_()
+        assert html.startswith("<table>")
+        assert "<b>" not in html
+    assert "CONVERGED" in solution._repr_html_()
+    axes = (
+        lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 2.0]), "pgs", history=True)
+        .history.plot()
+        .axes[0]
+    )
+    assert axes.get_ylabel() == "relative residual [-]"
+    with pytest.raises(lv.InputError, match="'iterations' or 'time'"):
+        solution.history.plot("x")
