@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import random_problems as rp
 from clib import run
-from click.testing import CliRunner
 from test_same_bits import kinds_of, of_matrix
 from tower import self_test_problem
 
@@ -19,7 +18,6 @@ import lavender as lv
 from lavender import bench
 from lavender import out as export
 from lavender.base.errors import LavenderError
-from lavender.cli import cli
 from lavender.out import vectors
 from lavender.out.header import constants, functions, javascript
 from lavender.sim.web import cut
@@ -270,34 +268,6 @@ def test_what_auto_did_is_steps_with_their_work_that_c_runs(folder, shared, comp
     run(compiler, "-std=c11", *WARNINGS, "-I", folder, tmp_path / "check.c", *link)
     said = run(tmp_path / "check", cwd=tmp_path).splitlines()
     assert len(said) == 3 and all(line.startswith("met ") for line in said)
-
-
-def test_vectors_are_of_the_problems_that_the_report_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(export.library, "source", lambda: "of another test")
-    rng = np.random.default_rng(0)
-    b = rng.normal(size=(9, 9))
-    mine = lv.Problem.lcp(b @ b.T + np.eye(9), np.ones(9))
-    mine.save(tmp_path / "ring.npz")  # the name of a case of the suite, too
-    records, out = tmp_path / "records.jsonl", tmp_path / "library"
-    bench.run([tmp_path / "ring.npz"], ["direct"], bench.Plan(levels=(1e-6,), budgets=(), repeats=1), records)
-    command = ["export", "c", str(out), "--for", str(records), "--solver", "direct"]
-    done = CliRunner().invoke(cli, command)
-    assert done.exit_code == 0, done.output
-    assert vectors.pack_problem(mine) in (out / "vectors.bin").read_bytes()
-    before = {path.name: path.read_bytes() for path in out.iterdir()}
-    lv.Problem.lcp(2.0 * mine.dense(), np.ones(9)).save(tmp_path / "ring.npz")
-    changed = CliRunner().invoke(cli, command)
-    assert isinstance(changed.exception, lv.InputError) and "is another problem here" in str(
-        changed.exception
-    )
-    mine.save(tmp_path / "ring.npz")
-    before["vectors.bin"] = b"mine"
-    (out / "vectors.bin").write_bytes(b"mine")
-    (out / "chosen.h").unlink()
-    del before["chosen.h"]
-    refused = CliRunner().invoke(cli, command)
-    assert isinstance(refused.exception, lv.InputError) and "--replace" in str(refused.exception)
-    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
 def test_bindings_have_every_name_of_the_header():

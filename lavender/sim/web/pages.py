@@ -86,7 +86,7 @@ def check(say: Callable[[str], Any] = lambda text: None) -> bool:
     LavenderError
         No checkout, no Node, or a module that is missing and cannot be built.
     """
-    script = ROOT / "tests" / "wasm" / "check_wasm_exports.mjs"
+    script = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
     if not script.is_file():
         raise LavenderError(
             f"{script.name} is in tests/sim/web of a checkout of the project, and not in this installation: clone the "

@@ -105,3 +105,27 @@ def test_what_is_found_can_be_compared_and_kept_in_a_set():
     ):
         one, two = found(), found()
         assert one == one and one != two and len({one, two}) == 2
+
+
+def test_the_motion_of_a_step_is_the_motion_error_of_its_problem():
+    sim = lv.Simulation(lv.Scene("stack", friction=0.0, solver_iterations=4, substeps=1), report_motion=True)
+    for _ in range(20):
+        problem = sim.constraint_problem()
+        *_, info = sim.step()
+    error = lv.solve(problem, "sequential_impulses", tol=0, max_iter=4).motion_error()
+    # 1e-10: both references are solved to 1e-12 and better, from two starts and so by other sweeps.
+    for key in ("relative", "speed", "bound"):
+        assert info["motion"][key] == pytest.approx(getattr(error, key), rel=1e-10)
+    # The plane is body 0 of the scene and no body of the rows.
+    assert info["motion"]["body"] == sim.scene.bodies[1 + error.body].name
+    assert info["motion"]["open"] == 0.0
+
+
+def test_under_friction_a_step_is_near_one_of_its_motions():
+    sim = lv.Simulation(lv.Scene("stack", solver_iterations=16), report_motion=True)
+    for _ in range(10):
+        *_, info = sim.step()
+    motion = info["motion"]
+    assert 0.0 < motion["relative"] < 0.5
+    assert motion["bound"] is None
+    assert motion["open"] >= 0.0

@@ -240,14 +240,3 @@ def test_an_infinite_impulse_is_no_solution(problem):
     for x in (np.zeros(problem.m), np.ones(problem.m)):
         found = lv.prove(problem, x)
         assert not found.proven and found.impulse is None
-
-
-def test_the_command_refuses_what_it_does_not_know(capsys):
-    from lavender.cli import main
-
-    with pytest.raises(SystemExit) as ended:
-        main(["prove", "stack(n=2)", "--solver", "foo"])
-    assert ended.value.code == 2 and "foo" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as ended:
-        main(["prove", "stack(n=64)", "--solver", "pgs"])
-    assert "pgs: MAX_ITERATIONS" in capsys.readouterr().out or ended.value.code == 0

@@ -12,12 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import lavender as lv
 from lavender.base.apart.lines import Lines
 from lavender.base.errors import LavenderError
-from lavender.cli.entry import cli
 from lavender.lab.phenomena import PHENOMENA, WAYS, Record, Track, run, ways
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, follow, make, versions_of_node
@@ -393,48 +391,3 @@ def test_the_table_tells_worst_values_losses_and_reasons():
         "stick, impulses: 1 of 1 cases out, creep 0.02 m/s (bound 1.0e-06 m/s); within it: soft_step"
     ]
     assert tables.notes(found) == ["drake: stick: it has no cause"]
-
-
-def test_the_command(tmp_path):
-    out = tmp_path / "found.json"
-    done = CliRunner().invoke(cli, ["phenomena", "lift", "--steppers", "impulses,avbd", "--out", str(out)])
-    assert done.exit_code == 0
-    assert "| impulses | 0 m, 2/2 |" in done.output
-    told = json.loads(out.read_text())
-    assert {r["engine"] for r in told["records"]} == {
-        "impulses",
-        "impulses 16x4",
-        "impulses newton",
-        "avbd",
-        "avbd 16x4",
-    }
-    assert all(r["setting"] for r in told["records"])
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["nothing"], "unknown phenomenon"),
-        (["stick", "--set", "slope=3"], "0 to 0.99 is needed"),
-        (["stick", "--set", "speed=3"], "speed"),
-        (["stick", "--set", "slope"], "NAME=VALUE"),
-        (["stick", "--steppers", "fast"], "unknown stepper"),
-        (["stick", "--engines", "fast"], "unknown engine"),
-        (["stick", "--steppers", "none"], "no stepper and no engine"),
-        (["stick", "--out", "no/such/folder/x.json"], "is not there; make it first"),
-    ],
-)
-def test_bad_words_end_with_one_line_and_status_2(words, said, capsys):
-    from lavender.cli.entry import main
-
-    with pytest.raises(SystemExit) as end:
-        main(["phenomena", *words])
-    assert end.value.code == 2
-    assert said in capsys.readouterr().err
-
-
-def test_the_list_tells_truths_without_running():
-    done = CliRunner().invoke(cli, ["phenomena", "--list"])
-    assert done.exit_code == 0
-    for name, p in PHENOMENA.items():
-        assert f"{name}: {p.title}" in done.output

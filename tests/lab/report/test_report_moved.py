@@ -9,11 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import lavender as lv
 from lavender import bench, report
-from lavender.cli import cli, main
 from lavender.lab.report import contents, moved, tables
 from lavender.lab.report.curves import figures
 from lavender.lab.report.findings import Report
@@ -114,63 +112,6 @@ def test_the_page_and_the_summary_show_both(records, tmp_path):
     assert "flying apart" not in (tmp_path / "summary.md").read_text(encoding="utf-8")
     assert "motion_speed" in (tmp_path / "records.csv").read_text(encoding="utf-8").splitlines()[0]
     assert report.write is write
-
-
-def test_the_terminal_shows_speeds_on_request(tmp_path):
-    args = [
-        "report",
-        "stack(n=8)",
-        "--solvers",
-        "pgs",
-        "--levels",
-        "1e-3",
-        "--budgets",
-        "4",
-        "--repeats",
-        "1",
-    ]
-    asked = CliRunner().invoke(cli, [*args, "--speed-levels", "1e-2", "1e-3", "--out", str(tmp_path / "a")])
-    assert asked.exit_code == 0, asked.output
-    assert "to 1e-3 m/s" in asked.output
-    assert "to 1e-3 m/s" in asked.output
-    plain = CliRunner().invoke(cli, [*args, "--out", str(tmp_path / "b")])
-    assert "motion" not in plain.output
-
-
-def test_references_are_written_beside_files_and_used(tmp_path, monkeypatch, capsys):
-    problem = lv.suite.case("stack(n=8)").problem
-    lv.io.save(problem, tmp_path / "pile.npz")
-    with pytest.raises(SystemExit) as end:
-        main(["reference", str(tmp_path)])
-    assert end.value.code == 0
-    assert (tmp_path / "pile.npz.reference").is_file()
-    assert "auto" in capsys.readouterr().out
-    used = []
-    import lavender.lab.bench.running.runner as runner
-
-    load = runner.load_reference
-    monkeypatch.setattr(runner, "load_reference", lambda p, path: used.append(load(p, path)))
-    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1, orders=(), motion=True)
-    found = bench.run([tmp_path], ["pgs"], plan)  # the folder holds one problem: a reference is none
-    assert len(found.cases) == 1
-    assert used[0].accepted
-
-
-def test_nothing_solves_it_is_an_exit_code(tmp_path):
-    lv.io.save(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), tmp_path / "impossible.npz")
-    for words, code in (([str(tmp_path / "impossible.npz")], 1), (["stack(n=4)"], 1)):
-        with pytest.raises(SystemExit) as end:
-            main(["reference", *words])
-        assert end.value.code == code
-
-
-def test_solving_what_has_nothing_to_do_is_no_failure(tmp_path, capsys):
-    path = tmp_path / "idle.npz"
-    lv.io.save(idle_problem(), path)
-    with pytest.raises(SystemExit) as end:
-        main(["solve", str(path), "--solver", "pgs"])
-    assert end.value.code == 0
-    assert "nothing to do" in capsys.readouterr().out
 
 
 def test_the_summary_has_every_line_of_the_motion_table(records, tmp_path):

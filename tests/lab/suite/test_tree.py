@@ -12,7 +12,6 @@ import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
-from lavender.cli import main
 from lavender.judge.residuals import reference
 from lavender.lab.suite.build import Bodies, Contacts, contact_problem
 from lavender.problem import OPERATORS
@@ -160,21 +159,6 @@ def test_a_small_problem_is_told_by_who_solves_it(make, names):
     assert told and all(name in told for name in names), told
     solution = lv.solve(problem)
     assert solution.success and all(turn.solver.partition(" ")[0] in names for turn in solution.turns)
-
-
-def test_the_command_shows_the_way_and_gives_it_as_data(capsys):
-    with pytest.raises(SystemExit) as end:
-        main(["explain", "stack(n=200)", "granularF(n=4)"])
-    assert end.value.code in (0, None)
-    shown = capsys.readouterr().out
-    assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "relaxation" in shown
-    with pytest.raises(SystemExit):
-        main(["explain", "stack(n=200)", "--json", "--tol", "1e-9"])
-    plan = json.loads(capsys.readouterr().out)
-    assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "anderson"
-    with pytest.raises(SystemExit) as end:
-        main(["explain", "stack(n=200)", "--tol", "0"])
-    assert end.value.code == 2
 
 
 def test_there_are_twelve_rates():

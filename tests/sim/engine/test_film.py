@@ -206,35 +206,6 @@ def test_pictures_refuse_what_they_cannot_do(tmp_path):
         save_picture(film, tmp_path / "none" / "x.png")
 
 
-def test_lavender_run_writes_films_and_pictures(tmp_path, capsys):
-    from lavender.cli import main
-
-    for name in ("a.film", "a.gif"):
-        with pytest.raises(SystemExit) as code:
-            main(["run", "spinner", "--steps", "5", "--film", str(tmp_path / name)])
-        assert not code.value.code
-        assert name in capsys.readouterr().out
-    assert len(Film.load(tmp_path / "a.film")) == 6
-    with pytest.raises(SystemExit) as code:
-        main(["view", str(tmp_path / "a.gif")])
-    assert code.value.code == 2
-    assert "no film" in capsys.readouterr().err
-
-
-def test_lavender_run_shows_itself_until_ctrl_c(monkeypatch, capsys):
-    from lavender.cli import main
-    from lavender.sim.web import view
-
-    opened, waited = [], []
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    monkeypatch.setattr(view.Viewer, "wait", lambda self: waited.append(len(self.film)))
-    with pytest.raises(SystemExit) as code:
-        main(["run", "spinner", "--steps", "4", "--view"])
-    assert not code.value.code
-    assert waited == [5]
-    assert opened[0] in capsys.readouterr().out
-
-
 def test_a_film_may_be_read_while_another_thread_steps():
     sim = lv.Simulation("stack")
     film = sim.start_film()

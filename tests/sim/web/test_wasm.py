@@ -9,11 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
 import lavender as lv
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli import cli
 from lavender.sim.scene import SCENES
 from lavender.sim.web import compile as wasm
 from lavender.sim.web import cut, pages
@@ -150,31 +148,6 @@ def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request
     (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
     assert size == pytest.approx(1000 * int(told), rel=0.03)  # compilers differ by a percent or two
     assert size < 0.95 * wasm.LARGEST
-
-
-def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
-    monkeypatch.setattr(pages, "module", lambda say, name: name.encode())
-    monkeypatch.setattr(pages, "ROOT", tmp_path)
-    with pytest.raises(LavenderError, match="in tests/sim/web of a checkout"):
-        pages.check()
-    script = tmp_path / "tests" / "wasm" / CHECK.name
-    script.parent.mkdir(parents=True)
-    script.write_text("""
-import { readFileSync } from "node:fs";
-import { dirname, join } from "node:path";
-const newton = readFileSync(join(dirname(process.argv[2]), "newton.wasm"), "utf8");
-process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === "newton" && process.env.PYTHON ? 0 : 1);
-""")
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(LavenderError, match=r"node is not there.*install Node 18"):
-        pages.check()
-    monkeypatch.undo()
-    if shutil.which("node") is None:
-        pytest.skip("needs Node")
-    monkeypatch.setattr(pages, "ROOT", tmp_path)
-    for data, code in ((str.encode, 0), (lambda name: b"other", 1)):
-        monkeypatch.setattr(pages, "module", lambda say, name, data=data: data(name))
-        assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
 
 
 def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):

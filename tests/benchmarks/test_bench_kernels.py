@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 import lavender as lv
-from benchmarks import engine
+from benchmarks import engine, made
 from benchmarks.clock import least
 from benchmarks.kernels import command, microbenchmarks, problems
 from benchmarks.kernels.cases import job, run
@@ -19,7 +19,7 @@ from benchmarks.kernels.instructions import COUNTED, instructions
 
 @pytest.mark.parametrize("shuffle", [False, True])
 def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
-    problem = problems.lattice_pile(200, shuffle=shuffle)
+    problem = made.lattice_pile(200, shuffle=shuffle)
     contacts, bodies = problems.bare_contacts(problem)
     microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
     impulse = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=20).impulse
@@ -42,14 +42,14 @@ def test_the_bare_row_sweep_is_pgs():
 
 def test_the_pile_stands_where_it_says():
     for contacts in (1, 50, 3_000):
-        problem = problems.lattice_pile(contacts)
+        problem = made.lattice_pile(contacts)
         assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
         assert (problem.rows.contact_body < 0).any()
-    given, shuffled = problems.lattice_pile(300), problems.lattice_pile(300, shuffle=True)
+    given, shuffled = made.lattice_pile(300), problems.lattice_pile(300, shuffle=True)
     assert given.n_blocks == shuffled.n_blocks
     assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
     with pytest.raises(lv.InputError, match="at least 1"):
-        problems.lattice_pile(0)
+        made.lattice_pile(0)
 
 
 def test_least_is_the_least_of_many():
