@@ -555,8 +555,16 @@ def api_page(site):
     for name in sorted(lv.__all__):
         thing = getattr(lv, name)
         if callable(thing):  # no constants, no rooms
-            rooms.setdefault(thing.__module__.split(".")[1], []).append((lv, name))
-    for room in ("io", "suite", "bench", "report", "motion", "measures", "certificates"):
+            rooms.setdefault(".".join(thing.__module__.split(".")[1:3]), []).append((lv, name))
+    for room in (
+        "io",
+        "lab.suite",
+        "lab.bench",
+        "lab.report",
+        "lab.motion",
+        "judge.measures",
+        "judge.certificates",
+    ):
         held = importlib.import_module(f"lavender.{room}")
         own = {n: getattr(held, n) for n in sorted(held.__all__) if n not in suite.FAMILIES}
         rooms[f"lavender.{room}"] = [

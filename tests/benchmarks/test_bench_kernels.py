@@ -45,7 +45,7 @@ def test_the_pile_stands_where_it_says():
         problem = made.lattice_pile(contacts)
         assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
         assert (problem.rows.contact_body < 0).any()
-    given, shuffled = made.lattice_pile(300), problems.lattice_pile(300, shuffle=True)
+    given, shuffled = made.lattice_pile(300), made.lattice_pile(300, shuffle=True)
     assert given.n_blocks == shuffled.n_blocks
     assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
     with pytest.raises(lv.InputError, match="at least 1"):

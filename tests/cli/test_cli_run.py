@@ -1,8 +1,10 @@
 """`lavender run`, `web` and `record`: what steps an engine from the command line."""
 
 import json
+import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ import lavender as lv
 from lavender.base.errors import LavenderError
 from lavender.cli import cli
 from lavender.sim.engine import Film
+from lavender.sim.web import compile as wasm
 from lavender.sim.web import pages
 
 PGS = 1e-6  # as in test_io_mujoco.py
@@ -208,7 +211,8 @@ def test_lavender_run_shows_itself_until_ctrl_c(monkeypatch, capsys):
     assert opened[0] in capsys.readouterr().out
 
 
-ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
 
 
 CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
@@ -252,3 +256,37 @@ def node(*arguments):
     if shutil.which("node") is None:
         pytest.skip("Node is not installed")
     return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+
+
+def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
+    done = command("page", tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    files = {
+        path.relative_to(tmp_path / "site").as_posix()
+        for path in (tmp_path / "site").rglob("*")
+        if path.is_file()
+    }
+    assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
+    assert {"lavender.wasm", "newton.wasm"} <= files
+    assert (tmp_path / "site" / "lavender.wasm").read_bytes() == module
+    for name in sorted(files):
+        if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
+            text = (tmp_path / "site" / name).read_text(encoding="utf-8")
+            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
+
+
+@needs_compiler
+def test_command_says_why_it_cannot_build(tmp_path):
+    done = command("build", tmp_path / "none" / "a.wasm")
+    assert done.returncode == 2
+    assert "is not there; make it first" in done.stderr

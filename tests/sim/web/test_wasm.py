@@ -177,15 +177,6 @@ def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, mo
     assert pages.module() == fresh
 
 
-def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
-    # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
-    shipped = tmp_path / "lavender" / "sim" / "web"
-    command = [sys.executable, "setup.py", "-q", "build_wasm", "--build-lib", str(tmp_path)]
-    subprocess.run(command, check=True, cwd=ROOT)
-    assert (shipped / "lavender.wasm").read_bytes() == module
-    assert (shipped / "newton.wasm").read_bytes() == newton_module
-
-
 def test_hash_covers_what_is_cimported():
     # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
     with_rows = wasm.source_hash(ROOT, ["judge.measure"])
@@ -254,34 +245,3 @@ def test_page_scenes_are_the_start_of_native_ones():
         start = lv.Simulation(scene["name"]).snapshot()
         assert scene == scene | describe(start)
         assert len(scene["bodies"]) == scene["size"][0]
-
-
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
-        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
-    )  # fmt: skip
-
-
-def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
-    done = command("page", tmp_path / "site")
-    assert done.returncode == 0, done.stderr
-    files = {
-        path.relative_to(tmp_path / "site").as_posix()
-        for path in (tmp_path / "site").rglob("*")
-        if path.is_file()
-    }
-    assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
-    assert {"lavender.wasm", "newton.wasm"} <= files
-    assert (tmp_path / "site" / "lavender.wasm").read_bytes() == module
-    for name in sorted(files):
-        if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
-            text = (tmp_path / "site" / name).read_text(encoding="utf-8")
-            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
-
-
-@needs_compiler
-def test_command_says_why_it_cannot_build(tmp_path):
-    done = command("build", tmp_path / "none" / "a.wasm")
-    assert done.returncode == 2
-    assert "is not there; make it first" in done.stderr
