@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds, side_by_side, touching
+from random_problems import (
+    FORMS,
+    as_matrix,
+    good,
+    random_contact_problem,
+    random_lcp,
+    seeds,
+    side_by_side,
+    touching,
+)
 
 import lavender as lv
 from lavender.judge import residuals
@@ -150,6 +159,15 @@ def test_a_body_of_huge_inverse_inertia_is_refused_by_no_solver():
     solution = lv.solve(problem, "admm")
     assert solution.status in (lv.Status.NUMERICAL_ERROR, lv.Status.CONVERGED)
     lv.solve(problem, "auto")
+
+
+@pytest.mark.parametrize("problem", [random_lcp(1), random_contact_problem(2)], ids=["lcp", "bodies"])
+def test_a_start_at_its_floor_is_told_as_one(problem):
+    # The precision is the floor's, and there was no limit.
+    start = lv.solve(problem, tol=1e-30)
+    again = lv.solve(problem, tol=1e-30, impulse=start.impulse)
+    assert (again.status, again.iterations) == (lv.Status.FLOOR, 0)
+    assert "at its floor" in again.message and "time" not in again.message
 
 
 def test_a_start_that_solves_a_as_it_was_formed_is_judged_by_the_problem():
