@@ -24,6 +24,7 @@ MODEL = """<mujoco><option timestep="0.004"/><worldbody><geom type="plane" size=
 
 
 def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
+    pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(MODEL)
     (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
     out = tmp_path / "steps.jsonl"
@@ -51,6 +52,7 @@ def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
 
 
 def test_without_a_problem_nothing_is_printed_but_why(tmp_path):
+    pytest.importorskip("mujoco")
     (tmp_path / "arm.xml").write_text(MODEL)
     words = [str(tmp_path / "arm.xml"), "--steps", "0"]
     done = CliRunner().invoke(mujoco, words)
