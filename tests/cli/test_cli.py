@@ -6,7 +6,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,57 +21,7 @@ from lavender.cli import main
 from lavender.lab import check as checking
 from lavender.lab.bench.record import Skip, to_json
 
-
-@pytest.fixture
-def path(tmp_path):
-    io.save(stack(8), tmp_path / "stack8.npz")
-    return tmp_path / "stack8.npz"
-
-
-@pytest.fixture
-def lavender(capsys, tmp_path, monkeypatch):
-    """Runs the command in a folder of its own: (status, stdout, stderr)."""
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setenv("COLUMNS", "160")
-
-    def run(*words):
-        with pytest.raises(SystemExit) as end:
-            cli.main([str(w) for w in words])
-        out, err = capsys.readouterr()
-        return end.value.code, out, err
-
-    return run
-
-
 QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
-
-
-def test_report_leaves_records_and_page_and_prints_times(lavender, path, tmp_path):
-    code, out, _ = lavender(
-        "report", path, "--solvers", "pgs", "direct", *QUICK, "--tables", "--out", tmp_path / "out"
-    )
-    assert code == 0
-    names = {p.name for p in (tmp_path / "out").iterdir()}
-    assert names == {"records.jsonl", "records.csv", "records.json", "index.html", "summary.md"}
-    records = bench.read(tmp_path / "out")
-    assert {r.solver for r in records} == {"pgs", "direct"}
-    assert {r.max_iter for r in records if r.mode == "budget"} == {2, 4}
-    assert {r.tol for r in records if r.solver == "pgs" and r.mode == "tol"} == {1e-3, 1e-6}
-    for word in ("stack8", "to 1e-3", "to 1e-6", "CONVERGED", "Use ", "index.html"):
-        assert word in out
-
-
-def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
-    code, *_ = lavender(
-        "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
-        "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
-    )  # fmt: skip
-    assert code == 0
-    records = bench.read(tmp_path / "out")
-    assert {r.solver for r in records} == {"pgs", "jacobi"}
-    assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
-    assert {r.order for r in records} == {"given", "reverse"}
 
 
 def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
@@ -84,16 +33,6 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     code, out, _ = lavender("check", path, "--solvers", "liar")
     assert code == 1
     assert "claim contradicted" in out
-
-
-def test_a_file_of_a_folder_that_cannot_be_read_is_named_and_costs_itself_alone(lavender, path):
-    (path.parent / "[bold]x.npz").write_bytes(b"PK")
-    for command in ("check", "doctor", "explain"):
-        code, out, err = lavender(command, path.parent, *(["--solvers", "direct"] * (command == "check")))
-        assert (command, code) == (command, cli.EXIT_UNMET)
-        assert "[bold]x: " in out + err and "stack8" in out + f"stack8 {command}" * (command == "doctor")
-        assert lavender(command, path.parent / "[bold]x.npz")[0] == cli.EXIT_BAD_INPUT
-    assert lavender("explain", path.parent, "--tol", -1)[0] == cli.EXIT_BAD_INPUT
 
 
 def test_check_fails_on_a_file_it_cannot_read(lavender, path):
@@ -134,19 +73,6 @@ def test_check_passes_honest_solvers(lavender, path):
     code, out, _ = lavender("check", path, "--solvers", "pgs", "direct")
     assert code == 0
     assert out.count(checking.AGREES) >= 2
-
-
-def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monkeypatch):
-    bench.run([path], ["pgs"], bench.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
-    before = (tmp_path / "r.jsonl").read_bytes()
-    monkeypatch.setattr(bench, "run", None)
-    out_to = ("--out", tmp_path / "again", "--no-figures", "--paper")
-    code, out, _ = lavender("report", tmp_path / "r.jsonl", *out_to)
-    assert code == 0
-    assert "it solves your stack" in out
-    assert (tmp_path / "again" / "index.html").exists()
-    assert "lcp" in (tmp_path / "again" / "paper" / "tables.tex").read_text(encoding="utf-8")
-    assert (tmp_path / "r.jsonl").read_bytes() == before
 
 
 def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
@@ -273,14 +199,6 @@ def test_a_broken_file_is_named(lavender, tmp_path, content):
         assert err.count("\n") == 1
 
 
-def test_an_unwritable_report_is_refused_before_anything_is_solved(lavender, path, tmp_path, monkeypatch):
-    monkeypatch.setattr(bench, "run", None)  # calling it would be a TypeError
-    (tmp_path / "file").write_text("")
-    code, _, err = lavender("report", path, "--out", tmp_path / "file" / "out")
-    assert code == 2
-    assert "cannot write" in err
-
-
 def test_help_is_quick_and_names_every_command():
     code = "import sys, lavender.cli as c\ntry: c.main(['--help'])\nfinally: print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -291,146 +209,6 @@ def test_help_is_quick_and_names_every_command():
         set(done.stderr.split()) & {"matplotlib", "h5py", "qpsolvers", "pandas", "rich.table", "jinja2"}
         == set()
     )
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
-    # A problem that nothing solves in the time: every run to a level takes its limit.
-    out = tmp_path / "out"
-    a = np.array([[1.0, -1.0], [-1.0, 1.0]])
-    n = 300
-    big = np.kron(np.eye(n), a) + 1e-9 * np.eye(2 * n)
-    io.save(lv.Problem.lcp(big, np.random.default_rng(0).standard_normal(2 * n)), tmp_path / "hard.npz")
-    io.save(stack(8), tmp_path / "easy.npz")
-    command = [sys.executable, "-m", "lavender.cli", "report", tmp_path / "easy.npz", tmp_path / "hard.npz"]
-    command += ["--solvers", "pgs,jacobi", "--time-limit", "60", "--no-figures", "--out", out]
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
-    )
-    records = out / "records.jsonl"
-    while not (records.exists() and '"case": "hard"' in records.read_text()):
-        assert process.poll() is None
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    printed, said = process.communicate(timeout=600)
-    assert process.returncode == 130, said
-    assert b"Traceback" not in said
-    assert b"continues from here" in printed
-    assert (out / "index.html").exists()
-    kept = [json.loads(line) for line in records.read_text().splitlines()]
-    assert any(r["kind"] == "record" and r["case"] == "easy" for r in kept)
-
-
-def test_campaigns_over_parts_of_the_seeds_are_one_when_put_together(lavender, tmp_path):
-    more = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--workers", 1)
-    parts = []
-    for name, seeds in (("a", "2"), ("b", "2:4")):
-        code, *_ = lavender(
-            "report", "--campaign", "granular(n=2)", "--seeds", seeds, *more, "--out", tmp_path / name
-        )
-        assert code == 0
-        parts.append((tmp_path / name / "records.jsonl").read_text())
-    (tmp_path / "all.jsonl").write_text("".join(parts))
-    code, out, _ = lavender("report", tmp_path / "all.jsonl", "--out", tmp_path / "all")
-    assert code == 0
-    assert "4 cases" in (tmp_path / "all" / "index.html").read_text()
-    assert "100.0 %" in out
-
-
-def test_a_recorded_scene_is_reported_as_a_sequence(lavender, tmp_path):
-    folder = tmp_path / "steps"
-    code, out, _ = lavender("run", "stack", "--steps", 5, "--skip", 1, "--record", folder)
-    assert code == 0
-    assert "4 problems" in out
-    assert len(list(folder.glob("*.npz"))) == 4
-    words = (
-        "report",
-        folder,
-        "--solvers",
-        "sequential_impulses",
-        "--budgets",
-        "4",
-        "--levels",
-        "1e-1",
-    )
-    code, out, _ = lavender(*words, "--no-figures", "--repeats", 1)
-    assert code == 0
-    assert "it solves the 4 steps of steps in" in out
-    code, out, _ = lavender(*words, "--no-figures", "--repeats", 1, "--compare", "lavender-report")
-    assert code == 0
-    assert "steps of sequences are not compared" in out and "nothing beyond noise" not in out
-    assert (
-        "| sequential_impulses | 4 iterations |" in (tmp_path / "here/lavender-report/summary.md").read_text()
-    )
-    code, _, err = lavender("run", "stack", "--steps", 5, "--record", folder)
-    assert (code, "steps of two recordings" in err) == (2, True)
-    assert lavender("run", "stack", "--steps", 3, "--record", folder, "--replace")[0] == 0
-    assert len(list(folder.glob("*.npz"))) == 3  # none of the four is left
-    assert lavender("run", "no such scene")[0] == 2
-    assert lavender("report", "--sequence")[0] == 2
-    assert lavender("report", "--sequence", folder, "--compare", "nowhere")[0] == 2
-
-
-def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tmp_path):
-    words = ("report", path, "stack(n=8)", *QUICK[:-1], "--out", tmp_path / "out", "--no-figures")
-    code, out, _ = lavender(*words)
-    assert code == 0
-    said, _, rest = out.strip().partition("\n    lv.solve(problem, ")
-    assert said.startswith("Use ") and "\n" not in said  # in a pipe a sentence is a line
-    assert "to 1e-6" in rest and "CONVERGED" not in out and "By structure" not in out
-    assert len(out.splitlines()) <= 25
-    code, out, _ = lavender(*words, "--tables")
-    assert "CONVERGED" in out and "By structure" in out
-    n = len(bench.read(tmp_path / "out"))
-    plain = len([r for r in bench.read(tmp_path / "out") if not r.turns])
-    assert f"{n} of {n} runs reused of 20" in out
-    code, out, _ = lavender(*words, "--fresh")
-    assert "reused" not in out
-    again = [r for r in bench.read(tmp_path / "out") if not r.turns]
-    assert len(again) == plain  # made again, they stand for the earlier ones
-
-
-def test_nothing_is_cut_off_in_a_pipe(path, tmp_path):
-    long = tmp_path / ("a" * 100 + ".npz")
-    io.save(stack(8), long)
-    words = [
-        sys.executable,
-        "-m",
-        "lavender",
-        "report",
-        long,
-        "--solvers",
-        "sequential_impulses,pgs",
-        *QUICK,
-        "--tables",
-    ]
-    done = subprocess.run(
-        [*map(str, words), "--out", tmp_path / "o"], capture_output=True, text=True, check=True
-    )
-    assert "…" not in done.stdout
-    assert "a" * 100 in done.stdout.replace("\n", "")
-    assert f"page: {tmp_path / 'o' / 'index.html'}\n" in done.stdout
-
-
-def test_a_named_file_that_does_not_load_touches_nothing_and_one_in_a_folder_is_counted(
-    lavender, path, tmp_path
-):
-    folder = tmp_path / "problems"
-    folder.mkdir()
-    io.save(stack(8), folder / "good.npz")
-    broken = folder / "broken.npz"
-    broken.write_bytes(path.read_bytes()[:100])
-    more = ("--solvers", "pgs", *QUICK[:-1], "--out", tmp_path / "out")
-    code, _, err = lavender("report", folder / "good.npz", broken, *more)
-    assert code == cli.EXIT_BAD_INPUT
-    assert "broken.npz" in err
-    assert not (tmp_path / "out" / "index.html").exists()
-    code, _, _ = lavender("report", folder, *more[:-1], tmp_path / "out")
-    assert code == cli.EXIT_UNMET
-    assert (tmp_path / "out" / "index.html").exists()
-    assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
-    assert lavender("check", broken, "--solvers", "pgs")[0] == cli.EXIT_BAD_INPUT
-    assert lavender("report", "--campaign", broken, *more[:-1], tmp_path / "c")[0] == cli.EXIT_BAD_INPUT
 
 
 def test_solve_says_by_its_exit_code_what_came_of_it(lavender, path, tmp_path):
@@ -567,40 +345,6 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
     assert "Traceback" not in done.stderr
 
 
-WORKER = """
-import os, signal, sys
-class Finder:
-    def find_spec(self, name, path=None, target=None):
-        if name == "joblib.hashing":
-            os.killpg(0, signal.SIGINT)
-if "popen_loky" in " ".join(sys.orig_argv):
-    sys.meta_path.insert(0, Finder())
-"""
-
-
-@pytest.mark.skipif(not hasattr(signal, "pthread_sigmask"), reason="signals of POSIX")
-def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alone(tmp_path):
-    """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
-    (tmp_path / "sitecustomize.py").write_text(WORKER)
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [
-        sys.executable,
-        "-m",
-        "lavender",
-        "report",
-        "--campaign",
-        "granular(n=2)",
-        "--seeds",
-        "20",
-    ]
-    command += ["--workers", "2", "--solvers", "pgs", "--no-figures", "--out", str(tmp_path / "out")]
-    more = {"env": environment, "capture_output": True, "text": True, "timeout": 600, "check": False}
-    done = subprocess.run(command, start_new_session=True, **more)
-    assert done.returncode == 130
-    assert "Traceback" not in done.stderr
-    assert "continues from here" in done.stdout
-
-
 @pytest.mark.parametrize("columns", ["0", "1", "19"])
 @pytest.mark.parametrize(
     "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]
@@ -628,128 +372,6 @@ def test_another_program_keeps_its_own_ctrl_c():
     subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=600)
 
 
-MODEL = """<mujoco><option timestep="0.01"/><worldbody><geom type="plane" size="1 1 1"/>
-<body pos="0 0 {height}"><freejoint/><geom type="{kind}" size=".1 .1 .1"/></body></worldbody></mujoco>"""
-
-
-def test_models_of_one_file_name_are_kept_apart(lavender, tmp_path):
-    pytest.importorskip("mujoco")
-    for name, kind in (("h1", "box"), ("g1", "sphere")):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "scene.xml").write_text(MODEL.format(height=0.1, kind=kind))
-    words = (
-        "--steps",
-        20,
-        "--every",
-        5,
-        "--solvers",
-        "auto",
-        "--repeats",
-        1,
-        "--no-figures",
-        "--out",
-        tmp_path / "o",
-    )
-    models = [tmp_path / name / "scene.xml" for name in ("h1", "g1")]
-    assert lavender("report", *models, *words)[0] == 0
-    found = bench.read(tmp_path / "o")
-    rows = {info.sequence: info.rows for info in found.cases.values()}
-    assert set(rows) == {"h1-scene", "g1-scene"}
-    assert rows["h1-scene"] > rows["g1-scene"]  # a box has more contacts than a sphere
-    folders = {p.name for p in (tmp_path / "o" / "recorded").iterdir()}
-    assert lavender("report", *models, *words)[0] == 0
-    assert {p.name for p in (tmp_path / "o" / "recorded").iterdir()} == folders
-
-
-def test_what_is_left_out_stands_beside_what_is_left(lavender, tmp_path, monkeypatch):
-    """Steps that could not be recorded: on the page, in the summary, the terminal, the files, and the exit code."""
-    recording = pytest.importorskip("lavender.io.recording")
-    pytest.importorskip("mujoco")
-    (tmp_path / "box.xml").write_text(MODEL.format(height=0.1, kind="box"))
-    true = recording.adapter.from_mujoco
-
-    def some(model, data, name):
-        if int(name.split()[1]) % 15 == 0:
-            raise lv.CapabilityError(f"{name} is of another <problem>")
-        return true(model, data, name=name)
-
-    monkeypatch.setattr(recording.adapter, "from_mujoco", some)
-    more = ("--solvers", "auto", "pgs", "--repeats", 1, "--time-limit", 0.02)
-    more += ("--no-figures", "--tables", "--paper", "--out", tmp_path / "o")
-    model = (tmp_path / "box.xml", "--steps", 45)
-    for _ in range(2):  # recorded, and found recorded
-        code, out, _ = lavender("report", *model, *more)
-        assert code == cli.EXIT_UNMET
-        summary, page = ((tmp_path / "o" / name).read_text() for name in ("summary.md", "index.html"))
-        (name,) = {info.sequence for info in bench.read(tmp_path / "o").cases.values()}
-        for said in (out, summary, page):
-            assert f"steps of {name} (3 left out)" in " ".join(said.split())  # the headline
-            assert said.count("(3 left out)") >= 3  # and the tables
-            assert f"3 steps of {name}" in said
-        assert "step 15 is of another <problem>" in " ".join(out.split())
-        assert all(f"step {k} is of another &lt;problem&gt;" in page for k in (15, 30, 45))
-        assert "6 problems (3 left out)" in (tmp_path / "o" / "paper" / "method.tex").read_text()
-        skips = json.loads((tmp_path / "o" / "records.json").read_text())["skips"]
-        assert [(s["sequence"], s["solver"]) for s in skips if "of another" in s["reason"]] == [
-            (name, "")
-        ] * 3
-    assert lavender("report", tmp_path / "o" / "records.jsonl", *more[7:])[0] == 0  # shown again
-    (folder,) = (tmp_path / "o" / "recorded").iterdir()
-    code, out, _ = lavender(
-        "report", "--campaign", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
-    )
-    assert code == cli.EXIT_UNMET and "left out (1 of 3)" in out
-    assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
-    monkeypatch.setattr(recording.adapter, "from_mujoco", true)
-    code, out, _ = lavender("report", *model, *more, "--fresh")
-    assert (code, "left out" in out) == (0, False)
-
-
-def test_a_model_is_recorded_again_when_what_it_is_made_of_has_changed(lavender, tmp_path, monkeypatch):
-    mujoco, recording = pytest.importorskip("mujoco"), pytest.importorskip("lavender.io.recording")
-    if not hasattr(mujoco, "mju_getXMLDependencies"):
-        pytest.skip("this MuJoCo does not tell what a model includes")
-    model, part, played = (tmp_path / name for name in ("scene.xml", "part.xml", "played.npy"))
-    body = MODEL.format(height=0.1, kind="box")
-    part.write_text(
-        f"<mujocoinclude>{body[body.index('<worldbody>') : body.index('</mujoco>')]}</mujocoinclude>"
-    )
-    model.write_text('<mujoco><include file="part.xml"/></mujoco>')
-    np.save(played, np.zeros((1, 0)))
-    calls, kept = [], recording.record_file
-    words = [
-        "report",
-        model,
-        "--controls",
-        played,
-        "--steps",
-        10,
-        "--every",
-        5,
-        "--solvers",
-        "auto",
-        "--no-figures",
-    ]
-
-    def recorded(*given, **more):
-        calls.append(given)
-        return kept(*given, **more)
-
-    def stopped(*given, **more):
-        recorded(*given, **more)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(recording, "record_file", recorded)
-    assert (lavender(*words)[0], lavender(*words)[0], len(calls)) == (0, 0, 1)
-    for count, changed in ((2, part), (3, played)):
-        os.utime(changed, (1e9, 1e9 + count))
-        assert (lavender(*words)[0], len(calls)) == (0, count)
-    monkeypatch.setattr(recording, "record_file", stopped)  # on the way, for all that anybody knows
-    assert lavender(*words, "--fresh")[0] == cli.EXIT_INTERRUPTED
-    monkeypatch.setattr(recording, "record_file", recorded)
-    assert (lavender(*words)[0], len(calls)) == (0, 5)
-
-
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
     assert lavender("doctor", path)[:2] == (0, "1 looked at, none suspicious\n")
     code, out, _ = lavender("doctor", path, "duplicated(k=3)")
@@ -760,17 +382,6 @@ def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
         2,
     ]
     assert lavender("doctor", tmp_path / "none.npz")[0] == 2
-
-
-def test_a_report_tells_what_looks_wrong(lavender, tmp_path):
-    code, out, _ = lavender(
-        "report", "duplicated(k=3)", "--solvers", "pgs", *QUICK, "--out", tmp_path / "out"
-    )
-    assert code == 0
-    told = "duplicate rows: 2 contacts stand where another of the pair does"
-    assert told in out
-    assert told in (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-    assert bench.read(tmp_path / "out").cases["duplicated(k=3)"].suspicions[0].startswith(told)
 
 
 def _must_not_begin(*_, **__):
