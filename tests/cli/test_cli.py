@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import LAWS, free, on_rows, robot, says
 from click.testing import CliRunner
-from random_problems import as_matrix, dragged, random_ellipses
-from random_trees import random_tree, tree_mass
+from random_problems import as_matrix
 from stacks import stack
 
 import lavender as lv
@@ -460,10 +460,6 @@ def test_files_are_written_whoever_reads(path, tmp_path):
     assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
 
 
-def says(status, **more):
-    return lv.Claim(status, 1, **more)
-
-
 def test_the_command_of_a_check_fails_on_a_liar(plug_in, capsys):
     from lavender.cli import main
 
@@ -476,19 +472,6 @@ def test_the_command_of_a_check_fails_on_a_liar(plug_in, capsys):
         main(["check", "granular(n=3)", "--solvers", liar])
     assert end.value.code == 1
     assert "1 claims are contradicted" in capsys.readouterr().out
-
-
-LAWS = ("coulomb", "cone")
-
-
-def free(seed, contacts=3, friction="coulomb", mu=None):
-    return dragged(seed, contacts, mu, friction=friction)
-
-
-def on_rows(seed, friction="coulomb", **sizes):
-    """Bodies with joints and contacts, an ellipse each."""
-    base = random_ellipses(seed, friction, **sizes)
-    return replace(base, compliance=base.compliance + 0.3)
 
 
 FORMS = {"generalized": free, "matrix": lambda *a, **k: as_matrix(free(*a, **k)), "rows": on_rows}
@@ -531,20 +514,6 @@ def test_every_door_gives_the_same(form, law, tmp_path):
     assert lv.residual(problem, single, "float32").verdict == "at its floor"
     assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
     assert str(lv.explain(problem))
-
-
-def robot(seed, m=12, n=10, soft=True, number=np.float64):
-    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
-    rng = np.random.default_rng(seed)
-    mass = tree_mass(rng, random_tree(rng, n))
-    jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
-    jac[:, 0] += 0.3
-    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
-    upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
-    return lv.Problem.from_jacobian(
-        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
-        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
-    )  # fmt: skip
 
 
 def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(tmp_path):

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import says
 from random_problems import random_contact_problem, random_lcp, spd
 
 import lavender as lv
@@ -231,10 +232,6 @@ def test_a_proof_that_there_is_no_solution_counts():
     assert [row.verdict for row in table] == [check.PROVED, check.PROVED, check.NOT_SOLVED]
     assert table.reference is None
     assert not table.ok and not table.contradicted
-
-
-def says(status, **more):
-    return lv.Claim(status, 1, **more)
 
 
 def test_ctrl_c_ends_what_solves_one_problem_after_another(plug_in):

@@ -2,26 +2,11 @@
 
 import numpy as np
 import pytest
+from calls import swept
 from random_problems import random_contact_problem
 
 import lavender as lv
 from benchmarks.made import lattice_pile
-from lavender_ext.accelerate import accelerated
-
-
-def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
-    """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(accelerated, "may_pack", lambda data: False)
-        prepared = lv.prepare(problem, name, **options)
-    solver, state = prepared.solver, prepared.state
-    rng = np.random.default_rng(problem.m)
-    lam = 0.05 * np.abs(rng.normal(size=problem.m))
-    for n in counts:
-        solver.run(state, lam, n, tol)
-    return lam, state.sweeps.velocity[: problem.rows.n_bodies], state.sweeps.pairs[0]
-
 
 ORDERS = ["given", "reverse", "symmetric", "bottom_up", "colored", "array"]
 SOLVERS = [("nncg", {}), ("nncg", {"restart": "against"}), ("nncg", {"convex": 20}), ("anderson", {})]

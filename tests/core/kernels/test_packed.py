@@ -5,12 +5,12 @@ from functools import partial
 
 import numpy as np
 import pytest
+from calls import impulses, in_chunks, packed
 from random_problems import CONTACTS, random_contact_problem
 
 import lavender as lv
 from benchmarks.made import lattice_pile
 from lavender.solvers import layout
-from lavender_ext.sweep import serial
 
 FIXED = ["given", "reverse", "bottom_up", "top_down", "local", "colored", "array"]
 
@@ -28,35 +28,6 @@ NO_LANES = ("one tangent",)
 def tangled(seed, contacts, joints, bodies=None, kind="disks"):
     bodies = bodies or max(3, (contacts + joints) // 2)
     return KINDS[kind](seed, bodies=bodies, joints=joints, contacts=contacts)
-
-
-def impulses(problem, packs=True, **options):
-    """Sequential impulses of a problem, prepared, perhaps never in pairs."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(serial, "may_pack", lambda data: False)
-        return lv.prepare(problem, "sequential_impulses", **options)
-
-
-def in_chunks(problem, order, counts, start, *, packs=True):
-    """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
-    if order == "array":
-        order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
-    prepared = impulses(problem, packs, order=order)
-    solver, state = prepared.solver, prepared.state
-    lam = start.copy()
-    for n in counts:
-        solver.run(state, lam, n, 0.0)
-    return lam, state.sweeps.velocity[:-2], state.sweeps.pairs
-
-
-def packed(problem, order, counts, start):
-    """(records, stages) of those runs, which have the bits of one contact after the other."""
-    lam, v, pairs = in_chunks(problem, order, counts, start)
-    one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
-    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
-    return pairs
 
 
 @pytest.mark.parametrize("order", FIXED)

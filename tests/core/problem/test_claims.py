@@ -6,6 +6,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from calls import says
 from random_problems import (
     CONTACTS,
     FORMS,
@@ -20,10 +21,6 @@ from lavender import registry
 
 #: Its solution, 1e310, is no number, and so the error of every impulse is infinite.
 FLOORLESS = lv.Problem.linear(1e-310 * np.eye(2), [1.0, 1.0])
-
-
-def says(status, **more):
-    return lv.Claim(status, 1, **more)
 
 
 # -- finite numbers -----------------------------------------------------------------------------------

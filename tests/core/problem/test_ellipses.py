@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, dragged, random_ellipses
+from calls import LAWS, free, on_rows
+from random_problems import as_matrix
 
 import lavender as lv
 from lavender import registry
@@ -12,17 +13,6 @@ from lavender.judge.certificates import check_certificate
 
 OURS = [n for n in lv.available() if registry.specs()[n].own and not registry.specs()[n].external]
 TAKES = [n for n in (*OURS, "clarabel_cone") if registry.specs()[n].laws & {"coulomb", "cone"}]
-LAWS = ("coulomb", "cone")
-
-
-def free(seed, contacts=3, friction="coulomb", mu=None):
-    return dragged(seed, contacts, mu, friction=friction)
-
-
-def on_rows(seed, friction="coulomb", **sizes):
-    """Bodies with joints and contacts, an ellipse each."""
-    base = random_ellipses(seed, friction, **sizes)
-    return replace(base, compliance=base.compliance + 0.3)
 
 
 FORMS = {"generalized": free, "matrix": lambda *a, **k: as_matrix(free(*a, **k)), "rows": on_rows}

@@ -3,27 +3,13 @@
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from calls import robot
 from hypothesis import given, settings
 from random_problems import random_contact_problem, random_lcp, seeds
 from random_trees import random_tree, tree_mass
 
 import lavender as lv
 from lavender.judge.residuals import UNIT32, rounded
-
-
-def robot(seed, m=12, n=10, soft=True, number=np.float64):
-    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
-    rng = np.random.default_rng(seed)
-    mass = tree_mass(rng, random_tree(rng, n))
-    jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
-    jac[:, 0] += 0.3
-    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
-    upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
-    return lv.Problem.from_jacobian(
-        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
-        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
-    )  # fmt: skip
-
 
 # -- the floor --------------------------------------------------------------------------------------
 

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from calls import Clock, dense, over_velocities
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
@@ -18,36 +19,12 @@ from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
 
 
-class Clock:
-    """Stands still but for counted work."""
-
-    now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch):
     made = Clock()
     monkeypatch.setattr(deadline, "perf_counter", made)
     monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
     return made
-
-
-def dense(m, law, seed=0):
-    rng = np.random.default_rng(seed)
-    half = rng.normal(size=(m, m // 2))
-    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
-    return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
-
-
-def over_velocities(m, nv, seed=0):
-    rng = np.random.default_rng(seed)
-    half = rng.normal(size=(nv, nv))
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
-    mass = half @ half.T / nv + np.eye(nv)
-    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
 
 
 def test_set_up_is_inside(clock, monkeypatch):

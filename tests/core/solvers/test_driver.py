@@ -4,29 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import REACHED, driven
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
 
 import lavender as lv
-from lavender.judge.certificates import check_certificate
-from lavender_ext.driver.driver import Driver
-
-MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
-
-
-def driven(problem, tol=1e-9, budget=1500, work=10**6):
-    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
-    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
-    if not driver.start(impulse):
-        return None
-    how = MORE
-    while how in (MORE, CERTIFICATE):
-        how, done, relative, proof = driver.step(work, impulse)
-        if proof is not None and check_certificate(problem, proof) is None:
-            driver.prove()
-    return how, done, relative, impulse
 
 
 def forms(problem):

@@ -7,6 +7,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from calls import dense_h, system_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import FORMS, general, good, random_contact_problem, seeds
@@ -21,11 +22,6 @@ from lavender.solvers.newton_systems.systems import make_system
 from lavender_ext.core.problem import LAWS
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.solve import COMPLIANCE, Layout, Solve
-
-
-def dense_h(problem):
-    s = 1.0 / np.sqrt(problem.d)
-    return problem.dense() * s[:, None] * s[None, :]
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse"])
@@ -66,16 +62,6 @@ def test_a_problem_is_scaled_by_its_definition(form, seed):
 
 
 # -- linear algebra ---------------------------------------------------------------------------------
-
-
-def system_in(problem, form):
-    """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
-    if form != "sparse":
-        return make_system(problem, form)
-    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, EARLY_FILL=2.0):
-        system = make_system(problem, "impulse")
-    assert not system.dense
-    return system
 
 
 @pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])

@@ -2,13 +2,13 @@
 
 import _thread
 import pickle
-import re
 import sys
 import threading
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from calls import SHORT, check, facts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
@@ -29,31 +29,6 @@ from lavender.solvers.small import (
     who,
 )
 from lavender_ext.small.many import solve_first
-
-SHORT = ("auto", "direct", "newton")
-TIMES = ("setup_time", "solve_time", "_rest")
-
-
-def long_way(problem, solver, **options):
-    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
-
-
-def facts(solution):
-    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
-    r = solution.residual
-    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
-    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
-    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
-    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
-
-
-def check(problem, solver, **options):
-    short = lv.solve(problem, solver, **options)
-    expected = facts(long_way(problem, solver, **options))
-    assert facts(short) == expected
-    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
-    return short
 
 
 def draw(kind, seed):

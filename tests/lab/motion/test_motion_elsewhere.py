@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from random_problems import dragged
+from calls import free
 
 import lavender as lv
 from lavender.lab.motion.unique import uniqueness
@@ -17,10 +17,6 @@ def test_several_motions_are_told():
     found = lv.motions(p)
     d = lv.derivative(p, found[0].impulse)
     assert len(d.motions) == len(found) and d.motions.all == found.all
-
-
-def free(seed, contacts=3, friction="coulomb", mu=None):
-    return dragged(seed, contacts, mu, friction=friction)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from calls import Clock, dense, over_velocities
 
 import lavender as lv
 from benchmarks.made import fresh
@@ -21,36 +22,12 @@ OWN = [name for name, spec in registry.specs().items() if spec.own and not spec.
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
 
 
-class Clock:
-    """Stands still but for counted work."""
-
-    now = 0.0
-
-    def __call__(self):
-        return self.now
-
-
 @pytest.fixture
 def clock(monkeypatch):
     made = Clock()
     monkeypatch.setattr(deadline, "perf_counter", made)
     monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
     return made
-
-
-def dense(m, law, seed=0):
-    rng = np.random.default_rng(seed)
-    half = rng.normal(size=(m, m // 2))
-    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
-    return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
-
-
-def over_velocities(m, nv, seed=0):
-    rng = np.random.default_rng(seed)
-    half = rng.normal(size=(nv, nv))
-    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
-    mass = half @ half.T / nv + np.eye(nv)
-    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
 
 
 PROBLEMS = {

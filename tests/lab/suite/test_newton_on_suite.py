@@ -1,10 +1,10 @@
 """`newton`, `admm` and `auto` on built-in problems, whose structure these properties need."""
 
 from dataclasses import replace
-from unittest import mock
 
 import numpy as np
 import pytest
+from calls import dense_h, system_in
 from hypothesis import given, settings
 from random_problems import as_matrix, good, seeds
 
@@ -15,7 +15,6 @@ from lavender.base.deadline import Deadline
 from lavender.lab.suite import box_stack
 from lavender.lab.suite.build import FALL
 from lavender.solvers.newton import SPEC, Newton
-from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
 
 
@@ -134,21 +133,6 @@ def test_a_looser_tolerance_costs_no_more():
     # Turns are as long as what is expected at that tolerance: in a shorter one the relaxation may begin later.
     assert sweeps[0] <= 2.0 * sweeps[1], sweeps
     assert sweeps[1] <= 2.0 * sweeps[2], sweeps
-
-
-def dense_h(problem):
-    s = 1.0 / np.sqrt(problem.d)
-    return problem.dense() * s[:, None] * s[None, :]
-
-
-def system_in(problem, form):
-    """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
-    if form != "sparse":
-        return make_system(problem, form)
-    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, EARLY_FILL=2.0):
-        system = make_system(problem, "impulse")
-    assert not system.dense
-    return system
 
 
 @given(seed=seeds)

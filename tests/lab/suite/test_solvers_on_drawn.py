@@ -1,23 +1,22 @@
 """Solvers on problems of structures drawn by lot (`benchmarks.drawn`)."""
 
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
 import pytest
+from calls import REACHED, check, driven, facts
 from random_problems import as_matrix, good
 
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import registry
-from lavender.judge.certificates import check_certificate
 from lavender.solvers.certify import certify
 from lavender.solvers.newton_systems import general, systems
 from lavender.solvers.newton_systems.systems import make_system
 from lavender.solvers.small import AUTO
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.driver.driver import Driver
 from lavender_ext.small.many import solve_first
 
 
@@ -113,23 +112,6 @@ def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():
     assert sparse.work["factorisations"] <= 3  # 6 after 4 sweeps
 
 
-MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
-
-
-def driven(problem, tol=1e-9, budget=1500, work=10**6):
-    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
-    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
-    if not driver.start(impulse):
-        return None
-    how = MORE
-    while how in (MORE, CERTIFICATE):
-        how, done, relative, proof = driver.step(work, impulse)
-        if proof is not None and check_certificate(problem, proof) is None:
-            driver.prove()
-    return how, done, relative, impulse
-
-
 def test_generalised_coordinates_are_driven_by_the_same_names():
     for seed in (44017, 44027, 44030):
         problem = wild(seed=seed).problem
@@ -212,31 +194,6 @@ def test_from_a_start_that_leads_nowhere_newton_begins_from_nothing_in_the_end()
     for impulse, most in ((None, 40), (near, 400)):
         solution = lv.solve(problem, "newton", impulse=impulse, tol=1e-6)
         assert good(solution, 1e-6) and solution.work["factorisations"] < most, solution
-
-
-TIMES = ("setup_time", "solve_time", "_rest")
-
-
-def long_way(problem, solver, **options):
-    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
-
-
-def facts(solution):
-    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
-    r = solution.residual
-    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
-    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
-    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
-    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
-
-
-def check(problem, solver, **options):
-    short = lv.solve(problem, solver, **options)
-    expected = facts(long_way(problem, solver, **options))
-    assert facts(short) == expected
-    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
-    return short
 
 
 @pytest.mark.parametrize("solver", ["auto", "direct"])

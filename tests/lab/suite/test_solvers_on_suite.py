@@ -2,29 +2,21 @@
 
 import dataclasses
 import itertools
-import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from calls import SHORT, SPENT, STUCK, check, driven, says
 from random_problems import CONTACTS, FORMS, as_matrix
 from scipy.linalg import block_diag
 
 import lavender as lv
 from lavender import registry, suite
-from lavender.judge.certificates import check_certificate
 from lavender.lab.suite.families import granular
 from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
 from lavender.solvers.registry import SMALL_ROWS
-from lavender_ext.driver.driver import Driver
-
-
-def says(status, **more):
-    return lv.Claim(status, 1, **more)
-
 
 GIVEN = FORMS | {
     "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
@@ -115,23 +107,6 @@ def test_a_step_that_goes_wrong_is_undone():
     assert solution.residual.relative < lv.solve(problem, "pgs", tol=0.0, max_iter=400).residual.relative
 
 
-MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
-
-
-def driven(problem, tol=1e-9, budget=1500, work=10**6):
-    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
-    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
-    if not driver.start(impulse):
-        return None
-    how = MORE
-    while how in (MORE, CERTIFICATE):
-        how, done, relative, proof = driver.step(work, impulse)
-        if proof is not None and check_certificate(problem, proof) is None:
-            driver.prove()
-    return how, done, relative, impulse
-
-
 def test_a_budget_ends_it_and_a_proof_too():
     hard = as_matrix(suite.pyramid(k=3, mass_ratio=1e3, friction="coulomb", sliding=0.5).problem)
     how, done, relative, impulse = driven(hard, 1e-12, budget=3, work=1)
@@ -149,34 +124,6 @@ def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
         for restart in ("growth", "against")
     ]
     assert sweeps[1] < 0.7 * sweeps[0]
-
-
-SHORT = ("auto", "direct", "newton")
-
-
-TIMES = ("setup_time", "solve_time", "_rest")
-
-
-def long_way(problem, solver, **options):
-    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
-
-
-def facts(solution):
-    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
-    r = solution.residual
-    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
-    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
-    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
-    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
-    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
-
-
-def check(problem, solver, **options):
-    short = lv.solve(problem, solver, **options)
-    expected = facts(long_way(problem, solver, **options))
-    assert facts(short) == expected
-    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
-    return short
 
 
 @pytest.mark.parametrize("name", suite.families())

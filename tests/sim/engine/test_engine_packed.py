@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
+from calls import packed, swept
 from worked import after
 
 import lavender as lv
 from lavender.sim.engine.layout import HEAD
-from lavender_ext.accelerate import accelerated
-from lavender_ext.sweep import serial
 
 CASES = [
     ("stack", {}),
@@ -100,35 +99,6 @@ def test_packed_contacts_of_boxes_thrown_together(mixed):
     assert not mixed or rows_of >= {1, 3, 4, 5, 6}
 
 
-def impulses(problem, packs=True, **options):
-    """Sequential impulses of a problem, prepared, perhaps never in pairs."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(serial, "may_pack", lambda data: False)
-        return lv.prepare(problem, "sequential_impulses", **options)
-
-
-def in_chunks(problem, order, counts, start, *, packs=True):
-    """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
-    if order == "array":
-        order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
-    prepared = impulses(problem, packs, order=order)
-    solver, state = prepared.solver, prepared.state
-    lam = start.copy()
-    for n in counts:
-        solver.run(state, lam, n, 0.0)
-    return lam, state.sweeps.velocity[:-2], state.sweeps.pairs
-
-
-def packed(problem, order, counts, start):
-    """(records, stages) of those runs, which have the bits of one contact after the other."""
-    lam, v, pairs = in_chunks(problem, order, counts, start)
-    one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
-    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
-    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
-    return pairs
-
-
 def test_a_joint_on_top_of_a_tower_leaves_it_packed():
     """It is swept first and its body's contacts last: it begins late, so that slots stay wide."""
     shapes = []
@@ -142,20 +112,6 @@ def test_a_joint_on_top_of_a_tower_leaves_it_packed():
         shapes.append(packed(problem, "given", [20], problem.start()))
     assert shapes[1][0] <= shapes[0][0] + 2
     assert shapes[1][1] >= shapes[0][1]
-
-
-def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
-    """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(accelerated, "may_pack", lambda data: False)
-        prepared = lv.prepare(problem, name, **options)
-    solver, state = prepared.solver, prepared.state
-    rng = np.random.default_rng(problem.m)
-    lam = 0.05 * np.abs(rng.normal(size=problem.m))
-    for n in counts:
-        solver.run(state, lam, n, tol)
-    return lam, state.sweeps.velocity[: problem.rows.n_bodies], state.sweeps.pairs[0]
 
 
 def test_one_chain_is_swept_one_by_one():

@@ -1,0 +1,175 @@
+"""Ways into kernels, a clock that is played, and problems, which tests of several floors share."""
+
+import re
+from dataclasses import fields, replace
+from unittest import mock
+
+import numpy as np
+import pytest
+from random_problems import dragged, random_ellipses
+from random_trees import random_tree, tree_mass
+
+import lavender as lv
+from lavender.judge.certificates import check_certificate
+from lavender.solvers.newton_systems import systems
+from lavender.solvers.newton_systems.systems import make_system
+from lavender_ext.accelerate import accelerated
+from lavender_ext.driver.driver import Driver
+from lavender_ext.sweep import serial
+
+SHORT = ("auto", "direct", "newton")
+
+
+TIMES = ("setup_time", "solve_time", "_rest")
+
+
+def long_way(problem, solver, **options):
+    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
+
+
+def facts(solution):
+    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
+    r = solution.residual
+    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
+    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
+    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
+    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
+
+
+def check(problem, solver, **options):
+    short = lv.solve(problem, solver, **options)
+    expected = facts(long_way(problem, solver, **options))
+    assert facts(short) == expected
+    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
+    return short
+
+
+class Clock:
+    """Stands still but for counted work."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def dense(m, law, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(m, m // 2))
+    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
+    return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
+
+
+def over_velocities(m, nv, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(nv, nv))
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    mass = half @ half.T / nv + np.eye(nv)
+    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
+
+
+def impulses(problem, packs=True, **options):
+    """Sequential impulses of a problem, prepared, perhaps never in pairs."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not packs:
+            patch.setattr(serial, "may_pack", lambda data: False)
+        return lv.prepare(problem, "sequential_impulses", **options)
+
+
+def in_chunks(problem, order, counts, start, *, packs=True):
+    """Impulse and velocities after runs of those many sweeps each, and how the contacts were packed."""
+    if order == "array":
+        order = np.random.default_rng(problem.n_blocks).permutation(problem.n_blocks)
+    prepared = impulses(problem, packs, order=order)
+    solver, state = prepared.solver, prepared.state
+    lam = start.copy()
+    for n in counts:
+        solver.run(state, lam, n, 0.0)
+    return lam, state.sweeps.velocity[:-2], state.sweeps.pairs
+
+
+def packed(problem, order, counts, start):
+    """(records, stages) of those runs, which have the bits of one contact after the other."""
+    lam, v, pairs = in_chunks(problem, order, counts, start)
+    one, v_one, _ = in_chunks(problem, order, counts, start, packs=False)
+    np.testing.assert_array_equal(lam.view(np.uint8), one.view(np.uint8))
+    np.testing.assert_array_equal(v.view(np.uint8), v_one.view(np.uint8))
+    return pairs
+
+
+def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
+    """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not packs:
+            patch.setattr(accelerated, "may_pack", lambda data: False)
+        prepared = lv.prepare(problem, name, **options)
+    solver, state = prepared.solver, prepared.state
+    rng = np.random.default_rng(problem.m)
+    lam = 0.05 * np.abs(rng.normal(size=problem.m))
+    for n in counts:
+        solver.run(state, lam, n, tol)
+    return lam, state.sweeps.velocity[: problem.rows.n_bodies], state.sweeps.pairs[0]
+
+
+def robot(seed, m=12, n=10, soft=True, number=np.float64):
+    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
+    rng = np.random.default_rng(seed)
+    mass = tree_mass(rng, random_tree(rng, n))
+    jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
+    jac[:, 0] += 0.3
+    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
+    upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
+    return lv.Problem.from_jacobian(
+        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
+        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
+    )  # fmt: skip
+
+
+MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
+
+
+def driven(problem, tol=1e-9, budget=1500, work=10**6):
+    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
+    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
+    if not driver.start(impulse):
+        return None
+    how = MORE
+    while how in (MORE, CERTIFICATE):
+        how, done, relative, proof = driver.step(work, impulse)
+        if proof is not None and check_certificate(problem, proof) is None:
+            driver.prove()
+    return how, done, relative, impulse
+
+
+LAWS = ("coulomb", "cone")
+
+
+def free(seed, contacts=3, friction="coulomb", mu=None):
+    return dragged(seed, contacts, mu, friction=friction)
+
+
+def on_rows(seed, friction="coulomb", **sizes):
+    """Bodies with joints and contacts, an ellipse each."""
+    base = random_ellipses(seed, friction, **sizes)
+    return replace(base, compliance=base.compliance + 0.3)
+
+
+def says(status, **more):
+    return lv.Claim(status, 1, **more)
+
+
+def dense_h(problem):
+    s = 1.0 / np.sqrt(problem.d)
+    return problem.dense() * s[:, None] * s[None, :]
+
+
+def system_in(problem, form):
+    """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
+    if form != "sparse":
+        return make_system(problem, form)
+    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, EARLY_FILL=2.0):
+        system = make_system(problem, "impulse")
+    assert not system.dense
+    return system
