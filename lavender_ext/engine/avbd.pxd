@@ -11,7 +11,9 @@ body after body takes the Newton step of (1/2h) (z - y).M (z - y) + sum over its
 
     (M/h + sum kappa J^T J) dz = -M (z - y)/h + sum J^T p                                             (2)
 
-over the rows that push, then all rows take lambda <- p, and those inside their bounds
+over the rows that push. Where a contact that did not would push after that step (the next step would open it again, and
+so on, through the ground), the step is taken once more with its row, of lambda - kappa (C' + J z) < 0, too. Then all rows
+take lambda <- p, and those inside their bounds
 
     kappa <- kappa + beta kappa0 |C' + J z| / slop,   kappa0 = 1/(h A_ii)                             (3)
 
@@ -127,6 +129,20 @@ cdef inline void add_contact(const engine_t* e, int32_t c, int32_t side, const d
     add_row(j, p[2], kappa, m, g)
 
 
+cdef inline int32_t add_met(const engine_t* e, int32_t c, int32_t side, const double* z, const double* step, double* m,
+                            double* g) noexcept nogil:
+    """Whether a contact that does not push at z would after the step of its body; its row is then added."""
+    cdef double kappa = e.push[e.size[N_JOINT_ROW] + c], p
+    cdef double j[6]
+    cdef double turn[6]
+    p = e.impulse[e.ptr[e.size[N_JOINT] + c]] - kappa * (normal_error(e, c) + displacement(e, c, z, e.normal + 3 * c, turn))
+    contact_row(e.normal + 3 * c, turn + 3 * side, 1.0 if side else -1.0, j)
+    if p > 0.0 or p - kappa * (dot3(j, step) + dot3(j + 3, step + 3)) <= 0.0:
+        return 0
+    add_row(j, p, kappa, m, g)
+    return 1
+
+
 cdef inline void add_joint(const engine_t* e, int32_t i, int32_t side, const double* z, double* m,
                            double* g) noexcept nogil:
     cdef int32_t row
@@ -174,10 +190,12 @@ cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int
     """(2) of body i; rows[first[i]:first[i + 1]]: its blocks, twice their number, plus the side that it is on."""
     cdef double m[36]
     cdef double g[6]
+    cdef double factor[36]
+    cdef double step[6]
     cdef double inertia[9]
     cdef double h = e.setting[S_H], mass = 1.0 / e.inv_mass[i], x
     cdef double* z = e.shift
-    cdef int32_t k, l, kj = e.size[N_JOINT]
+    cdef int32_t k, l, kj = e.size[N_JOINT], met = 0
     for k in range(36):
         m[k] = 0.0
     mass_matrix(e, i, inertia)
@@ -195,9 +213,18 @@ cdef inline void descend(engine_t* e, int32_t i, const int32_t* first, const int
             add_joint(e, l, rows[k] & 1, z, m, g)
         else:
             add_contact(e, l - kj, rows[k] & 1, z, m, g)
-    solve_6(m, g)
+    for k in range(36):
+        factor[k] = m[k]
     for k in range(6):
-        z[6 * i + k] += g[k]
+        step[k] = g[k]
+    solve_6(factor, step)
+    for k in range(first[i], first[i + 1]):
+        if rows[k] >> 1 >= kj:
+            met |= add_met(e, (rows[k] >> 1) - kj, rows[k] & 1, z, step, m, g)
+    if met:
+        solve_6(m, g)
+    for k in range(6):
+        z[6 * i + k] += g[k] if met else step[k]
 
 
 cdef inline void stiffen(double* kappa, double least, double error, double beta, double slop) noexcept nogil:

@@ -8,6 +8,7 @@ import pytest
 from worked import after
 
 import lavender as lv
+from benchmarks import gallery
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.scene.parts import rotation
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
@@ -159,6 +160,40 @@ def test_a_free_body_keeps_its_angular_momentum(name):
         r = rotation(seen["quaternions"][0])
         end = r @ scene.bodies[0].inertia @ r.T @ seen["velocities"][0][3:]
         np.testing.assert_allclose(end, start, atol=tol * np.linalg.norm(start))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_ball_that_lands_at_any_speed_stays_on_the_ground(name):
+    for speed in np.linspace(0.0, 5.0, 11):
+        scene = lv.Scene(stepper=name, dt=1 / 240, friction=0.3)
+        scene.add_plane()
+        scene.add_sphere(0.167, position=(0, 0, 1.3), velocity=(0.7, 0, -speed))
+        sim = lv.Simulation(scene)
+        height = [sim.step()[0]["positions"][1][2] - 0.167 for _ in range(240)]
+        assert min(height) > -0.02, speed  # a step's way at 5 m/s; what is left of it goes slowly
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("name", NAMES)
+def test_thrown_bodies_gain_no_energy_and_fall_through_nothing(name, seed):
+    rng = np.random.default_rng(seed)
+    scene = lv.Scene(stepper=name, dt=1 / 240, friction=rng.uniform())
+    scene.add_plane()
+    for i in range(8):
+        more = {"position": (*rng.uniform(-0.6, 0.6, 2), 1.0 + 1.5 * i), "mass": 10.0 ** rng.uniform(-1, 1)}
+        more |= {"velocity": rng.normal(scale=2.0, size=3), "angular_velocity": rng.normal(scale=3.0, size=3)}
+        if rng.integers(2):
+            scene.add_sphere(rng.uniform(0.1, 0.4), **more)
+        else:
+            turned = rng.normal(size=4)
+            scene.add_box(rng.uniform(0.2, 0.8, 3), quaternion=turned / np.linalg.norm(turned), **more)
+    sim = lv.Simulation(scene)
+    start = gallery.energy(scene, sim.reset()[0])
+    for _ in range(600):
+        seen, _, lost, _, _ = sim.step()
+        assert not lost
+        assert gallery.energy(scene, seen) < 1.001 * start
+    assert seen["positions"][1:, 2].min() > 0.05
 
 
 # -- twins ----------------------------------------------------------------------------------------
