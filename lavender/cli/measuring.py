@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     P = TypeVar("P", bound=Plan)
 
-__all__ = ["Measured", "measure", "run_campaign"]
+__all__ = ["Measured", "Progress", "measure", "run_campaign"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
-        with _Progress() as bar:
+        with Progress() as bar:
 
             def watch(event: Event) -> None:
                 nonlocal reused
@@ -135,7 +135,7 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
     check_named(bench.resolve(words))
     plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
     more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
-    with bench.Store(path) as store, _Progress() as watch:
+    with bench.Store(path) as store, Progress() as watch:
         try:
             made = bench.campaign(words, asked["solvers"], plan, store, watch=watch, **more)
         except KeyboardInterrupt:
@@ -143,8 +143,8 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
         return Measured(made, False)
 
 
-class _Progress:
-    """A progress bar over pairs of case and solver, on a terminal; silent elsewhere."""
+class Progress:
+    """A progress bar over what is measured, pairs of case and solver for one, on a terminal; silent elsewhere."""
 
     def __enter__(self) -> Callable[[Event], None]:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn

@@ -1,0 +1,1 @@
+"""Measuring: engines audited over many worlds, and their settings chosen."""
