@@ -50,8 +50,8 @@ TASK = 4096  # steps that a worker does between two answers
 WORST = 3  # worlds that are kept as files
 POINTS = 60  # of a curve over time
 OF_ERRORS = (
-    "Of the worst row of each step. At its floor: rounding explains the error, in the engine's precision. Close enough: "
-    "no row is further off than the threshold. Stopped early, or wrong: the rest."
+    "Of the worst row of each step. At its floor: rounding explains the error, in the engine's precision. Close "
+    "enough: no row is further off than the threshold. Stopped early, or wrong: the rest."
 )
 OF_FILES = (
     "Problems with the engine's impulses, in the folder worst; states.npz holds the states to go back to."
@@ -239,9 +239,9 @@ class Audit:
         return Sheet(
             "lavender audit", self.head,
             [
-                Section("How wrong", [self.table_of_errors, self.table_of_verdicts], self.figures, OF_ERRORS),
-                Section("Where", [self.table_of_rows], note="Rows that were the worst of an early stop."),
-                Section("The worst worlds", [self.table_of_worst], note=OF_FILES),
+                Section("How wrong", [self.table_of_errors, self.table_of_verdicts], self.figures, OF_ERRORS, short=4),
+                Section("Where", [self.table_of_rows], short=5, note="Rows that were the worst of an early stop."),
+                Section("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
             ],
             {"head": self.head, "engine": self.engine, "model": str(self.runs.model), "worlds": self.runs.worlds,
              "steps": self.runs.steps, "seed": self.runs.seed, "done": self.done, "early": int(self.early.sum()),

@@ -33,6 +33,7 @@ class Part:
     figures: Sequence[Figure] = ()
     note: str = ""
     code: Sequence[str] = ()  # lines to copy
+    short: int = 0  # rows of the first table that a terminal shows
 
 
 @dataclass(frozen=True)
@@ -65,15 +66,13 @@ class Sheet:
             raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
         return folder / "index.html"
 
-    def show(self, console: Console, lines: int = 4) -> None:
-        """The sentence, then each part's first table by its first lines, and what is to be copied."""
+    def show(self, console: Console) -> None:
+        """The sentence, what is to be copied, and the first rows of each part's first table."""
         console.print(self.head, style="bold", highlight=False, markup=False)
         for part in self.parts:
             for line in part.code:
                 console.print(f"    {line}", highlight=False, markup=False, soft_wrap=True)
-            for table in part.tables[:1]:
+            for table in part.tables[:1] if part.short else ():
                 if table.rows:
                     console.print()
-                    print_table(
-                        console, replace(table, rows=table.rows[:lines], marks=table.marks[:lines]), cut=True
-                    )
+                    print_table(console, replace(table, rows=table.rows[: part.short]), cut=True)
