@@ -15,7 +15,7 @@ import copy
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -190,7 +190,7 @@ class Audit:
         parts = [speed[:, k : k + width] for k in range(0, self.runs.steps, width)]
         known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
         over = tuple(
-            Curve.of(name, name, [(k, float(np.quantile(p, q, method="higher"))) for k, p in known])
+            Curve.of(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
             for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0)) if known
         )  # fmt: skip
         sorted_ = np.sort(speed[np.isfinite(speed) & (speed > 0.0)])[::-1]
@@ -301,10 +301,10 @@ def audit(
     if precision not in (None, *PRECISIONS) or (precision and engine != "mujoco"):
         raise InputError(f"precision is {precision!r}; {' or '.join(PRECISIONS)}, of MuJoCo alone, is needed")
     check_workers(workers)
-    runs = Runs(os.fspath(model), worlds, steps, control, seed, spread)
+    runs = Runs(os.fspath(model), worlds, steps, control=control, seed=seed, spread=spread)
     how = precision or "float64", number("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
-    found = Audit(runs, engine, numbers, verdict, {}, [])
+    found = Audit(runs, engine, numbers, verdict, where={}, worst=[])
     stopped = False
     try:
         for piece in (
@@ -326,7 +326,7 @@ def audit(
         stopped = True
     if not found.done:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
-    return Audit(runs, engine, numbers, verdict, found.where, found.worst, stopped)
+    return replace(found, stopped=stopped)
 
 
 def _worst(some: list[Worst]) -> list[Worst]:
@@ -403,6 +403,7 @@ def _judged(
     for i in order[np.sort(first)][:WORST].tolist():
         own = flat[batch.rows_of(i)].copy()
         at = int(world[i]), int(step[i])
-        worst.append(Worst(float(numbers[0, i]), *at, rows[i], batch[i], own, state_of(i)))
+        kept = {"where": rows[i], "problem": batch[i], "impulse": own, "state": state_of(i)}
+        worst.append(Worst(float(numbers[0, i]), *at, **kept))
     where = [(i, NUMBER.sub("contact ", name)) for i, name in rows.items()]
-    return Piece(world, step, numbers, verdict, where, worst)
+    return Piece(world, step, numbers, verdict, where=where, worst=worst)

@@ -41,7 +41,7 @@ from lavender.report.table import Table
 from lavender.report.text import residual, seconds, times
 from lavender.residuals import ENOUGH
 
-__all__ = ["Measured", "Setting", "Tuning", "tune"]
+__all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
 
 WORST = 0.99  # quantile of the error by which settings are compared
 EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
@@ -133,7 +133,7 @@ class Measured:
 
 
 @dataclass(eq=False)
-class _Stage:
+class Stage:
     """Worlds on which settings are measured: starts (n, size), controls (n, ahead, nu), where bodies converge to."""
 
     mj: Any
@@ -143,7 +143,8 @@ class _Stage:
     ends: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], ahead: int) -> _Stage:
+    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], ahead: int) -> Stage:
+        """Stretches of worlds that run with the model's own setting."""
         starts, controls = [], []
         for world in worlds:
             drive = runs.drive(model, world)
@@ -246,8 +247,12 @@ class Tuning:
     @cached_property
     def closer(self) -> Measured | None:
         """As fast as now, and most accurate; None where now is within the threshold."""
-        best = min((m for m in self._own if m.time <= (1.0 + EQUAL) * self.now.time), key=lambda m: m.worst)
-        return best if best.worst < self.now.worst > self.threshold else None
+        now = self.now
+        good = [
+            m for m in self._own if m.time <= (1.0 + EQUAL) * now.time and m.error.max() <= now.error.max()
+        ]
+        best = min(good, key=lambda m: m.worst)
+        return best if best.worst < now.worst > self.threshold else None
 
     @property
     def front(self) -> list[Measured]:
@@ -316,12 +321,13 @@ class Tuning:
             gain = times(now.worst / self.closer.worst) if self.closer.worst else "exact:"
             head += f" In the same time it can be {gain} less."
         other = [m for m in self.measured if m.setting.is_other]
+        shown = [now, *(m for m in self.front if m is not now)]
         every = sorted(self.measured, key=lambda m: m.time)
         return Sheet(
             "lavender tune", head,
             [
                 Part("Lines to copy", code=self.lines, note="Chosen on the even worlds, tried on the odd ones."),
-                Part("The front of time and error", [self._table([now, *self.front])], [self.figure], short=9),
+                Part("The front of time and error", [self._table(shown)], [self.figure], short=9),
                 Part("Other problems", [self._table(other)], short=4,
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
                 Part("Every setting", [self._table(every)]),
@@ -408,7 +414,8 @@ def tune(
     CapabilityError
         An integrator whose problem is not of M.
     """
-    runs = Runs(os.fspath(model), whole_number("worlds", worlds, 2, None), steps, control, seed, spread)
+    own = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
+    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread)
     ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
     threshold = number("threshold", threshold, low=0.0)
     if steps % ahead:
@@ -427,9 +434,10 @@ def tune(
     held: list[Measured] = []
 
     def found(stopped: bool) -> Tuning:
-        return Tuning(runs, ahead, [m for m in measured if np.isfinite(m.time)], held, threshold, stopped)
+        timed = [m for m in measured if np.isfinite(m.time)]
+        return Tuning(runs, ahead, timed, held, threshold=threshold, stopped=stopped)
 
-    def judge(stage: _Stage, settings: list[Setting]) -> list[Measured]:
+    def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
         out = []
         for setting in settings:
             out.append(stage.measured(setting))
@@ -437,7 +445,7 @@ def tune(
         return out
 
     try:
-        stage = _Stage.of(mj, made, runs, range(0, worlds, 2), ahead)
+        stage = Stage.of(mj, made, runs, range(0, worlds, 2), ahead)
         measured += judge(stage, grid(mj, made))
         stage.time(measured, 1, tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
@@ -447,7 +455,7 @@ def tune(
         stage.time(measured, rounds, tell)
         chosen = found(False)
         kept = [Setting(), *(m.setting for m in (chosen.faster, chosen.closer) if m is not None)]
-        stage = _Stage.of(mj, made, runs, range(1, worlds, 2), ahead)
+        stage = Stage.of(mj, made, runs, range(1, worlds, 2), ahead)
         last = judge(stage, list(dict.fromkeys(kept)))
         stage.time(last, 2 * rounds, tell)
         held += last

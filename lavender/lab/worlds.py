@@ -183,7 +183,7 @@ def _warp(mj: Any, model: Any, begin: dict[str, Any]) -> Any:
     import mujoco_warp as mjw
     import warp as wp
 
-    wp.config.quiet = True
+    wp.config.log_level = getattr(wp, "LOG_WARNING", 30)  # not a line for each kernel
     first = mj.MjData(model)
     mj.mj_forward(model, first)
     rows = max(ROOM, 2 * int(first.nefc))
