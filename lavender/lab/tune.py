@@ -33,7 +33,7 @@ from lavender.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.lab.audit import AT_ONCE
-from lavender.lab.worlds import Runs, states_of
+from lavender.lab.worlds import Runs, flew_apart, states_of
 from lavender.many import residual_many
 from lavender.report.curves import Curve, Figure
 from lavender.report.sheet import Part, Sheet
@@ -171,26 +171,35 @@ class Stage:
                 mj.mj_step(model, data)
                 spent += perf_counter() - begin
             mj.mj_kinematics(model, data)
-            ends[i] = data.xpos
+            ends[i] = np.nan if flew_apart(mj, data) else data.xpos
         return spent / (n * ahead), ends
 
     def measured(self, setting: Setting) -> Measured:
-        """A setting judged, not timed yet."""
+        """A setting judged, not timed yet; its errors are infinite where a world flies apart."""
         mj, model = self.mj, setting.on(self.mj, self.model)
+        solver = str(_word(mj, model, "solver"))
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
-        ends = self.run(model, states)[1]
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
         errors = []
-        for i in range(0, len(states), AT_ONCE):
-            batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
-            errors.append(residual_many(batch, impulse, errors="status").velocity_error)
-        error = np.nan_to_num(np.concatenate(errors), nan=np.inf)
+        try:
+            ends = self.run(model, states)[1]
+            for i in range(0, len(states), AT_ONCE):
+                batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
+                errors.append(residual_many(batch, impulse, errors="status").velocity_error)
+        except mj.FatalError:
+            return Measured(setting, solver, np.full(1, np.inf), np.full(1, np.inf))
         off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
-        return Measured(setting, str(_word(mj, model, "solver")), error, np.nan_to_num(off, nan=np.inf))
+        if np.isnan(off).any():
+            return Measured(setting, solver, np.full(1, np.inf), np.full(1, np.inf))
+        return Measured(setting, solver, np.nan_to_num(np.concatenate(errors), nan=np.inf), off)
 
     def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
-        """The least of several rounds in which all take turns, the first of them the model's own setting."""
+        """The least of several rounds in which all take turns, the first of them the model's own setting.
+
+        Worlds that fly apart tell no time.
+        """
+        some = [m for m in some if np.isfinite(m.error).all()]
         models = [m.setting.on(self.mj, self.model) for m in some]
         for turn in range(rounds):
             for m, model in zip(some, models, strict=True):
@@ -330,7 +339,7 @@ class Tuning:
                 Part("The front of time and error", [self._table(shown)], [self.figure], short=9),
                 Part("Other problems", [self._table(other)], short=4,
                      note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
-                Part("Every setting", [self._table(every)]),
+                Part("Every setting", [self._table(every)], note="Without those with which a world flies apart."),
             ],
             {"model": self.runs.model, "lines": self.lines, "stopped": self.stopped,
              "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
@@ -446,7 +455,10 @@ def tune(
 
     try:
         stage = Stage.of(mj, made, runs, range(0, worlds, 2), ahead)
-        measured += judge(stage, grid(mj, made))
+        measured += judge(stage, [Setting()])
+        if not np.isfinite(measured[0].error).all():
+            raise InputError(f"{runs.model}: these worlds fly apart with the model's own setting")
+        measured += judge(stage, grid(mj, made)[1:])
         stage.time(measured, 1, tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
         known = {m.setting for m in measured}

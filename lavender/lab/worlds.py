@@ -85,15 +85,34 @@ class Frame(NamedTuple):
 
 
 def states_of(mj: Any, model: Any, runs: Runs, world: int) -> FloatArray:
-    """(steps, size) states before each step of a world, controls and warm start in them (mjSTATE_INTEGRATION)."""
+    """(steps, size) states before each step of a world, controls and warm start in them (mjSTATE_INTEGRATION).
+
+    NaN from where a world flies apart on: MuJoCo ends in an error, or begins it anew.
+    """
     kind = mj.mjtState.mjSTATE_INTEGRATION
     data, drive = runs.start(mj, model, world), runs.drive(model, world)
     states = np.empty((runs.steps, mj.mj_stateSize(model, kind)))
     for step in range(runs.steps):
         data.ctrl[:] = drive(data, step)
         mj.mj_getState(model, data, states[step], kind)
-        mj.mj_step(model, data)
+        try:
+            mj.mj_step(model, data)
+        except mj.FatalError:  # out of memory
+            states[step:] = np.nan
+            break
+        if flew_apart(mj, data):
+            states[step + 1 :] = np.nan
+            break
     return states
+
+
+def flew_apart(mj: Any, data: Any) -> bool:
+    """Whether MuJoCo has begun the simulation anew, for its numbers were not finite or huge."""
+    kinds = mj.mjtWarning
+    return any(
+        data.warning[int(k)].number
+        for k in (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
+    )
 
 
 def fields_of(mj: Any, model: Any, state: FloatArray) -> dict[str, FloatArray]:

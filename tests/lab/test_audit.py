@@ -175,6 +175,34 @@ def test_a_world_that_is_not_finite_is_accepted_by_nobody(model, monkeypatch):
     assert VERDICTS[found.verdict[0, 5]] == "not finite" and found.largest == np.inf
 
 
+def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(model, monkeypatch):
+    step = mj.mj_step
+
+    def dies(model, data):
+        if data.time > 0.03:
+            raise mj.FatalError("out of memory")
+        step(model, data)
+
+    monkeypatch.setattr(mj, "mj_step", dies)
+    found = audit(model(), worlds=1, steps=12, workers=1)
+    assert [VERDICTS[i] == "not finite" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_world_that_mujoco_begins_anew_ends_there(model, monkeypatch, tmp_path):
+    drive = Runs.drive
+
+    def huge(self, made, world):
+        calm = drive(self, made, world)
+        return lambda data, step: np.full(made.nu, 1e18) if world == 1 and step == 3 else calm(data, step)
+
+    monkeypatch.setattr(Runs, "drive", huge)
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    found = audit(model(), worlds=2, steps=10, workers=1)
+    assert (found.verdict[1, 5:] == VERDICTS.index("not finite")).all()
+    assert (found.verdict[0] < VERDICTS.index("not finite")).all() and found.largest == np.inf
+
+
 @pytest.mark.parametrize(
     ("options", "given", "words"),
     [

@@ -128,3 +128,20 @@ def test_the_command_prints_a_page_and_few_lines(model, tmp_path, monkeypatch): 
 def test_bad_words_are_told(model, given, words):  # noqa: F811
     with pytest.raises(lv.InputError, match=words):
         tune(model(), **{"worlds": 2, "steps": 20} | given)
+
+
+def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(model, monkeypatch):  # noqa: F811
+    fewer(monkeypatch)
+    run = Stage.run
+
+    def dies(self, model, states=None):
+        if model.opt.iterations == 25:
+            raise mj.FatalError("out of memory")
+        return run(self, model, states)
+
+    monkeypatch.setattr(Stage, "run", dies)
+    found = tune(model(), worlds=2, steps=10, rounds=1)
+    assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
+    monkeypatch.setattr(Stage, "measured", lambda self, setting: measured(np.inf, np.inf))
+    with pytest.raises(lv.InputError, match="fly apart"):
+        tune(model(), worlds=2, steps=10, rounds=1)
