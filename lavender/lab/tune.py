@@ -221,8 +221,8 @@ class Tuning:
         On the even worlds.
     held : list of Measured
         The own setting and those chosen, on the odd worlds; empty where Ctrl-C came before.
-    threshold : float, m/s
-        Error below which nobody asks for less.
+    threshold : float, m/s, m
+        Error, and distance, below which nobody asks for less.
     stopped : bool
     """
 
@@ -242,24 +242,25 @@ class Tuning:
     def _own(self) -> list[Measured]:
         return [m for m in self.measured if not m.setting.is_other and np.isfinite(m.time)]
 
+    def _holds(self, m: Measured) -> bool:
+        """No further off than now in its worst steps and in motion, or within the threshold."""
+        now, most = self.now, self.threshold
+        pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
+        return all(x <= max(own, most) for x, own in pairs)
+
     @cached_property
     def faster(self) -> Measured | None:
         """As accurate as now, or within the threshold, and fastest."""
         now = self.now
-        good = [
-            m for m in self._own
-            if m.worst <= max(now.worst, self.threshold) and m.error.max() <= max(now.error.max(), self.threshold)
-        ]  # fmt: skip
-        best = min(good, key=lambda m: m.time, default=now)
+        good = [m for m in self._own if m.worst <= max(now.worst, self.threshold) and self._holds(m)]
+        best = min(good, key=lambda m: m.time)
         return best if best.time < (1.0 - EQUAL) * now.time else None
 
     @cached_property
     def closer(self) -> Measured | None:
         """As fast as now, and most accurate; None where now is within the threshold."""
         now = self.now
-        good = [
-            m for m in self._own if m.time <= (1.0 + EQUAL) * now.time and m.error.max() <= now.error.max()
-        ]
+        good = [m for m in self._own if m.time <= (1.0 + EQUAL) * now.time and self._holds(m)]
         best = min(good, key=lambda m: m.worst)
         return best if best.worst < now.worst > self.threshold else None
 
@@ -406,8 +407,8 @@ def tune(
         Steps of a stretch.
     rounds : int
         In which settings are timed in turns.
-    threshold : float, m/s
-        Error below which nobody asks for less.
+    threshold : float, m/s, m
+        Error, and distance, below which nobody asks for less.
     watch : callable, optional
         Told of what is done.
 

@@ -85,6 +85,9 @@ def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
     rare = measured(5.0, 1e-10, tolerance=1e-4)
     rare.error[0] = 1.0  # one step in a hundred: below the quantile, not below the worst
     assert chosen(now, rare).faster is None
+    astray = measured(5.0, 1e-10, tolerance=1e-4)
+    astray.motion[:] = 1e-3  # its answers are right, and the bodies elsewhere
+    assert chosen(now, astray).faster is None
 
 
 def test_both_sides_of_the_choice_are_printed():
