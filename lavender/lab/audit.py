@@ -37,7 +37,7 @@ from lavender.report.curves import Curve, Figure
 from lavender.report.sheet import Part as Section
 from lavender.report.sheet import Sheet
 from lavender.report.table import Cell, Table
-from lavender.report.text import count, percent, residual
+from lavender.report.text import count, percent, size
 from lavender.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
 
 __all__ = ["Audit", "Worst", "audit"]
@@ -137,7 +137,7 @@ class Audit:
             return f"{begun}none of {done} ended early."
         return (
             f"{begun}{np.count_nonzero(early)} of {done} ended early ({percent(int(early.sum()), self.done, 1)}), in "
-            f"{np.count_nonzero(early.any(axis=1))} worlds; {residual(self.largest)} m/s off in the worst."
+            f"{np.count_nonzero(early.any(axis=1))} worlds; {size(self.largest)} m/s off in the worst."
         )
 
     @property
@@ -150,7 +150,7 @@ class Audit:
                 known = x[chosen & np.isfinite(x)]
                 if len(known):
                     found = np.quantile(known, QUANTILES, method="higher")
-                    rows.append([f"{name} [{unit}], {of}", *map(residual, found.tolist())])
+                    rows.append([f"{name} [{unit}], {of}", *map(size, found.tolist())])
         return Table(heads, rows, words=frozenset({"error"}))
 
     @property
@@ -168,14 +168,14 @@ class Audit:
     def table_of_rows(self) -> Table:
         """Where early stops have their worst row, most often first."""
         ranked = sorted(self.where.items(), key=lambda entry: -entry[1][0])
-        rows = [[name, str(n), residual(most)] for name, (n, most) in ranked]
+        rows = [[name, str(n), size(most)] for name, (n, most) in ranked]
         return Table(["worst row", "early stops", "at most [m/s]"], rows)
 
     @property
     def table_of_worst(self) -> Table:
         """The worlds that are kept as files."""
         rows = [
-            [f"worst_{i}.npz", str(w.world), str(w.step), residual(w.velocity), w.where]
+            [f"worst_{i}.npz", str(w.world), str(w.step), size(w.velocity), w.where]
             for i, w in enumerate(self.worst, 1)
         ]
         return Table(

@@ -38,7 +38,7 @@ from lavender.many import residual_many
 from lavender.report.curves import Curve, Figure
 from lavender.report.sheet import Part, Sheet
 from lavender.report.table import Table
-from lavender.report.text import residual, seconds, times
+from lavender.report.text import seconds, size, times
 from lavender.residuals import ENOUGH
 
 __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
@@ -277,7 +277,7 @@ class Tuning:
     def lines(self) -> list[str]:
         """What to copy, and how it did on the worlds that were held back."""
         none = f"none of {len(self._own)} settings"
-        enough = f"not needed, {residual(self.now.worst)} m/s is within {self.threshold:g}"
+        enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
         said = []
         for word, m, why in (
@@ -297,8 +297,8 @@ class Tuning:
     def _table(self, some: Iterable[Measured]) -> Table:
         rows = [
             [
-                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", residual(m.worst),
-                residual(float(m.error.max())), residual(m.worst_motion),
+                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", size(m.worst),
+                size(float(m.error.max())), size(m.worst_motion),
             ]
             for m in some
         ]  # fmt: skip
@@ -314,7 +314,7 @@ class Tuning:
             return replace(Curve.of(name, name, [(m.time, m.worst) for m in some], notes=notes), **more)
 
         by = {s: [m for m in self._own if m.solver == s] for s in ITERATIONS}
-        parts = [curve(s, some, points=True, thin=True) for s, some in by.items() if some]
+        parts = [curve(s, some, points=True) for s, some in by.items() if some]
         parts += [curve("front", self.front), curve("as it is", [self.now], points=True)]
         return Figure("time-and-error", Path(self.runs.model).name, "time of a step [s]",
                       "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
@@ -325,7 +325,7 @@ class Tuning:
         now = self.now
         head = (
             f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps are more than "
-            f"{residual(now.worst)} m/s off."
+            f"{size(now.worst)} m/s off."
         )
         if self.closer is not None:
             gain = times(now.worst / self.closer.worst) if self.closer.worst else "exact:"
@@ -352,7 +352,7 @@ class Tuning:
 
 
 def _beside(m: Measured, now: Measured) -> str:
-    return f"{m.time / now.time:.2f} of the time, error {residual(m.worst)} m/s beside {residual(now.worst)}"
+    return f"{m.time / now.time:.2f} of the time, error {size(m.worst)} m/s beside {size(now.worst)}"
 
 
 def _told(m: Measured) -> dict[str, Any]:
