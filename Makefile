@@ -50,9 +50,9 @@ verdict:  ## docs/verdict.md: the tables of the built-in report, measured on thi
 	sed -i '1,/^The tables/!d' docs/verdict.md
 	sed -e '1d' -e 's/^```python/```text/' -e '/^\*\*Cases/,$$d' build/verdict/summary.md >> docs/verdict.md
 
-wasm:  ## the WebAssembly modules, in lavender/web/
-	$(BIN)lavender web build lavender/web/lavender.wasm
-	$(BIN)lavender web build lavender/web/newton.wasm --part newton
+wasm:  ## the WebAssembly modules, in lavender/sim/web/
+	$(BIN)lavender web build lavender/sim/web/lavender.wasm
+	$(BIN)lavender web build lavender/sim/web/newton.wasm --part newton
 
 fingerprint:  ## do solvers and engine still give the bits of the stored fingerprint?
 	$(PYTHON) .ci/fingerprint --compare .ci/fingerprint.txt

@@ -33,9 +33,9 @@ os.environ.setdefault("SOURCE_DATE_EPOCH", "1580601600")  # 2020-02-02, as hatch
 MODE = os.environ.get("LAVENDER_DEBUG", "")
 DEBUG = MODE not in ("", "0")
 OPTIONS = runpy.run_path("lavender_ext/build_options.py")
-WASM = runpy.run_path("lavender/web/compile.py")
+WASM = runpy.run_path("lavender/sim/web/compile.py")
 put = WASM["put"]
-LIBRARY = runpy.run_path("lavender/export/amalgamate.py")
+LIBRARY = runpy.run_path("lavender/out/amalgamate.py")
 DIRECTIVES = OPTIONS["directives"](debug=DEBUG)
 #: Holds what Cython would otherwise write into every module (memoryviews): half of all that is compiled.
 SHARED = "lavender_ext._utility"
@@ -92,7 +92,7 @@ class BuildKernels(build_ext):
         if not current:
             self.force = True  # file times do not tell
         # A build that is killed leaves torn files, newer than their sources; and who reads translations while they are
-        # written makes his own (lavender/web/cut.py).
+        # written makes his own (lavender/sim/web/cut.py).
         stamp.unlink(missing_ok=True)
         out.mkdir(parents=True, exist_ok=True)
         try:
@@ -145,7 +145,7 @@ class BuildWasm(Command):
         if self.editable_mode:
             return  # `lavender web` builds it when it is first needed
         for name, part in WASM["PARTS"].items():
-            here = Path("lavender", "web", f"{name}.wasm")
+            here = Path("lavender", "sim", "web", f"{name}.wasm")
             out = Path(self.build_lib, here)
             out.parent.mkdir(parents=True, exist_ok=True)
             if WASM["is_current"](here, Path(), part):
@@ -159,7 +159,7 @@ class BuildWasm(Command):
 
     def get_outputs(self):
         """The modules, where they could be built."""
-        found = (Path(self.build_lib, "lavender", "web", f"{name}.wasm") for name in WASM["PARTS"])
+        found = (Path(self.build_lib, "lavender", "sim", "web", f"{name}.wasm") for name in WASM["PARTS"])
         return [str(out) for out in found if out.exists()]
 
     def get_output_mapping(self):
@@ -172,7 +172,7 @@ class BuildWasm(Command):
 
 
 class BuildLibrary(Command):
-    """Makes the C library of the kernels (lavender/export/amalgamate.py); into a wheel with all of it."""
+    """Makes the C library of the kernels (lavender/out/amalgamate.py); into a wheel with all of it."""
 
     user_options = [("build-lib=", None, "folder of what is installed")]  # noqa: RUF012 - as the base class asks
 
@@ -190,7 +190,7 @@ class BuildLibrary(Command):
         """One source from the translations of this build, and everything that lies beside it."""
         if self.editable_mode:
             return  # `lavender export` makes it when it is first needed
-        for path in [*sorted(Path("lavender/export").rglob("*.*")), make_library()]:
+        for path in [*sorted(Path("lavender/out").rglob("*.*")), make_library()]:
             if path.is_file() and path.suffix not in (".py", ".pyc", ".part"):
                 out = Path(self.build_lib, path)
                 out.parent.mkdir(parents=True, exist_ok=True)
@@ -211,8 +211,8 @@ class BuildLibrary(Command):
 
 
 def make_library():
-    """lavender/export/c/lavender.c of the kernels as they are, its path."""
-    out = Path("lavender", "export", "c", "lavender.c")
+    """lavender/out/c/lavender.c of the kernels as they are, its path."""
+    out = Path("lavender", "out", "c", "lavender.c")
     if not (out.exists() and LIBRARY["source_hash"](Path()) in out.read_text(encoding="utf-8")[:1000]):
         put(out, LIBRARY["amalgamate"](Path().resolve(), Path("build", "cython")).encode())
     return out

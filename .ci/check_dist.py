@@ -15,7 +15,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-WASM = runpy.run_path(str(ROOT / "lavender" / "web" / "compile.py"))
+WASM = runpy.run_path(str(ROOT / "lavender" / "sim" / "web" / "compile.py"))
 
 
 def names_in(folder: Path) -> tuple[set[str], set[str]]:
@@ -51,15 +51,15 @@ def problems(in_sdist: set[str], in_wheel: set[str]) -> list[str]:
         found += [] if name in in_sdist else [f"sdist lacks {name}"]
     found += [f"wheel lacks {name}" for name in sorted(sources - in_wheel)]
     found += [f"wheel lacks the compiled module {name}" for name in sorted(kernels - modules)]
-    for path in ("lavender/export/c/lavender.c", *(f"lavender/web/{name}.wasm" for name in WASM["PARTS"])):
+    for path in ("lavender/out/c/lavender.c", *(f"lavender/sim/web/{name}.wasm" for name in WASM["PARTS"])):
         found += [] if path in in_sdist else [f"sdist lacks {path}"]
         found += [] if path in in_wheel else [f"wheel lacks {path}"]
     if not any(name.endswith("/licenses/LICENSE") for name in in_wheel):
         found.append("wheel lacks LICENSE")
     ours = (
-        "lavender/export/",
+        "lavender/out/",
         "examples/",
-        "tests/parity/scenes.c",
+        "tests/out/parity/scenes.c",
     )  # C that is written by hand, and the library
     built = {name for name in in_sdist if not name.startswith(ours)}
     left = [f"sdist holds {name}" for name in built if name.endswith((".c", ".h", ".so", ".pyc", ".o"))]
@@ -76,7 +76,7 @@ def stale(folder: Path) -> list[str]:
     with tarfile.open(sdist) as archive, zipfile.ZipFile(wheel) as zipped:
         top = archive.getnames()[0].partition("/")[0]
         for name, part in WASM["PARTS"].items():
-            path, sources = f"lavender/web/{name}.wasm", WASM["source_hash"](ROOT, part.modules)
+            path, sources = f"lavender/sim/web/{name}.wasm", WASM["source_hash"](ROOT, part.modules)
             held = archive.extractfile(f"{top}/{path}")
             for what, data in (("sdist", held.read() if held else b""), ("wheel", zipped.read(path))):
                 if not data.endswith(sources.encode()):

@@ -13,12 +13,12 @@ from setuptools import build_meta
 from setuptools.build_meta import *  # noqa: F403 - the other hooks
 
 PINNED = ["cython==3.3.1", "ziglang==0.17.0"]
-WASM = runpy.run_path("lavender/web/compile.py")  # a frontend calls from the root of the project
+WASM = runpy.run_path("lavender/sim/web/compile.py")  # a frontend calls from the root of the project
 
 
 def missing():
     """Files of modules that are not of these sources, with their parts."""
-    files = ((Path("lavender", "web", f"{name}.wasm"), part) for name, part in WASM["PARTS"].items())
+    files = ((Path("lavender", "sim", "web", f"{name}.wasm"), part) for name, part in WASM["PARTS"].items())
     return [(path, part) for path, part in files if not WASM["is_current"](path, Path(), part)]
 
 

@@ -57,7 +57,7 @@ def cli() -> None:
 
 def main() -> None:
     """The command line; what lavender says is an error line, as in its own commands."""
-    from lavender.errors import LavenderError
+    from lavender.base.errors import LavenderError
 
     try:
         cli(prog_name="python -m benchmarks")

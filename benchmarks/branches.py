@@ -18,13 +18,13 @@ import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
 from lavender import motion
-from lavender._arrays import FloatArray
-from lavender.engine import Simulation
-from lavender.motion.error import SAME
+from lavender.base.arrays import FloatArray
+from lavender.lab.motion.error import SAME
 from lavender.problem import Problem
-from lavender.registry import available
-from lavender.scene import Scene
-from lavender.solve import solve
+from lavender.sim.engine import Simulation
+from lavender.sim.scene import Scene
+from lavender.solvers.registry import available
+from lavender.solving.solve import solve
 
 __all__ = ["RUNS", "WAYS", "Crossing", "command", "follow", "pushed", "table"]
 

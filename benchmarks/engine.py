@@ -16,7 +16,7 @@ import click
 import lavender as lv
 from benchmarks.clock import least
 from benchmarks.output import markdown
-from lavender.engine.state import State
+from lavender.sim.engine.state import State
 
 DT = 1.0 / 240.0
 

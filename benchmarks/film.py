@@ -8,14 +8,14 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.cli.options import parameters_of
-from lavender.engine import Film, Simulation
-from lavender.engine.picture import picture_suffix, save_picture
-from lavender.errors import InputError
 from lavender.io.stored import writable
-from lavender.phenomena import chosen, run
-from lavender.phenomena.parts import Phenomenon, Record, Track, Values
+from lavender.lab.phenomena import chosen, run
+from lavender.lab.phenomena.parts import Phenomenon, Record, Track, Values
+from lavender.sim.engine import Film, Simulation
+from lavender.sim.engine.picture import picture_suffix, save_picture
 
 __all__ = ["command", "save_film"]
 

@@ -23,10 +23,10 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
-from lavender.cones import ROW
-from lavender.errors import InputError
+from lavender.base.errors import InputError
+from lavender.judge.residuals import AT_FLOOR, Residual, nothing_to_do, residual
 from lavender.problem import Problem
-from lavender.residuals import AT_FLOOR, Residual, nothing_to_do, residual
+from lavender.problem.cones import ROW
 
 __all__ = ["Stop", "command", "exchange", "newton", "planted", "robot_steps", "table"]
 

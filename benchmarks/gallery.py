@@ -20,11 +20,11 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
-from lavender._arrays import FloatArray
-from lavender.engine import Simulation
-from lavender.errors import InputError
-from lavender.scene import SCENES, Scene
-from lavender.scene.parts import rotation
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.sim.engine import Simulation
+from lavender.sim.scene import SCENES, Scene
+from lavender.sim.scene.parts import rotation
 
 __all__ = ["STEPS_PER_SECOND", "Stay", "command", "energy", "stay", "table"]
 

@@ -6,7 +6,7 @@
 The first: wall and CPU time of cold calls over their limit, medians, with the sweeps or steps that were done, the
 relative residual, and beside it that of the start. The second: counted and least CPU time of every set-up, and the
 rates that would bring the counts closest to it (relative least squares, none negative). The files
-`lavender/solvers/setup_times.py` and `lavender/residuals.py` have half as much again.
+`lavender/solvers/setup_times.py` and `lavender/judge/residuals.py` have half as much again.
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 import lavender as lv
-from benchmarks.islands import forms, fresh
+from benchmarks.made import forms, fresh
 from benchmarks.output import markdown
-from lavender import _later, residuals, suite
+from lavender import suite
+from lavender.base import later as _later
+from lavender.judge import residuals
 from lavender.problem import Problem
-from lavender.registry import get
 from lavender.solvers import setup_times
+from lavender.solvers.registry import get
 
 CASES = ("stack(n=64)", "chain(n=33)", "pyramidF(k=6)", "stack(n=5000)", "granular(n=12)", "granularF(n=12)",
          "dense 300 x 100", "dense 3000 x 300", "matrix 300", "matrix 2400")  # fmt: skip

@@ -17,14 +17,14 @@ import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
 from lavender import motion
-from lavender.bench import resolve, structure_of
-from lavender.cones import ROW
-from lavender.errors import CapabilityError, InputError
+from lavender.base.errors import CapabilityError, InputError
 from lavender.io.stored import write_figure
-from lavender.measures import natural_map, siconos_error
+from lavender.judge.measures import natural_map, siconos_error
+from lavender.lab.bench import resolve, structure_of
 from lavender.problem import Problem
-from lavender.registry import available, get
-from lavender.solve import solve
+from lavender.problem.cones import ROW
+from lavender.solvers.registry import available, get
+from lavender.solving.solve import solve
 
 __all__ = [
     "Branches",

@@ -28,12 +28,12 @@ import numpy as np
 
 import lavender as lv
 from benchmarks import drawn
-from benchmarks.islands import forms
+from benchmarks.made import forms
 from benchmarks.output import markdown, out_option, write_json
 from lavender import suite
+from lavender.judge.residuals import nothing_to_do
 from lavender.problem import Problem
-from lavender.residuals import nothing_to_do
-from lavender.scene.gallery import SCENES
+from lavender.sim.scene.gallery import SCENES
 from lavender.solvers import newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.warm_start import Tried

@@ -23,8 +23,8 @@ from typing import Any
 import click
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 
 __all__ = ["command"]
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from lavender.bench import machine
 from lavender.io.stored import writable, write_text
+from lavender.lab.bench import machine
 
 __all__ = ["markdown", "out_option", "write_json"]
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import click
 
 from benchmarks.output import markdown
-from lavender.errors import SolverUnavailable
-from lavender.web import pages
+from lavender.base.errors import SolverUnavailable
+from lavender.sim.web import pages
 
 ADDRESSES = (
     "scene=pyramid&a=16,warm,given&b=16,warm,given&speed=1&play=1",

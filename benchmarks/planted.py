@@ -16,14 +16,14 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown
-from lavender.cones import ROW, Cones
-from lavender.engine import Simulation
-from lavender.errors import LavenderError
+from lavender.base.errors import LavenderError
 from lavender.io import from_mujoco
+from lavender.lab.suspicions import diagnose
 from lavender.problem import Problem
-from lavender.rows import Rows
-from lavender.scene import Scene
-from lavender.suspicions import diagnose
+from lavender.problem.cones import ROW, Cones
+from lavender.problem.rows import Rows
+from lavender.sim.engine import Simulation
+from lavender.sim.scene import Scene
 
 SCENES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("stack", {"n": 12}),

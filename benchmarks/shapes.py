@@ -24,12 +24,12 @@ import scipy.sparse as sp
 
 from benchmarks.output import markdown, out_option, write_json
 from lavender import solve
-from lavender._arrays import FloatArray
-from lavender.cones import ROW
-from lavender.engine import Simulation
-from lavender.phenomena.engines import engine
+from lavender.base.arrays import FloatArray
+from lavender.lab.phenomena.engines import engine
 from lavender.problem import Problem
-from lavender.scene import Scene
+from lavender.problem.cones import ROW
+from lavender.sim.engine import Simulation
+from lavender.sim.scene import Scene
 
 __all__ = ["Law", "command", "drag", "edges_of", "laws", "scenes", "table"]
 

@@ -32,13 +32,13 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown
-from lavender._arrays import FloatArray
-from lavender.engine import Simulation
-from lavender.engine.layout import HEAD, SETTING
-from lavender.engine.state import State
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.io.stored import write_figure
-from lavender.scene import Scene
+from lavender.sim.engine import Simulation
+from lavender.sim.engine.layout import HEAD, SETTING
+from lavender.sim.engine.state import State
+from lavender.sim.scene import Scene
 
 __all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "slowest"]
 

@@ -27,13 +27,13 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
-from lavender._arrays import FloatArray
-from lavender.bench.machine import versions
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError, UnknownName
 from lavender.cli.options import Names, Numbers
-from lavender.errors import InputError, UnknownName
-from lavender.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
-from lavender.scene import Scene
-from lavender.scene.scene import SCENE_ORDERS
+from lavender.lab.bench.machine import versions
+from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, lacks, versions_of_node
+from lavender.sim.scene import Scene
+from lavender.sim.scene.scene import SCENE_ORDERS
 
 __all__ = [
     "ENGINES",

@@ -23,16 +23,16 @@ import click
 import numpy as np
 
 from benchmarks.output import markdown, out_option, write_json
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.io.stored import write_figure
-from lavender.phenomena.engines import follow
-from lavender.phenomena.engines.own import Engine
-from lavender.report.curves import Curve, Figure
-from lavender.report.draw import matplotlib_panels
-from lavender.report.style import looks
-from lavender.scene import Scene
-from lavender.scene.steppers import STEPPERS, get_stepper
+from lavender.lab.phenomena.engines import follow
+from lavender.lab.phenomena.engines.own import Engine
+from lavender.lab.report.curves import Curve, Figure
+from lavender.lab.report.draw import matplotlib_panels
+from lavender.lab.report.style import looks
+from lavender.sim.scene import Scene
+from lavender.sim.scene.steppers import STEPPERS, get_stepper
 
 __all__ = ["BUDGETS", "SCENES", "Point", "command", "draw", "measure", "reference", "table"]
 

@@ -35,19 +35,19 @@ import lavender_ext
 from benchmarks import motions, stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
-from lavender.bench import level_name, structure_of
-from lavender.ordering import ORDERS
+from lavender.lab.bench import level_name, structure_of
+from lavender.lab.report import contents, geometric_means, reaches
+from lavender.lab.report.curves import figures as report_figures
+from lavender.lab.report.curves import work_precision
+from lavender.lab.report.draw import matplotlib_panels
+from lavender.lab.report.findings import Report
+from lavender.lab.report.page import page as report_page
+from lavender.lab.report.style import looks
+from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.lab.report.text import residual, seconds
 from lavender.problem import LAWS
-from lavender.report import contents, geometric_means, reaches
-from lavender.report.curves import figures as report_figures
-from lavender.report.curves import work_precision
-from lavender.report.draw import matplotlib_panels
-from lavender.report.findings import Report
-from lavender.report.page import page as report_page
-from lavender.report.style import looks
-from lavender.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.report.text import residual, seconds
-from lavender.scene.gallery import SCENES
+from lavender.problem.ordering import ORDERS
+from lavender.sim.scene.gallery import SCENES
 
 ROOT = Path(__file__).resolve().parent.parent
 LEVELS = (1e-3, 1e-6, 1e-9)
@@ -524,7 +524,7 @@ def suite_page(site):
 
 def part_pages(site):
     """Tables that hand-written pages include."""
-    text = inspect.getdoc(sys.modules["lavender.ordering"])
+    text = inspect.getdoc(sys.modules["lavender.problem.ordering"])
     assert all(order in text for order in ORDERS)
     site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
     fields = ", ".join(f"`{name}`" for name in lv.SOLVER_FIELDS)
@@ -555,8 +555,16 @@ def api_page(site):
     for name in sorted(lv.__all__):
         thing = getattr(lv, name)
         if callable(thing):  # no constants, no rooms
-            rooms.setdefault(thing.__module__.split(".")[1], []).append((lv, name))
-    for room in ("io", "suite", "bench", "report", "motion", "measures", "certificates"):
+            rooms.setdefault(".".join(thing.__module__.split(".")[1:3]), []).append((lv, name))
+    for room in (
+        "io",
+        "lab.suite",
+        "lab.bench",
+        "lab.report",
+        "lab.motion",
+        "judge.measures",
+        "judge.certificates",
+    ):
         held = importlib.import_module(f"lavender.{room}")
         own = {n: getattr(held, n) for n in sorted(held.__all__) if n not in suite.FAMILIES}
         rooms[f"lavender.{room}"] = [

@@ -16,8 +16,8 @@ import numpy as np
 from panels import beside, save
 
 import lavender as lv
-from lavender.bench import carry
-from lavender.engine import Simulation
+from lavender.lab.bench import carry
+from lavender.sim.engine import Simulation
 
 SCENE = "stack"
 STEPS = 60

@@ -35,7 +35,7 @@ import numpy as np
 from panels import beside, save
 
 import lavender as lv
-from lavender.measures import natural_map
+from lavender.judge.measures import natural_map
 
 N = 8
 OPEN = 4  # index of the contact that opens

@@ -15,14 +15,14 @@ Measuring  `bench`, `report`, `suite` (built-in problems), `io` (files and other
 Submodules and the engine are imported at their first use.
 """
 
-import lavender._starting  # noqa: I001 - first: Ctrl-C from here on
+import lavender.base.starting  # noqa: I001 - first: Ctrl-C from here on
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import lavender._built
+import lavender.base.built
 from lavender._version import __version__
-from lavender.cones import (
+from lavender.problem.cones import (
     CONTACT,
     CONTACT_BOX,
     CONTACT_ELLIPSE,
@@ -32,7 +32,7 @@ from lavender.cones import (
     ROW,
     Cones,
 )
-from lavender.errors import (
+from lavender.base.errors import (
     CapabilityError,
     InputError,
     InUse,
@@ -41,66 +41,78 @@ from lavender.errors import (
     SolverUnavailable,
     UnknownName,
 )
-from lavender.generalized import Generalized
+from lavender.problem.generalized import Generalized
 from lavender.problem import Problem, QPSolution
-from lavender.redundancy import Redundancy, redundancy
-from lavender.registry import SolverSpec, available, get, known, register
-from lavender.residuals import Residual, residual
-from lavender.rows import Rows
-from lavender.solution import Claim, Solution, Status, Turn
-from lavender.solve import prepare, solve
+from lavender.solvers.registry import SolverSpec, available, get, known, register
+from lavender.judge.residuals import Residual, residual
+from lavender.problem.rows import Rows
+from lavender.judge.solution import Claim, Solution, Status, Turn
+from lavender.solving.solve import prepare, solve
 
 if TYPE_CHECKING:
-    from lavender import bench, engine, io, motion, phenomena, report, scene, suite
-    from lavender.batch import Batch
-    from lavender.check import CrossCheck, cross_check
-    from lavender.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender import io
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
-    from lavender.many import Residuals, Solutions, residual_many, solve_many
-    from lavender.motion import MotionError, Motions, motion_error, motions
-    from lavender.plan import Plan, explain
-    from lavender.proof import Enclosure, prove
-    from lavender.quadratic import solve_qp
-    from lavender.scene import Scene
-    from lavender.suspicions import Suspicion, diagnose
+    from lavender.lab import bench, motion, phenomena, report, suite
+    from lavender.lab.check import CrossCheck, cross_check
+    from lavender.lab.motion import MotionError, Motions, motion_error, motions
+    from lavender.lab.proof import Enclosure, prove
+    from lavender.lab.redundancy import Redundancy, redundancy
+    from lavender.lab.suspicions import Suspicion, diagnose
+    from lavender.problem.batch import Batch
+    from lavender.sim import engine, scene
+    from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
+    from lavender.sim.scene import Scene
+    from lavender.solving.many import Residuals, Solutions, residual_many, solve_many
+    from lavender.solving.plan import Plan, explain
+    from lavender.solving.quadratic import solve_qp
 
-# Public name -> module that holds it; the module itself where both are the same.
+# Public name -> module that holds it, imported at the first use of the name.
 _LATER = {
-    "Batch": "lavender.batch",
-    "CrossCheck": "lavender.check",
+    "Batch": "lavender.problem.batch",
+    "CrossCheck": "lavender.lab.check",
     "Derivative": "lavender.gradient",
-    "MotionError": "lavender.motion",
-    "Motions": "lavender.motion",
-    "Plan": "lavender.plan",
-    "Residuals": "lavender.many",
-    "SOLVER_FIELDS": "lavender.engine",
-    "Scene": "lavender.scene",
-    "Simulation": "lavender.engine",
-    "Snapshot": "lavender.engine",
-    "Solutions": "lavender.many",
-    "Suspicion": "lavender.suspicions",
-    "bench": "lavender.bench",
-    "cross_check": "lavender.check",
-    "Enclosure": "lavender.proof",
+    "Enclosure": "lavender.lab.proof",
+    "MotionError": "lavender.lab.motion",
+    "Motions": "lavender.lab.motion",
+    "Plan": "lavender.solving.plan",
+    "Redundancy": "lavender.lab.redundancy",
+    "Residuals": "lavender.solving.many",
+    "SOLVER_FIELDS": "lavender.sim.engine",
+    "Scene": "lavender.sim.scene",
+    "Simulation": "lavender.sim.engine",
+    "Snapshot": "lavender.sim.engine",
+    "Solutions": "lavender.solving.many",
+    "Suspicion": "lavender.lab.suspicions",
+    "cross_check": "lavender.lab.check",
     "derivative": "lavender.gradient",
     "derivatives": "lavender.gradient",
-    "diagnose": "lavender.suspicions",
-    "engine": "lavender.engine",
-    "explain": "lavender.plan",
-    "io": "lavender.io",
+    "diagnose": "lavender.lab.suspicions",
+    "explain": "lavender.solving.plan",
     "load": "lavender.io",
-    "motion": "lavender.motion",
-    "motion_error": "lavender.motion",
-    "motions": "lavender.motion",
-    "phenomena": "lavender.phenomena",
-    "prove": "lavender.proof",
-    "report": "lavender.report",
-    "scene": "lavender.scene",
-    "residual_many": "lavender.many",
-    "solve_many": "lavender.many",
-    "solve_qp": "lavender.quadratic",
-    "suite": "lavender.suite",
+    "motion_error": "lavender.lab.motion",
+    "motions": "lavender.lab.motion",
+    "prove": "lavender.lab.proof",
+    "redundancy": "lavender.lab.redundancy",
+    "residual_many": "lavender.solving.many",
+    "solve_many": "lavender.solving.many",
+    "solve_qp": "lavender.solving.quadratic",
+}
+
+# Public module -> where it stands.
+_MODULES = {
+    "bench": "lavender.lab.bench",
+    "cones": "lavender.problem.cones",
+    "engine": "lavender.sim.engine",
+    "errors": "lavender.base.errors",
+    "export": "lavender.out",
+    "io": "lavender.io",
+    "motion": "lavender.lab.motion",
+    "phenomena": "lavender.lab.phenomena",
+    "registry": "lavender.solvers.registry",
+    "report": "lavender.lab.report",
+    "scene": "lavender.sim.scene",
+    "suite": "lavender.lab.suite",
 }
 
 __all__ = [
@@ -177,10 +189,12 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name in _MODULES:
+        value = import_module(_MODULES[name])
+    elif name in _LATER:
+        value = getattr(import_module(_LATER[name]), name)
+    else:
         raise AttributeError(f"module 'lavender' has no attribute {name!r}")
-    module = import_module(_LATER[name])
-    value = module if _LATER[name] == f"lavender.{name}" else getattr(module, name)
     globals()[name] = value
     return value
 
@@ -191,4 +205,4 @@ def __dir__() -> list[str]:
 
 for _name in ("auto", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
     get(_name)  # with the package: the first solve may have a time limit
-lavender._starting.end()
+lavender.base.starting.end()

@@ -12,9 +12,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from lavender.cones import Cones
-from lavender.errors import InputError, SolverUnavailable
-from lavender.layer import NAMES, Step, shapes, step
+from lavender.base.errors import InputError, SolverUnavailable
+from lavender.gradient.layer import NAMES, Step, shapes, step
+from lavender.problem.cones import Cones
 
 try:
     import jax

@@ -13,7 +13,7 @@ import numpy as np
 from judge_twin import norm, project_cone
 
 import lavender as lv
-from lavender.cones import ROW
+from lavender.problem.cones import ROW
 
 HAS_WIDE = np.finfo(np.longdouble).eps < 1e-18
 ROUNDS = 6  # of reading the conditions anew

@@ -17,8 +17,8 @@ from kkt_truth import EXACT_BITS, Exact, Wide, curved, matrix_in, shift_in, solu
 from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
-from lavender.motion.bound import difference, witness
-from lavender.motion.operator import make
+from lavender.lab.motion.bound import difference, witness
+from lavender.lab.motion.operator import make
 
 SHAPES = ("disk", "disk", "box", "rolling")
 

@@ -3,8 +3,8 @@
 import numpy as np
 
 import lavender as lv
-from lavender.engine.layout import HEAD, SETTING
-from lavender.engine.stepping import TOL
+from lavender.sim.engine.layout import HEAD, SETTING
+from lavender.sim.engine.stepping import TOL
 from lavender_ext.warm.substep import Substep
 
 __all__ = ["NewtonSteps"]

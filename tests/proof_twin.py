@@ -1,4 +1,4 @@
-"""The conditions of a solution once more, in rational numbers and from the data alone: nothing of `lavender.proof`.
+"""The conditions of a solution once more, in rational numbers and from the data alone: nothing of `lavender.lab.proof`.
 
 Solutions are planted in whole numbers and fractions by powers of two, so that b = A lambda - w is exact in float64;
 what slides goes along vectors of whole length. An answer near a planted one is proven, and the centre of what was
@@ -18,7 +18,7 @@ from fractions import Fraction
 import numpy as np
 
 import lavender as lv
-from lavender import proof
+from lavender.lab import proof
 
 getcontext().prec = 60
 SLACK = Fraction(

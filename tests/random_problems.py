@@ -8,7 +8,18 @@ import numpy as np
 import scipy.sparse as sp
 
 import lavender as lv
-from lavender.scene.parts import rotation
+
+
+def rotation(q):
+    """Body to world, of a unit quaternion w x y z."""
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def unit(rng, n=3):

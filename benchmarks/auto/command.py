@@ -13,12 +13,12 @@ import benchmarks.drawn  # noqa: F401 - makes them families of the suite
 from benchmarks.auto.record import Record, as_line, read, records
 from benchmarks.auto.replay import RULES, fit, regrets, summary
 from benchmarks.output import out_option
-from lavender.bench import seeds as from_seeds
-from lavender.bench.cases import resolve
-from lavender.errors import InputError
+from lavender.base.errors import InputError
 from lavender.io.stored import write_text
+from lavender.judge.residuals import reference
+from lavender.lab.bench import seeds as from_seeds
+from lavender.lab.bench.cases import resolve
 from lavender.problem import OPERATORS, Problem
-from lavender.residuals import reference
 
 __all__ = ["command"]
 

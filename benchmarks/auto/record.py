@@ -20,10 +20,10 @@ import numpy as np
 
 import lavender as lv
 from lavender import registry
-from lavender.bench.running.timing import one_thread
+from lavender.judge.residuals import judged, reference
+from lavender.judge.solution import Status
+from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
-from lavender.residuals import judged, reference
-from lavender.solution import Status
 
 __all__ = ["LEVELS", "SOLVERS", "Record", "as_line", "read", "records"]
 

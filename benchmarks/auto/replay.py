@@ -18,9 +18,9 @@ from scipy import optimize
 
 from benchmarks.auto.record import LEVELS, Record
 from lavender.problem import Problem
-from lavender.registry import SMALL_ROWS
 from lavender.solvers import costs
 from lavender.solvers.auto import MOST, SHARE, Stage, Tree
+from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.small import who
 from lavender.solvers.steps import FIRST
 from lavender_ext.small.checked_sweeps import sweeps_left

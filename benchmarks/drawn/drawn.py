@@ -30,12 +30,12 @@ from benchmarks.drawn.wild import (
     on_floor,
     problem_of,
 )
-from lavender.cones import Cones
-from lavender.errors import UnknownName
+from lavender.base.errors import UnknownName
+from lavender.lab.suite.build import Bodies, Contacts, sideways
+from lavender.lab.suite.case import Draft, family
+from lavender.lab.suite.families import BOX, SPHERE, at_least
 from lavender.problem import Problem
-from lavender.suite.build import Bodies, Contacts, sideways
-from lavender.suite.case import Draft, family
-from lavender.suite.families import BOX, SPHERE, at_least
+from lavender.problem.cones import Cones
 
 __all__ = ["JUDGED", "TUNED", "drawn"]
 

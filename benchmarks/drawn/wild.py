@@ -21,11 +21,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
+from lavender.lab.suite.build import Bodies, Contacts, manifold, sideways, static_loads
+from lavender.lab.suite.case import Draft, family
+from lavender.lab.suite.families import BOX, ROD, SPHERE, at_least, ball_joints
 from lavender.problem import Problem
-from lavender.suite.build import Bodies, Contacts, manifold, sideways, static_loads
-from lavender.suite.case import Draft, family
-from lavender.suite.families import BOX, ROD, SPHERE, at_least, ball_joints
 
 __all__ = ["STRUCTURES", "wild"]
 

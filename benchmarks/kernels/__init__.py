@@ -7,6 +7,5 @@ installed.
 """
 
 from benchmarks.kernels.command import command
-from benchmarks.kernels.problems import lattice_pile
 
-__all__ = ["command", "lattice_pile"]
+__all__ = ["command"]

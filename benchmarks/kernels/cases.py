@@ -12,14 +12,15 @@ import numpy as np
 
 from benchmarks.clock import least, wall
 from benchmarks.kernels import microbenchmarks
-from benchmarks.kernels.problems import bare_contacts, lattice_pile, raw_bytes, tridiagonal
-from lavender._arrays import FloatArray
-from lavender.engine.simulation import Simulation
-from lavender.errors import InputError
+from benchmarks.kernels.problems import bare_contacts, raw_bytes, tridiagonal
+from benchmarks.made import lattice_pile
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.judge.residuals import residual
 from lavender.problem import Problem
-from lavender.residuals import residual
-from lavender.scene.scene import Scene
-from lavender.solve import prepare, solve
+from lavender.sim.engine.simulation import Simulation
+from lavender.sim.scene.scene import Scene
+from lavender.solving.solve import prepare, solve
 from lavender_ext.judge import measure
 
 __all__ = ["CASES", "Job", "Row", "job", "run"]

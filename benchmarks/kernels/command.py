@@ -11,7 +11,7 @@ import click
 from benchmarks.kernels.cases import CASES, Row, run
 from benchmarks.kernels.instructions import COUNTED, instructions
 from benchmarks.output import markdown, out_option, write_json
-from lavender.bench import machine
+from lavender.lab.bench import machine
 
 __all__ = ["command", "table"]
 

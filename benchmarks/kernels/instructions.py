@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.kernels.cases import job
-from lavender.errors import InputError, SolverUnavailable
+from lavender.base.errors import InputError, SolverUnavailable
 
 __all__ = ["COUNTED", "instructions"]
 

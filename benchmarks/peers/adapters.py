@@ -23,18 +23,18 @@ import numpy as np
 import scipy.sparse as sp
 
 from lavender import registry
-from lavender._arrays import FloatArray
-from lavender.cones import CONTACT
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.external.as_qp import FORMS, QP, bound_rows, impulse_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.backends import BACKENDS
 from lavender.external.qp_solver import QPSolver, refusal
 from lavender.external.running import Limits
 from lavender.external.stopwatch import own_time
+from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.residuals import reference
-from lavender.solve import prepare
+from lavender.problem.cones import CONTACT
+from lavender.solving.solve import prepare
 
 __all__ = ["SCIPY", "SCRATCH", "TARGETS", "Contestant", "Result", "check_siconos", "contestants", "ours"]
 

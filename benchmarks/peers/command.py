@@ -18,7 +18,7 @@ from benchmarks.peers.adapters import Result, contestants, ours
 from benchmarks.peers.engines import Step
 from benchmarks.peers.problems import PROBLEMS, problems
 from benchmarks.peers.tables import engines_table, solvers_tables
-from lavender.bench import machine
+from lavender.lab.bench import machine
 
 __all__ = ["command"]
 

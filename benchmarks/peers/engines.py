@@ -19,10 +19,10 @@ import numpy as np
 
 from benchmarks import stand
 from benchmarks.stand import Contestant, Tower
-from lavender.errors import UnknownName
-from lavender.phenomena.engines import engine, lacks
+from lavender.base.errors import UnknownName
+from lavender.lab.phenomena.engines import engine, lacks
 from lavender.problem import Problem
-from lavender.scene import Scene
+from lavender.sim.scene import Scene
 
 __all__ = ["ENGINES", "SCENES", "Step", "export", "measure_scene"]
 

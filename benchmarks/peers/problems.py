@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 from importlib.util import find_spec
 
 from benchmarks.peers import engines
-from lavender.bench.cases import resolve
-from lavender.engine import Simulation
-from lavender.errors import InputError, UnknownName
+from lavender.base.errors import InputError, UnknownName
+from lavender.lab.bench.cases import resolve
 from lavender.problem import Problem
-from lavender.scene import Scene
+from lavender.sim.engine import Simulation
+from lavender.sim.scene import Scene
 
 __all__ = ["PROBLEMS", "problems"]
 

@@ -10,10 +10,10 @@ from time import monotonic
 from typing import Any
 
 from benchmarks.peers.adapters import SCRATCH, TARGETS, Contestant, Result
-from lavender.bench.running.timing import one_thread
 from lavender.external.running import quiet
+from lavender.judge.residuals import residual
+from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
-from lavender.residuals import residual
 
 __all__ = ["race"]
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
-from lavender.report.tables import geometric_mean
-from lavender.report.text import residual, seconds
+from lavender.lab.report.tables import geometric_mean
+from lavender.lab.report.text import residual, seconds
 
 __all__ = ["Comparison", "Mean", "compare", "engines_table", "losses", "means", "over_ours", "solvers_tables"]
 

@@ -3,7 +3,7 @@
 What a command needs is imported when it runs, so that --help is quick.
 """
 
-from lavender import _starting
+from lavender.base import starting as _starting
 
 _starting.begin()  # until `main` takes over
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.measuring import Progress
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
@@ -19,7 +20,6 @@ from lavender.cli.options import (
     was_given,
     worlds_options,
 )
-from lavender.errors import InputError
 from lavender.io.stored import writable
 
 __all__ = ["audit"]

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import click
 
+from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_UNMET, one_thread
-from lavender.errors import InputError, LavenderError
 from lavender.io.stored import writable, write_text
 
 __all__ = ["bench"]
@@ -54,9 +54,9 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
         import mujoco as mj
     except ImportError:
         raise click.UsageError("mujoco cannot be imported: pip install mujoco") from None
-    from lavender.bench.machine import cpu_name, versions
-    from lavender.bench.simulators import Step, WarmStep, measure, measure_warm
-    from lavender.report.simulators import table, warm_table
+    from lavender.lab.bench.machine import cpu_name, versions
+    from lavender.lab.bench.simulators import Step, WarmStep, measure, measure_warm
+    from lavender.lab.report.simulators import table, warm_table
 
     found: list[Step] = []
     consecutive: list[WarmStep] = []

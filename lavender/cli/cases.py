@@ -22,8 +22,8 @@ def cases(pattern: str, size: bool) -> None:
     PATTERN selects families whose name or description contains it. A case is a family with parameters:
     "pyramid(k=20)".
     """
-    from lavender.errors import UnknownName
-    from lavender.suite.case import FAMILIES, spell
+    from lavender.base.errors import UnknownName
+    from lavender.lab.suite.case import FAMILIES, spell
 
     found = {
         name: f

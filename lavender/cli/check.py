@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import (
     EXIT_BAD_INPUT,
     EXIT_UNMET,
@@ -17,7 +18,6 @@ from lavender.cli.options import (
     threshold_option,
     was_given,
 )
-from lavender.errors import InputError, LavenderError
 
 __all__ = ["check"]
 
@@ -53,10 +53,10 @@ def check(
     cannot be read; or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
-    from lavender import bench
-    from lavender._arrays import number
-    from lavender.check import cross_check
-    from lavender.residuals import AT_FLOOR, CLOSE
+    from lavender.base.arrays import number
+    from lavender.judge.residuals import AT_FLOOR, CLOSE
+    from lavender.lab import bench
+    from lavender.lab.check import cross_check
 
     one_thread()
     out = console()

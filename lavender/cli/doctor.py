@@ -7,9 +7,9 @@ from dataclasses import asdict
 
 import click
 
-from lavender.bench import doctor as bench_doctor
+from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET
-from lavender.errors import InputError, LavenderError
+from lavender.lab.bench import doctor as bench_doctor
 
 __all__ = ["doctor"]
 
@@ -48,8 +48,8 @@ def doctor(files: tuple[str, ...], as_json: bool) -> None:
 
 
 def _suspect(files: tuple[str, ...], as_json: bool) -> None:
-    from lavender import bench
-    from lavender.suspicions import diagnose
+    from lavender.lab import bench
+    from lavender.lab.suspicions import diagnose
 
     found, missing, unread = {}, False, False
     for item in bench.resolve(files):

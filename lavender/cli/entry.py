@@ -10,10 +10,10 @@ from collections.abc import Sequence
 
 import click
 
-from lavender import _starting
 from lavender._version import __version__
+from lavender.base import starting as _starting
+from lavender.base.errors import LavenderError, UnknownName
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, unheard
-from lavender.errors import LavenderError, UnknownName
 
 __all__ = ["cli", "main"]
 
@@ -22,7 +22,7 @@ COMMANDS = {
     name: f"lavender.cli.{name}"
     for name in ("audit", "bench", "cases", "check", "doctor", "explain", "export", "phenomena", "prove", "record",
                  "reference", "report", "run", "solve", "solvers", "tune")
-} | dict.fromkeys(("view", "web"), "lavender.web.command")  # fmt: skip
+} | dict.fromkeys(("view", "web"), "lavender.sim.web.command")  # fmt: skip
 
 
 class Commands(click.Group):

@@ -6,8 +6,8 @@ import json
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET
-from lavender.errors import InputError
 
 __all__ = ["explain"]
 
@@ -23,8 +23,8 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
 
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
-    from lavender.bench.cases import resolve
-    from lavender.plan import explain as plan_of
+    from lavender.lab.bench.cases import resolve
+    from lavender.solving.plan import explain as plan_of
 
     unread = False
     for item in resolve(list(files)):

@@ -35,8 +35,8 @@ def export(
     replace: bool,
 ) -> None:
     """Write the kernels for use without Python: a C library with one header, or an npm package."""
-    from lavender.export import library
-    from lavender.export import vectors as chosen
+    from lavender.out import library
+    from lavender.out import vectors as chosen
 
     if records is None:
         refuse_unused(context, ["solver", "vectors"], "without --for")

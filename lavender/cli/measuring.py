@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.options import bytes_of, console, one_thread, was_given
-from lavender.errors import InputError
 
 if TYPE_CHECKING:
-    from lavender.bench import Event, Item, Plan, Records
+    from lavender.lab.bench import Event, Item, Plan, Records
 
     P = TypeVar("P", bound=Plan)
 
@@ -50,7 +50,7 @@ def check_named(items: Sequence[Item]) -> None:
     InputError
         One of them does not load: nothing is measured, and no page touched.
     """
-    from lavender.bench.running.runner import not_loaded
+    from lavender.lab.bench.running.runner import not_loaded
 
     for item in items:
         if item.named:
@@ -88,8 +88,8 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
     InputError
         A file that was named and does not load; a folder that cannot be written or that another process writes.
     """
-    from lavender import bench
-    from lavender.report.contenders import time_lines
+    from lavender.lab import bench
+    from lavender.lab.report.contenders import time_lines
 
     one_thread()
     asked = context.params
@@ -129,7 +129,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
 
 def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> Measured:
     """Run a campaign with a progress bar; `asked` are the options. Raises as `measure`."""
-    from lavender import bench
+    from lavender.lab import bench
 
     one_thread()
     check_named(bench.resolve(words))

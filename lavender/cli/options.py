@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lavender.errors import InputError
+from lavender.base.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -64,13 +64,14 @@ def _is_number(word: str) -> bool:
 
 
 def _is_order(word: str) -> bool:
-    from lavender.ordering import ORDERS
+    from lavender.problem.ordering import ORDERS
 
     return word.partition(":")[0] in ORDERS
 
 
 def _is_solver(word: str) -> bool:
-    from lavender import registry, suite
+    from lavender.lab import suite
+    from lavender.solvers import registry
 
     if Path(word).exists():
         return False
@@ -262,8 +263,8 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
     ------
     InputError, UnknownName
     """
-    from lavender import registry
-    from lavender.bench.running.runner import is_foreign
+    from lavender.lab.bench.running.runner import is_foreign
+    from lavender.solvers import registry
 
     if not solvers:
         return

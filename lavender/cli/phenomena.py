@@ -8,12 +8,12 @@ from pathlib import Path
 
 import click
 
-from lavender.bench.machine import cpu_name, versions
 from lavender.cli.options import parameters_of
 from lavender.io.stored import writable, write_text
-from lavender.phenomena import WAYS, Record, chosen, run
-from lavender.phenomena import table as tables
-from lavender.phenomena.engines import versions_of_node
+from lavender.lab.bench.machine import cpu_name, versions
+from lavender.lab.phenomena import WAYS, Record, chosen, run
+from lavender.lab.phenomena import table as tables
+from lavender.lab.phenomena.engines import versions_of_node
 
 __all__ = ["phenomena"]
 

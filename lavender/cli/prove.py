@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
+from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread
-from lavender.errors import InputError, LavenderError
 
 __all__ = ["prove"]
 
@@ -24,11 +24,11 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     Exit code 1: an answer without a proof, or a file in a folder that cannot be read. Exit code 2: a named file cannot
     be read.
     """
-    from lavender.bench.cases import resolve
-    from lavender.proof import prove as enclose
-    from lavender.proof import require
-    from lavender.registry import get
-    from lavender.solve import solve
+    from lavender.lab.bench.cases import resolve
+    from lavender.lab.proof import prove as enclose
+    from lavender.lab.proof import require
+    from lavender.solvers.registry import get
+    from lavender.solving.solve import solve
 
     one_thread()
     get(solver)  # refused before anything is read, as is a missing package

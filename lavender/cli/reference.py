@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
+from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
-from lavender.errors import InputError, LavenderError
 
 __all__ = ["reference"]
 
@@ -22,7 +22,7 @@ def reference(files: tuple[str, ...]) -> None:
 
     Exits with 1 when nothing solves a problem, or a file met in a folder cannot be read.
     """
-    from lavender import bench, motion
+    from lavender.lab import bench, motion
 
     one_thread()
     out = console()

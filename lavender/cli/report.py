@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from lavender.bench.record import file_name
+from lavender.base.errors import InputError
 from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
@@ -28,8 +28,8 @@ from lavender.cli.options import (
     refuse_unused_recording,
     was_given,
 )
-from lavender.errors import InputError
 from lavender.io.stored import writable, write_text
+from lavender.lab.bench.record import file_name
 
 __all__ = ["report"]
 
@@ -99,12 +99,12 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     Exit code 1: a file in a folder cannot be read, or a step could not be recorded. Exit code 2: a named file cannot
     be read, or another report is writing to the folder.
     """
-    from lavender import bench
-    from lavender.report.engine import contestants
-    from lavender.report.findings import Report
-    from lavender.report.terminal import print_report
-    from lavender.report.text import count
-    from lavender.report.write import write
+    from lavender.lab import bench
+    from lavender.lab.report.engine import contestants
+    from lavender.lab.report.findings import Report
+    from lavender.lab.report.terminal import print_report
+    from lavender.lab.report.text import count
+    from lavender.lab.report.write import write
 
     for limit in asked["time_budgets"]:
         if not (math.isfinite(limit) and limit > 0.0):
@@ -133,7 +133,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     )  # before a pipe that nobody reads ends the command
     paper = None
     if asked["paper"]:
-        from lavender.report.paper import write_paper
+        from lavender.lab.report.paper import write_paper
 
         paper = write_paper(found, out / "paper")
     print_report(found, console(), whole=asked["tables"])

@@ -9,8 +9,8 @@ from typing import Any
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.options import going_on, parameters_of, refuse_unused
-from lavender.errors import InputError
 
 __all__ = ["run"]
 
@@ -87,7 +87,7 @@ def run(
     SCENE is stack, pyramid, card_house, pile, chain, bridge, heavy_on_light, table, ramp, spinner,
     newtons_cradle or four_bar.
     """
-    from lavender.engine import run_scene
+    from lavender.sim.engine import run_scene
 
     record = asked["record"]
     if record is None:

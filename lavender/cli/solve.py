@@ -7,8 +7,8 @@ from typing import Any
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
-from lavender.errors import InputError
 from lavender.io.stored import writable, write_atomically
 
 __all__ = ["solve"]
@@ -53,11 +53,12 @@ def solve(
     Exit code 0: the judge accepts the answer (within tol, or at the floor of float64; with --tol 0 always).
     1: it does not. 3: the problem is infeasible, with a certificate that the judge confirms.
     """
-    from lavender import bench, registry
-    from lavender._later import load
-    from lavender.report.text import residual, seconds
-    from lavender.residuals import WRONG
-    from lavender.solve import solve as solve_problem
+    from lavender.base.later import load
+    from lavender.judge.residuals import WRONG
+    from lavender.lab import bench
+    from lavender.lab.report.text import residual, seconds
+    from lavender.solvers import registry
+    from lavender.solving.solve import solve as solve_problem
 
     one_thread()
     if output is not None:

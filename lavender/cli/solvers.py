@@ -19,8 +19,9 @@ def solvers(problem: str | None) -> None:
     """List the solvers: what each can do, and what to install for those that are missing."""
     from rich.table import Table
 
-    from lavender import bench, registry
+    from lavender.lab import bench
     from lavender.problem import LAWS, OPERATORS
+    from lavender.solvers import registry
 
     given = bench.resolve([problem])[0].problem if problem else None
     table = Table(box=None, pad_edge=False, header_style="bold")

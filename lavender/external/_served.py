@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.apart import served as apart
+from lavender.base.apart import served as apart
 from lavender.external.apart import ARRAYS, WORDS
 from lavender.external.running import Answer, quiet
 

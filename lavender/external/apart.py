@@ -2,7 +2,7 @@
 
 A process that has not answered when the time is up is ended, and the next call finds another. Backends that take a
 limit are told it and have as long again to answer with what they have; some look at the clock seconds apart. Answers
-are data (`lavender.apart`): nothing that a backend sends is unpickled here.
+are data (`lavender.base.apart`): nothing that a backend sends is unpickled here.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.apart.process import Ended, Process
-from lavender.errors import InputError
+from lavender.base.apart.process import Ended, Process
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.external.as_qp import QP
 from lavender.external.backend import Backend
 from lavender.external.running import Answer, Failed, Limits
-from lavender.solution import Status
+from lavender.judge.solution import Status
 
 __all__ = ["ARRAYS", "Elsewhere", "call", "ready"]
 

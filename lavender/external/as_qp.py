@@ -36,12 +36,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.cones import ROW
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError, InputError
+from lavender.base.later import sparse as sp
+from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.residuals import reference
+from lavender.problem.cones import ROW
 
 __all__ = ["FORMS", "QP", "bound_rows", "impulse_form", "pick_form", "target", "two_sided", "velocity_form"]
 

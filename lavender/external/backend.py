@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
+from lavender.base.arrays import FloatArray
+from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows
 from lavender.external.running import Answer, Call, Limits, proof, quiet
-from lavender.solution import Status
+from lavender.judge.solution import Status
 
 __all__ = ["Backend"]
 

@@ -19,7 +19,7 @@ from lavender.external.backend import Backend
 from lavender.external.native import clarabel, daqp, highs, osqp, qpalm
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
 from lavender.external.running import Limits, at_least
-from lavender.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec
 
 __all__ = ["BACKENDS", "SPECS"]
 

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, flag
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, flag
+from lavender.base.errors import CapabilityError, InputError
 from lavender.external import apart
 from lavender.external.as_qp import QP, impulse_form, pick_form, velocity_form
 from lavender.external.backend import Backend
 from lavender.external.running import ask
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solution import Claim, Status
 
 __all__ = ["OPTIONS", "QPSolver", "refusal"]
 

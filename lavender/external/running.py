@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
-from lavender.deadline import Deadline
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.base.errors import InputError
 from lavender.external.as_qp import QP, target
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import at_floor, quick
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.residuals import at_floor, quick
-from lavender.solution import Claim, Status
 
 __all__ = [
     "Answer",

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array
-from lavender._derived import cached_property
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray, as_array
+from lavender.base.errors import InputError
 from lavender.gradient.derivative import Derivative, derivative
 from lavender.gradient.result import Gradient
 from lavender.problem import Problem
+from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import adjoint_all
 
 __all__ = ["Derivatives", "derivatives"]

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.cones import CONTACT_BOX, CONTACT_ELLIPSE
-from lavender.errors import CapabilityError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
+from lavender.base.later import sparse as sp
 from lavender.gradient.result import BODIES, Gradient
 from lavender.problem import Problem
+from lavender.problem.cones import CONTACT_BOX, CONTACT_ELLIPSE
 
 __all__ = ["Bodies", "Parts"]
 

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray, as_array, as_csr
-from lavender._derived import cached_property
-from lavender._later import issparse
-from lavender._later import sparse as sp
-from lavender.cones import ROW
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, as_array, as_csr
+from lavender.base.errors import CapabilityError, InputError
+from lavender.base.later import above, issparse
+from lavender.base.later import sparse as sp
 from lavender.gradient.chains import Bodies, Parts
 from lavender.gradient.result import BODIES, HIGH, INPUTS, LOW, Gradient
 from lavender.gradient.system import System
+from lavender.judge.residuals import at_floor, residual
+from lavender.judge.states import States, linear_of
 from lavender.problem import Problem, check_problem
-from lavender.residuals import at_floor, residual
-from lavender.states import States, linear_of
+from lavender.problem.cones import ROW
+from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
 from lavender_ext.derivative.linear import Linear, wrench
-
-if TYPE_CHECKING:
-    from lavender.motion import Motions
 
 __all__ = ["Derivative", "Tangent", "Unique", "derivative"]
 
@@ -484,14 +481,12 @@ class Derivative:
         return not self.switching and bool(self.unique.target.all())
 
     @property
-    def motions(self) -> Motions:
-        """The motions that solve this problem, as `lavender.motions` finds them when first asked.
+    def motions(self) -> Any:
+        """The `Motions` that solve this problem, as `lavender.motions` finds them when first asked.
 
         Under Coulomb's law there may be several: a gradient is then of this one, whose choice it does not know.
         """
-        from lavender.motion import motions_of
-
-        return motions_of(self.problem.disk)
+        return above("lavender.lab.motion").motions_of(self.problem.disk)
 
     def __str__(self) -> str:
         words = [repr(self.states)]

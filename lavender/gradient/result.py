@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._derived import cached_property
-from lavender._later import issparse
-from lavender._later import sparse as sp
-from lavender.errors import CapabilityError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
+from lavender.base.later import issparse
+from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
+from lavender.problem.derived import cached_property
 from lavender_ext.derivative.linear import CASES
 
 __all__ = ["BODIES", "HIGH", "INPUTS", "LOW", "Gradient"]

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import lapack
-from lavender.errors import CapabilityError
-from lavender.lu import sparse_lu
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
+from lavender.base.later import lapack
+from lavender.base.lu import sparse_lu
 
 __all__ = ["System"]
 

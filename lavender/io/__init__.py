@@ -17,8 +17,8 @@ import os
 from collections.abc import Collection
 from typing import Any
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 from lavender.io import drake, efc, fclib, mujoco, npz
 from lavender.io.drake import from_drake
 from lavender.io.efc import from_efc, from_mujoco_many

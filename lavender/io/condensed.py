@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 from lavender.io.stored import Budget
-from lavender.lu import sparse_lu
 
 __all__ = ["ENTRY", "condensed", "most_entries"]
 

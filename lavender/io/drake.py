@@ -24,11 +24,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, number
-from lavender.cones import Cones
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, number
+from lavender.base.errors import CapabilityError, InputError
 from lavender.io.pinocchio import closing_speed, told
 from lavender.problem import Problem
+from lavender.problem.cones import Cones
 
 __all__ = ["from_drake", "impulse"]
 

@@ -19,11 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, number, precision_of, whole_number
-from lavender.batch import Batch, check_errors
-from lavender.cones import CONTACT, ROUND, ROW, Cones
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, as_array, number, precision_of, whole_number
+from lavender.base.errors import CapabilityError, InputError
 from lavender.io import mujoco as single
+from lavender.problem.batch import Batch, check_errors
+from lavender.problem.cones import CONTACT, ROUND, ROW, Cones
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]

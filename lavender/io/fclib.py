@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array
-from lavender._later import sparse as sp
-from lavender.cones import CONTACT_ROLLING, ROW, Cones
-from lavender.errors import CapabilityError, InputError
-from lavender.generalized import Generalized
+from lavender.base.arrays import FloatArray, as_array
+from lavender.base.errors import CapabilityError, InputError
+from lavender.base.later import sparse as sp
 from lavender.io.condensed import ENTRY, condensed
 from lavender.io.npz import compressed
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_bytes
 from lavender.problem import Problem
+from lavender.problem.cones import CONTACT_ROLLING, ROW, Cones
+from lavender.problem.generalized import Generalized
 
 __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
 

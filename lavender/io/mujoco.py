@@ -51,12 +51,12 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, as_array, read_only
-from lavender._later import sparse as sp
-from lavender.cones import Cones
-from lavender.errors import CapabilityError, InputError
-from lavender.generalized import Generalized
+from lavender.base.arrays import FloatArray, IntArray, as_array, read_only
+from lavender.base.errors import CapabilityError, InputError
+from lavender.base.later import sparse as sp
 from lavender.problem import Names, Problem
+from lavender.problem.cones import Cones
+from lavender.problem.generalized import Generalized
 from lavender_ext.core.generalized import lower_of_dense
 from lavender_ext.generalized import export
 

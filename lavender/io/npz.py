@@ -22,15 +22,15 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from lavender._arrays import FloatArray, as_array
-from lavender._later import issparse
-from lavender._later import sparse as sp
-from lavender.cones import CONTACT, ROW, Cones
-from lavender.errors import InputError
-from lavender.generalized import Generalized
+from lavender.base.arrays import FloatArray, as_array
+from lavender.base.errors import InputError
+from lavender.base.later import issparse
+from lavender.base.later import sparse as sp
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.rows import Rows
+from lavender.problem.cones import CONTACT, ROW, Cones
+from lavender.problem.generalized import Generalized
+from lavender.problem.rows import Rows
 
 __all__ = ["VERSION", "Archive", "read", "write"]
 

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import as_array, number
-from lavender.cones import Cones
-from lavender.errors import CapabilityError, InputError, LavenderError
+from lavender.base.arrays import as_array, number
+from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
+from lavender.problem.cones import Cones
 
 __all__ = ["from_pinocchio"]
 

@@ -14,13 +14,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender._arrays import FloatArray, as_array, number, whole_number
-from lavender.errors import InputError, LavenderError
+from lavender.base.arrays import FloatArray, as_array, number, whole_number
+from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
 from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, write_text
+from lavender.judge.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
-from lavender.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
 
 __all__ = ["Recording", "record", "record_file"]
 

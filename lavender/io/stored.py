@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, flag, whole_number
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.errors import InputError
 from lavender.problem import Problem
 
 __all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]

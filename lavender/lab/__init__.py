@@ -1,1 +1,1 @@
-"""Measuring: engines audited over many worlds, and their settings chosen."""
+"""Problems with a reason, measuring and reporting, and what examines a problem or an answer."""

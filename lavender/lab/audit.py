@@ -21,24 +21,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender._arrays import FloatArray, number
-from lavender.batch import Batch
-from lavender.bench.running.campaign import check_workers, connected, hand_out
-from lavender.bench.running.runner import Event
-from lavender.errors import InputError, UnknownName
+from lavender.base.arrays import FloatArray, number
+from lavender.base.errors import InputError, UnknownName
 from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.stored import folder_for_steps, write_arrays
+from lavender.judge.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
+from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
+from lavender.lab.bench.running.runner import Event
+from lavender.lab.report.curves import Curve, Figure
+from lavender.lab.report.sheet import Part as Section
+from lavender.lab.report.sheet import Sheet
+from lavender.lab.report.table import Cell, Table
+from lavender.lab.report.text import count, percent, size
 from lavender.lab.worlds import ENGINES, Runs, fields_of, frames, states_of
-from lavender.many import residual_many
 from lavender.problem import PRECISIONS, Problem
-from lavender.report.curves import Curve, Figure
-from lavender.report.sheet import Part as Section
-from lavender.report.sheet import Sheet
-from lavender.report.table import Cell, Table
-from lavender.report.text import count, percent, size
-from lavender.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
+from lavender.problem.batch import Batch
+from lavender.solving.many import residual_many
 
 __all__ = ["Audit", "Worst", "audit"]
 

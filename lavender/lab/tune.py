@@ -27,19 +27,19 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, number, whole_number
-from lavender.bench.running.runner import Event
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
+from lavender.judge.residuals import ENOUGH
 from lavender.lab.audit import AT_ONCE
+from lavender.lab.bench.running.runner import Event
+from lavender.lab.report.curves import Curve, Figure
+from lavender.lab.report.sheet import Part, Sheet
+from lavender.lab.report.table import Table
+from lavender.lab.report.text import seconds, size, times
 from lavender.lab.worlds import Runs, flew_apart, states_of
-from lavender.many import residual_many
-from lavender.report.curves import Curve, Figure
-from lavender.report.sheet import Part, Sheet
-from lavender.report.table import Table
-from lavender.report.text import seconds, size, times
-from lavender.residuals import ENOUGH
+from lavender.solving.many import residual_many
 
 __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
 

@@ -17,11 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, number, whole_number
-from lavender.batch import Batch
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, IntArray, number, whole_number
+from lavender.base.errors import CapabilityError, InputError
 from lavender.io.efc import from_efc
 from lavender.io.recording import Control, control_of, drive_of, model_of
+from lavender.problem.batch import Batch
 
 __all__ = ["ENGINES", "Frame", "Runs", "fields_of", "frames", "states_of"]
 

@@ -2,8 +2,8 @@
 
     A = J M^-1 J^T + diag(compliance)  [1/kg],   b = target - J v*  [m/s],   w = A lambda - b  [m/s]
 
-`Problem` holds rows (J and M^-1 of bodies, `lavender/rows.py`), J and M in generalised coordinates
-(`lavender/generalized.py`) or a matrix, one of them, and derives the rest on first use.
+`Problem` holds rows (J and M^-1 of bodies, `lavender/problem/rows.py`), J and M in generalised coordinates
+(`lavender/problem/generalized.py`) or a matrix, one of them, and derives the rest on first use.
 
 Files, each over the one before: `data.py` (fields and their checks), `operators.py` (A, J and the metric),
 `quadratic.py` (quadratic programs), `builders.py` (ways to make one), `problem.py` (`Problem` and its other forms).

@@ -8,15 +8,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
-from lavender.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, Cones, check_shape
-from lavender.errors import InputError
-from lavender.generalized import Generalized
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
+from lavender.base.errors import InputError
+from lavender.problem.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, Cones, check_shape
 from lavender.problem.data import checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
+from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
 from lavender.problem.quadratic import quadratic, unpacked
-from lavender.rows import Rows
+from lavender.problem.rows import Rows
 from lavender_ext.core.problem import rows_velocity
 
 P = TypeVar("P", bound="Builders")

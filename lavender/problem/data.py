@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import (
+from lavender.base.arrays import (
     ArrayLike,
     FloatArray,
     as_array,
@@ -20,12 +20,12 @@ from lavender._arrays import (
     whole_number,
     words_for,
 )
-from lavender._derived import Derived, cached_property
-from lavender._later import issparse
-from lavender.cones import ROUND, ROW, Cones
-from lavender.errors import InputError
-from lavender.generalized import Generalized
-from lavender.rows import Rows
+from lavender.base.errors import InputError
+from lavender.base.later import issparse
+from lavender.problem.cones import ROUND, ROW, Cones
+from lavender.problem.derived import Derived, cached_property
+from lavender.problem.generalized import Generalized
+from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import general_data

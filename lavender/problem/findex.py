@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray, as_array
-from lavender.cones import CONTACT, CONTACT_BOX, ROW, Cones
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray, IntArray, as_array
+from lavender.base.errors import InputError
+from lavender.problem.cones import CONTACT, CONTACT_BOX, ROW, Cones
 
 __all__ = ["arrays_of", "blocks_of", "order_of"]
 

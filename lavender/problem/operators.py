@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, IntArray, read_only
-from lavender._derived import cached_property, once
-from lavender._later import issparse
-from lavender._later import sparse as sp
-from lavender.errors import CapabilityError, TooLarge
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, read_only
+from lavender.base.errors import CapabilityError, TooLarge
+from lavender.base.later import issparse
+from lavender.base.later import sparse as sp
 from lavender.problem.data import ProblemData
+from lavender.problem.derived import cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER

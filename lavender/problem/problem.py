@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import ArrayLike, FloatArray, as_array, check_not_negative
-from lavender._derived import once
-from lavender._later import above
-from lavender._later import sparse as sp
-from lavender.cones import ROW, Cones
-from lavender.errors import InputError
-from lavender.generalized import Generalized
+from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_not_negative
+from lavender.base.errors import InputError
+from lavender.base.later import above
+from lavender.base.later import sparse as sp
 from lavender.problem.builders import Builders
+from lavender.problem.cones import ROW, Cones
+from lavender.problem.derived import once
+from lavender.problem.generalized import Generalized
 
 
 @dataclass(frozen=True, eq=False)

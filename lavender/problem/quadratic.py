@@ -25,13 +25,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender._arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
-from lavender._derived import cached_property
-from lavender._later import issparse
-from lavender._later import sparse as sp
-from lavender.cones import Cones
-from lavender.errors import InputError
-from lavender.generalized import Compressed, Generalized, compressed, lower_of
+from lavender.base.arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
+from lavender.base.errors import InputError
+from lavender.base.later import issparse
+from lavender.base.later import sparse as sp
+from lavender.problem.cones import Cones
+from lavender.problem.derived import cached_property
+from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.judge.measure import all_finite
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from lavender.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec
 
 __all__ = ["SPECS", "spec_of"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError, UnknownName
-from lavender.ordering import Order
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError, UnknownName
+from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.solution import Claim
+from lavender.problem.ordering import Order
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated

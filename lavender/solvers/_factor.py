@@ -18,10 +18,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender._later import lapack, load
-from lavender._later import sparse as sp
-from lavender.lu import sparse_lu
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.later import lapack, load
+from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored

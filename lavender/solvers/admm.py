@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import load
-from lavender._later import sparse as sp
-from lavender.deadline import Deadline, Stopwatch
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline, Stopwatch
+from lavender.base.errors import InputError
+from lavender.base.later import load
+from lavender.base.later import sparse as sp
+from lavender.judge.residuals import reference
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.residuals import reference
-from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import loading
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm

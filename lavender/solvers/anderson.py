@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender._arrays import whole_number
-from lavender.registry import SolverSpec
+from lavender.base.arrays import whole_number
 from lavender.solvers._accelerated import CONVEX_OPTION, LARGEST_MEMORY, SWEEP_OPTION, Accelerated
+from lavender.solvers.registry import SolverSpec
 
 
 @dataclass(frozen=True)
 class Anderson(Accelerated):
-    """Anderson-accelerated sweeps; `order`, `ground`, `seed` as in `lavender.ordering`."""
+    """Anderson-accelerated sweeps; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     memory: int = 5
 

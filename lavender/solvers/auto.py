@@ -29,16 +29,16 @@ from math import inf
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._derived import cached_property
-from lavender.deadline import NEVER, Deadline
-from lavender.errors import BREAKDOWN, last_words
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import NEVER, Deadline
+from lavender.base.errors import BREAKDOWN, last_words
+from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SMALL_ROWS, SolverSpec, get
-from lavender.solution import Claim, Status
+from lavender.problem.derived import cached_property
 from lavender.solvers import costs
 from lavender.solvers.certify import certify
 from lavender.solvers.newton import ROWS, NewtonState
+from lavender.solvers.registry import SMALL_ROWS, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog

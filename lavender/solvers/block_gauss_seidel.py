@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from lavender._arrays import FloatArray
-from lavender.ordering import Order
+from lavender.base.arrays import FloatArray
+from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.solution import Claim
+from lavender.problem.ordering import Order
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.local import gauss_seidel
@@ -26,7 +26,7 @@ from lavender_ext.sweep import serial
 
 @dataclass(frozen=True)
 class BlockGaussSeidel(Sweeping):
-    """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+    """Block Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     def _forming(self, problem: Problem) -> float:
         return forming(problem) if problem.rows is None and not reads_whitened(problem) else 0.0

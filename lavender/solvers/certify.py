@@ -19,16 +19,16 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.certificates import Proof, fighting, prove
-from lavender.deadline import Deadline
-from lavender.ordering import blocks_of_each
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.base.later import sparse as sp
+from lavender.judge.certificates import Proof, fighting, prove
+from lavender.judge.residuals import residual
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.registry import get
-from lavender.residuals import residual
-from lavender.solution import Claim, Status
+from lavender.problem.ordering import blocks_of_each
 from lavender.solvers.islands import restrict, rows_of
+from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 

@@ -26,15 +26,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
-from lavender.deadline import Deadline
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, remember
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.residuals import FLOOR_MOST, at_floor, judged, remember
-from lavender.solution import Claim, Status
 from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import factored, over_rows
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure

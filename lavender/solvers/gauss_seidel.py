@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from lavender.registry import SolverSpec
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sor import SOR
 
 
 @dataclass(frozen=True)
 class GaussSeidel(SOR):
-    """Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`."""
+    """Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     omega: float = field(default=1.0, init=False)
 

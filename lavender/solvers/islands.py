@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender.cones import Cones
+from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
+from lavender.problem.cones import Cones
 from lavender_ext.factor import graph
 
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender._arrays import FloatArray, number
-from lavender.ordering import block_order
+from lavender.base.arrays import FloatArray, number
+from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.solution import Claim
+from lavender.problem.ordering import block_order
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import summed
 from lavender.solvers.sweeping import SweepState, run_kernel
 from lavender_ext.sweep import serial

@@ -1,6 +1,6 @@
 """A problem with rows copied in sweep order, so that a sweep reads memory from front to back.
 
-Blocks are in the order of the sweep, and bodies are numbered by `lavender.ordering.body_ranks`. A block reads the same
+Blocks are in the order of the sweep, and bodies are numbered by `ordering.body_ranks`. A block reads the same
 values, so the impulses have the same bits; only sums over all rows have another order.
 """
 
@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender.ordering import Order, body_ranks
+from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import FRICTION, Problem
+from lavender.problem.ordering import Order, body_ranks
 from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
 

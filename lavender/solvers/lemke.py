@@ -16,15 +16,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
-from lavender.deadline import CHUNK_TIME, Deadline
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import CHUNK_TIME, Deadline
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import at_floor, remember
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.residuals import at_floor, remember
-from lavender.solution import Claim, Status
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import over_rows
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY

@@ -28,17 +28,17 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.certificates import check_certificate
-from lavender.deadline import Deadline, Stopwatch
-from lavender.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline, Stopwatch
+from lavender.base.errors import CapabilityError, InputError
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import at_floor, quick
+from lavender.judge.solution import Claim, Status, counted
 from lavender.problem import OPERATORS, Problem
-from lavender.registry import SolverSpec
-from lavender.residuals import at_floor, quick
-from lavender.solution import Claim, Status, counted
 from lavender.solvers.costs import STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start

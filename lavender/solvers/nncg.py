@@ -17,16 +17,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender.errors import UnknownName
-from lavender.registry import SolverSpec
+from lavender.base.errors import UnknownName
 from lavender.solvers._accelerated import CONVEX_OPTION, SWEEP_OPTION, Accelerated
+from lavender.solvers.registry import SolverSpec
 
 RESTARTS = ("growth", "against")
 
 
 @dataclass(frozen=True)
 class NNCG(Accelerated):
-    """Nonsmooth nonlinear conjugate gradients; `order`, `ground`, `seed` as in `lavender.ordering`."""
+    """Nonsmooth nonlinear conjugate gradients; `order`, `ground`, `seed` as in `lavender.problem.ordering`."""
 
     restart: str = "growth"
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.ordering import Order
+from lavender.base.arrays import FloatArray
+from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.solution import Claim
+from lavender.problem.ordering import Order
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import SweepState, Threaded, plan_of, reads_whitened, run_kernel, run_threads
 from lavender_ext.sweep import serial
@@ -30,7 +30,7 @@ _NONE = np.empty(0, np.int32)
 
 @dataclass(frozen=True)
 class PGS(Threaded):
-    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`; `threads` with "colored"."""
+    """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`; `threads` with "colored"."""
 
     def run(
         self,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender._later import lapack, load
-from lavender.deadline import Deadline, Stopwatch
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import Deadline, Stopwatch
+from lavender.base.later import lapack, load
+from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.residuals import reference
 from lavender.solvers._factor import (
     SMALL_SIZE,
     TINY,

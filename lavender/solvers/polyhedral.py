@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.certificates import check_certificate
-from lavender.cones import ROW, project
-from lavender.deadline import Deadline
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
+from lavender.base.later import sparse as sp
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import at_floor, quick
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.residuals import at_floor, quick
-from lavender.solution import Claim, Status
+from lavender.problem.cones import ROW, project
 
 # Of (1) and (2): times that they have the problem's rows, and s of making them for each of those.
 FEW, ROW_TIME = 3.0, 2e-5

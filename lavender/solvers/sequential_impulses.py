@@ -14,13 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.ordering import Order
+from lavender.base.arrays import FloatArray
+from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.registry import SolverSpec
-from lavender.solution import Claim
+from lavender.problem.ordering import Order
 from lavender.solvers.layout import Layout, lay_out
 from lavender.solvers.layout import pays as layout_pays
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import SweepState, Threaded, plan_of, run_kernel, run_threads
 from lavender_ext.sweep import serial
 
@@ -58,7 +58,7 @@ class ImpulseState(SweepState):
 
 @dataclass(frozen=True)
 class SequentialImpulses(Threaded):
-    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.ordering`;
+    """Matrix-free projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`;
     `threads` with "colored".
     """
 

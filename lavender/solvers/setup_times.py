@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import sys
 
-from lavender import residuals
+from lavender.judge import residuals
 from lavender.problem import Problem
-from lavender.registry import SMALL_ROWS
+from lavender.solvers.registry import SMALL_ROWS
 
 __all__ = [
     "entries_of",

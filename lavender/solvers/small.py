@@ -16,18 +16,23 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
+from lavender.judge.residuals import judged, reference
+from lavender.judge.solution import Claim, Status, Turn, counted
 from lavender.problem import Problem
-from lavender.registry import SMALL_ROWS
-from lavender.residuals import judged, reference
-from lavender.solution import Claim, Status, Turn, counted
 from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
+from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.setup_times import forming
 from lavender_ext.small.call import Bounded, Friction, Small
 from lavender_ext.small.many import Limits, solve_first
 
+#: Why nothing ran, by the status of a start.
+NOTHING = {
+    Status.CONVERGED: "the start is a solution",
+    Status.FLOOR: "the start is at its floor: what is left is rounding",
+}
 NO_TIME = "the time limit left no time for a solver"
 WARM = 1e-3  # relative residual from which an iterate is worth starting from
 # The most rows of an island: up to these, dense factors cost less than sweeps and factors of all islands together.
@@ -159,7 +164,7 @@ class SmallCall:
         status: Status = Status.CONVERGED,
     ) -> Claim:
         """The claim for a call with these counts, from a start (m,) or from none to a residual `after`."""
-        nothing = "the start is a solution" if status is Status.CONVERGED else NO_TIME
+        nothing = NOTHING.get(status, NO_TIME)
         if counts is None:
             return Claim(status, 0, {}, nothing)
         if problem.generalized is not None:

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender._derived import cached_property
-from lavender.certificates import check_certificate
-from lavender.deadline import Deadline
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.deadline import Deadline
+from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
+from lavender.judge.solution import Claim, Status, Turn
 from lavender.problem import Problem
-from lavender.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
-from lavender.solution import Claim, Status, Turn
+from lavender.problem.derived import cached_property
 from lavender.solvers.islands import islands
-from lavender.solvers.small import NO_TIME, told
+from lavender.solvers.small import NOTHING, NO_TIME, told
 from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
 
@@ -167,12 +167,11 @@ class SolveLog:
 
     def claim(self) -> Claim:
         """The claim of the whole solve."""
-        nothing = NO_TIME if self.budget > 0 else "no iterations were asked for"
-        if self.best <= self.tol:
-            nothing = "the start is a solution"
+        status = self.status
+        nothing = NOTHING.get(status, NO_TIME if self.budget > 0 else "no iterations were asked for")
         message = self.message or ("" if self.failure else nothing)
         return Claim(
-            Status.INTERRUPTED if self.interrupted else self.status,
+            Status.INTERRUPTED if self.interrupted else status,
             self.iterations,
             self.work,
             "; ".join(filter(None, (message, self.failure, *self._fights()))),

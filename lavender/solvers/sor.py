@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lavender._arrays import FloatArray, number
-from lavender.errors import InputError
-from lavender.registry import SolverSpec
-from lavender.solution import Claim
+from lavender.base.arrays import FloatArray, number
+from lavender.base.errors import InputError
+from lavender.judge.solution import Claim
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.sweeping import Sweeping, SweepState, run_kernel
 from lavender_ext.sweep import serial
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.deadline import CHUNK_TIME, NEVER, Deadline
-from lavender.errors import BREAKDOWN, last_words
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import CHUNK_TIME, NEVER, Deadline
+from lavender.base.errors import BREAKDOWN, last_words
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.registry import get
-from lavender.solution import Claim, Status
 from lavender.solvers._accelerated import operator
 from lavender.solvers.costs import sweep_cost
 from lavender.solvers.direct import Enough
+from lavender.solvers.registry import get
 from lavender.solvers.setup_times import forming
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS

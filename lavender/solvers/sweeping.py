@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from lavender._arrays import FloatArray, whole_number
-from lavender.errors import InputError
-from lavender.ordering import Order, block_order
+from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.errors import InputError
+from lavender.judge.residuals import reference
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.residuals import reference
-from lavender.solution import Claim, Status
+from lavender.problem.ordering import Order, block_order
 from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solution import Claim, Status
 from lavender_ext.warm.start import (
     JUDGED,
     MOST_SWEEPS,

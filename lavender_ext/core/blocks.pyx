@@ -1,7 +1,7 @@
 """Blocks of a problem, made, joined and checked: one pass over few numbers, in a few arrays.
 
 What Python would do in ten calls of NumPy takes longer than a solve of eight rows. Nothing is said here of what is wrong:
-`lavender.cones` finds the words where these functions return None.
+`lavender.problem.cones` finds the words where these functions return None.
 """
 from libc.stdint cimport int32_t
 

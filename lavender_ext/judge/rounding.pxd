@@ -1,7 +1,7 @@
 """What rounding to float32 makes of a slack in generalised coordinates: squares of its changes, entry by entry.
 
 With z_i = M^-1 J_i^T, A_ij = J_j . z_i + theta_i (i = j), x = M^-1 J^T lambda, f = M^2 x^2 + J^T^2 lambda^2, every matrix
-squared entry by entry, and u = 2^-24 (the formulas of lavender/residuals.py):
+squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.py):
 
     impulse     u^2 A^2 lambda^2                                                                          (1)
     data        u^2 (J^2 x^2 + z^2 f + theta^2 lambda^2 + target^2 + 2 J^2 v*^2),  target = b + J v*      (4)

@@ -102,7 +102,7 @@ cdef inline bint is_cheap(job_t* j, const limits_t* l, double work, int32_t* ste
 
 
 cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
-    """Rows of zeros at the bound that b asks for, as `decide_empty_rows` of lavender/outcome.py.
+    """Rows of zeros at the bound that b asks for, as `decide_empty_rows` of lavender/solving/outcome.py.
 
     0 where that is infinite and b alone is above tol, or where A_ii is 0 only because products of small numbers vanish.
     """

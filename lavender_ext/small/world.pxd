@@ -153,7 +153,7 @@ cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t
 
 
 cdef inline bint is_ordered(const generalized_t* g, int32_t entries) noexcept nogil:
-    """Would `Generalized` look for an order with less fill? As `_worth_ordering` of lavender/generalized.py."""
+    """Would `Generalized` look for an order with less fill? As `_worth_ordering` of lavender/problem/generalized.py."""
     cdef int32_t i, c
     cdef double work = 0.0
     if g.lptr[g.n] <= entries - g.n:

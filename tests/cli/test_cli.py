@@ -7,15 +7,20 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
+from random_problems import as_matrix, dragged, random_ellipses
+from random_trees import random_tree, tree_mass
 from stacks import stack
 
 import lavender as lv
 from lavender import bench, cli, io, registry
-from lavender import check as checking
-from lavender.bench.record import Skip, to_json
+from lavender.cli import main
+from lavender.lab import check as checking
+from lavender.lab.bench.record import Skip, to_json
 
 
 @pytest.fixture
@@ -238,7 +243,7 @@ def test_bad_input_is_one_line_and_status_2(lavender, words, sign):
 
 def test_the_time_of_a_solve_holds_no_loading_of_modules():
     code = (
-        "import sys, lavender; s = sys.modules['lavender.solve']; real = s.solve\n"
+        "import sys, lavender; s = sys.modules['lavender.solving.solve']; real = s.solve\n"
         "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
         "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
     )
@@ -464,7 +469,7 @@ def test_the_nearest_name_is_found_whatever_its_case(lavender):
 
 
 def test_cases_lists_families_with_parameters_and_reasons(lavender):
-    from lavender.suite.case import FAMILIES
+    from lavender.lab.suite.case import FAMILIES
 
     code, out, _ = lavender("cases")
     assert code == 0
@@ -578,7 +583,16 @@ def test_ctrl_c_while_workers_of_a_campaign_start_is_answered_by_the_command_alo
     """The terminal sends the signal to all of its processes, where the first worker begins its imports."""
     (tmp_path / "sitecustomize.py").write_text(WORKER)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
-    command = [sys.executable, "-m", "lavender", "report", "--campaign", "granular(n=2)", "--seeds", "20"]
+    command = [
+        sys.executable,
+        "-m",
+        "lavender",
+        "report",
+        "--campaign",
+        "granular(n=2)",
+        "--seeds",
+        "20",
+    ]
     command += ["--workers", "2", "--solvers", "pgs", "--no-figures", "--out", str(tmp_path / "out")]
     more = {"env": environment, "capture_output": True, "text": True, "timeout": 600, "check": False}
     done = subprocess.run(command, start_new_session=True, **more)
@@ -766,19 +780,19 @@ def _must_not_begin(*_, **__):
 @pytest.mark.parametrize(
     ("words", "work"),
     [
-        ("run stack --plot {}/x.svg", "lavender.engine.Simulation.step"),
-        ("run stack --trace {}/x.csv", "lavender.engine.Simulation.step"),
-        ("run stack --film {}/x.film", "lavender.engine.Simulation.step"),
-        ("run stack --film {}/x.gif", "lavender.engine.Simulation.step"),
-        ("solve toy_stack --output {}/x.npz", "lavender.bench.resolve"),
+        ("run stack --plot {}/x.svg", "lavender.sim.engine.Simulation.step"),
+        ("run stack --trace {}/x.csv", "lavender.sim.engine.Simulation.step"),
+        ("run stack --film {}/x.film", "lavender.sim.engine.Simulation.step"),
+        ("run stack --film {}/x.gif", "lavender.sim.engine.Simulation.step"),
+        ("solve toy_stack --output {}/x.npz", "lavender.lab.bench.resolve"),
         ("phenomena lift --out {}/x.json", "lavender.cli.phenomena.run"),
-        ("web build {}/x.wasm", "lavender.web.compile.build"),
-        ("export c {}/sub", "lavender.export.library.source"),
-        ("export npm {}/sub", "lavender.export.library.source"),
-        ("web page {}/sub", "lavender.web.pages.module"),
-        ("report toy_stack --out {}/sub", "lavender.bench.resolve"),
-        ("report toy_stack --campaign --out {}/sub", "lavender.bench.resolve"),
-        ("run stack --record {}/sub", "lavender.engine.Simulation.step"),
+        ("web build {}/x.wasm", "lavender.sim.web.compile.build"),
+        ("export c {}/sub", "lavender.out.library.source"),
+        ("export npm {}/sub", "lavender.out.library.source"),
+        ("web page {}/sub", "lavender.sim.web.pages.module"),
+        ("report toy_stack --out {}/sub", "lavender.lab.bench.resolve"),
+        ("report toy_stack --campaign --out {}/sub", "lavender.lab.bench.resolve"),
+        ("run stack --record {}/sub", "lavender.sim.engine.Simulation.step"),
     ],
 )
 def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch, tmp_path, words, work):
@@ -792,10 +806,10 @@ def test_what_cannot_be_written_is_refused_before_the_work(lavender, monkeypatch
 
 
 def test_a_format_that_nobody_writes_is_refused_before_the_work(lavender, monkeypatch):
-    monkeypatch.setattr("lavender.engine.Simulation.step", _must_not_begin)
+    monkeypatch.setattr("lavender.sim.engine.Simulation.step", _must_not_begin)
     code, _, err = lavender("run", "stack", "--plot", "x.plot")
     assert code == cli.EXIT_BAD_INPUT and "suffix" in err and "svg" in err
-    monkeypatch.setattr("lavender.engine.picture.which", lambda name: None)
+    monkeypatch.setattr("lavender.sim.engine.picture.which", lambda name: None)
     code, _, err = lavender("run", "stack", "--film", "x.mp4")
     assert code == cli.EXIT_BAD_INPUT and "ffmpeg" in err
 
@@ -833,3 +847,113 @@ def test_files_are_written_whoever_reads(path, tmp_path):
     assert _unread("solve", path, "--output", made[2]) == (0, "")
     assert _unread("reference", path) == (0, "")
     assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
+
+
+def says(status, **more):
+    return lv.Claim(status, 1, **more)
+
+
+def test_the_command_of_a_check_fails_on_a_liar(plug_in, capsys):
+    from lavender.cli import main
+
+    def run(_, impulse):
+        impulse[:] = 1000.0
+        return says(lv.Status.CONVERGED)
+
+    liar = plug_in(run, operators={"matrix"})
+    with pytest.raises(SystemExit) as end:
+        main(["check", "granular(n=3)", "--solvers", liar])
+    assert end.value.code == 1
+    assert "1 claims are contradicted" in capsys.readouterr().out
+
+
+LAWS = ("coulomb", "cone")
+
+
+def free(seed, contacts=3, friction="coulomb", mu=None):
+    return dragged(seed, contacts, mu, friction=friction)
+
+
+def on_rows(seed, friction="coulomb", **sizes):
+    """Bodies with joints and contacts, an ellipse each."""
+    base = random_ellipses(seed, friction, **sizes)
+    return replace(base, compliance=base.compliance + 0.3)
+
+
+FORMS = {"generalized": free, "matrix": lambda *a, **k: as_matrix(free(*a, **k)), "rows": on_rows}
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("law", LAWS)
+def test_every_door_gives_the_same(form, law, tmp_path):
+    problem = FORMS[form](1, friction=law)
+    found = lv.solve(problem, tol=1e-9)
+    assert found.success
+    assert lv.solve_many([problem, problem], tol=1e-9)[1].impulse.tobytes() == found.impulse.tobytes()
+    prepared = lv.prepare(problem, "newton")
+    first = prepared.solve(tol=1e-9).impulse
+    again = prepared.solve(replace(problem, name="again"), impulse=first, tol=1e-8)
+    assert again.success
+    np.testing.assert_allclose(again.impulse, first, rtol=1e-6, atol=1e-9)
+    assert lv.solve(problem, "newton", impulse=found.impulse, tol=1e-8, max_iter=1).success
+    path = tmp_path / "ellipse.npz"
+    problem.save(path)
+    back = lv.load(path)
+    assert back == problem
+    assert (
+        lv.residual(back, found.impulse).relative == found.residual.relative
+    )  # of the numbers that were handed out
+    with pytest.raises(SystemExit) as ended:
+        main(["reference", str(path)])
+    assert ended.value.code in (0, None)
+    best = lv.solve(problem, tol=1e-12)
+    assert best.motion_error(best).rows == 0.0
+    error = lv.motion_error(problem, 1.1 * found.impulse)
+    assert error.rows > 1e-3
+    near = lv.motion_error(problem, found.impulse)
+    assert near.rows < 1e-6
+    if law == "cone":
+        assert near.bound < 1e-6 * error.bound
+        assert lv.cross_check(problem, ["newton", "admm", "anderson"]).ok
+    np.testing.assert_array_equal(problem.carry(found), found.impulse)
+    single = np.float32(found.impulse)
+    assert lv.residual(problem, single, "float32").verdict == "at its floor"
+    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
+    assert str(lv.explain(problem))
+
+
+def robot(seed, m=12, n=10, soft=True, number=np.float64):
+    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
+    rng = np.random.default_rng(seed)
+    mass = tree_mass(rng, random_tree(rng, n))
+    jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
+    jac[:, 0] += 0.3
+    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
+    upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
+    return lv.Problem.from_jacobian(
+        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
+        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
+    )  # fmt: skip
+
+
+def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(tmp_path):
+    problem = robot(2)
+    exact = lv.solve(problem, tol=1e-11).impulse
+    for name, impulse in (("done", exact.astype(np.float32)), ("early", 0.9 * exact)):
+        lv.io.save(problem, tmp_path / f"{name}.npz", impulse=impulse)
+    told = ["--solvers", "pgs", "--precision", "float32"]
+    done = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "done.npz"), *told])
+    assert done.exit_code == 0, done.output
+    assert "stored answer: at its floor of float32" in " ".join(done.output.split())
+    early = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "early.npz"), *told])
+    assert early.exit_code == 1
+    assert "stored answer: stopped early, " in early.output
+    # Without the option the precision is the problem's, and the exit code that of the claims.
+    assert CliRunner().invoke(cli.cli, ["check", str(tmp_path / "early.npz"), *told[:2]]).exit_code == 0
+    lv.io.save(problem, tmp_path / "none.npz")
+    none = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "none.npz"), *told])
+    assert isinstance(none.exception, lv.InputError)
+    assert "no file holds an answer" in str(none.exception)
+    other = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "done.npz"), "--precision", "half"])
+    assert other.exit_code == 2
+    assert "'half' is not one of 'float64', 'float32'" in other.output

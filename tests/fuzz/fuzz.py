@@ -40,10 +40,10 @@ CHUNK = 200  # inputs, after which Hypothesis starts again with another seed
 FAULTS = ("crash", "hang", "raw", "false claim", "wrong number", "overrun", "changed", "warning")
 #: What --guided is to cover; the rest of the package runs at full speed.
 COVERED = {
-    "file": ["lavender.io", "lavender.problem", "lavender.cones", "lavender.rows", "lavender.generalized"],
-    "snapshot": ["lavender.engine"],
-    "steps": ["lavender.engine", "lavender.scene"],
-    "solve": ["lavender.solve", "lavender.solvers", "lavender.problem", "lavender.residuals"],
+    "file": ["lavender.io", "lavender.problem"],
+    "snapshot": ["lavender.sim.engine"],
+    "steps": ["lavender.sim.engine", "lavender.sim.scene"],
+    "solve": ["lavender.solving.solve", "lavender.solvers", "lavender.problem", "lavender.judge.residuals"],
 }
 
 

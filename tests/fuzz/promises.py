@@ -12,7 +12,7 @@ from worked import after
 import lavender as lv
 from benchmarks.drawn import wild
 from lavender import suite
-from lavender.suite import hard
+from lavender.lab.suite import hard
 
 SCENES = (
     ("stack", {"n": (3, 6, 10)}),

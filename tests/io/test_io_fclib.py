@@ -9,7 +9,7 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import random_contact_problem, seeds, side_by_side, touching
+from random_problems import as_matrix, dragged, random_contact_problem, seeds, side_by_side, touching
 
 import lavender as lv
 import lavender.io
@@ -519,3 +519,13 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     ):
         with pytest.raises(lv.InputError, match=r"lavender-contact\[fclib\]"):
             act()
+
+
+def free(seed, contacts=4, friction="coulomb", mu=None):
+    return dragged(seed, contacts, mu, "box", friction)
+
+
+def test_fclib_has_no_boxes(tmp_path):
+    pytest.importorskip("h5py")
+    with pytest.raises(lv.LavenderError, match="box"):
+        as_matrix(free(3)).save(tmp_path / "box.hdf5")

@@ -1,6 +1,7 @@
 """Problems in .npz: nothing is lost, nothing foreign gets in."""
 
 import dataclasses
+import io
 import io as bytestreams
 import json
 import os
@@ -419,3 +420,45 @@ def test_a_broken_compressed_matrix_is_refused_in_memory_too(indices, indptr):
     broken = sp.csr_array((np.ones(2), np.array(indices), np.array(indptr)), shape=(2, 2))
     with pytest.raises(lv.InputError, match="not a valid compressed matrix"):
         lv.Problem.linear(broken, [1.0, 1.0])
+
+
+def boxes(number):
+    """One box on four corners, turned."""
+    c, s = np.cos(0.3), np.sin(0.3)
+    given = {
+        "inv_mass": [0.5], "inv_inertia": [0.7 * np.eye(3)], "v_free": [[0.1, 0.0, -0.2, 0.0, 0.3, 0.0]],
+        "normal": np.tile([s, 0.0, c], (4, 1)), "tangent": np.tile([c, 0.0, -s], (4, 1)),
+        "arm_a": np.zeros((4, 3)),
+        "arm_b": [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)],
+    }  # fmt: skip
+    given = {name: np.asarray(x, number) for name, x in given.items()}
+    return lv.Rows(contact_body=np.tile([-1, 0], (4, 1)), **given)
+
+
+def test_rows_in_float32_keep_their_precision_in_their_problem_and_its_file(tmp_path):
+    rows = boxes(np.float32)
+    assert rows.precision == "float32"
+    assert boxes(np.float64).precision == "float64"
+    assert np.array_equal(rows.arm_b, rows.arm_b.astype(np.float32))
+    problem = lv.Problem.from_rows(rows, mu=0.5)
+    assert problem.precision == "float32"
+    assert lv.residual(problem, problem.start()).precision == "float32"
+    problem.save(tmp_path / "p.npz")
+    for again in (lv.load(tmp_path / "p.npz"), pickle.loads(pickle.dumps(problem))):
+        assert again == problem
+        assert again.precision == "float32"
+    assert problem.boxed(1.0).precision == problem.relaxed().precision == "float32"
+    assert lv.Problem.from_rows(boxes(np.float64), mu=0.5).precision == "float64"
+
+
+def test_a_file_with_another_precision_is_told(tmp_path):
+    path = tmp_path / "p.npz"
+    lv.Problem.lcp(np.eye(1), [1.0], precision="float32").save(path)
+    with np.load(path) as held:
+        entries = {name: held[name] for name in held}
+    entries["meta"] = np.frombuffer(entries["meta"].tobytes().replace(b'"float32"', b'"float16"'), np.uint8)
+    raw = io.BytesIO()
+    np.savez(raw, **entries)
+    path.write_bytes(raw.getvalue())
+    with pytest.raises(lv.InputError, match=r"precision in it is float64 or float32"):
+        lv.load(path)

@@ -21,8 +21,8 @@ from worked import example
 
 import benchmarks.__main__ as benchmarks
 from benchmarks import original
+from lavender.base.errors import InputError
 from lavender.cli import cli
-from lavender.errors import InputError
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PAGE = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")

@@ -117,18 +117,39 @@ def test_a_cimport_downwards_passes(tmp_path, file, line):
     assert kernel_breaches(tmp_path / "lavender_ext") == []
 
 
-def test_the_page_on_architecture_lists_the_rooms_in_the_order_of_their_contract():
+def test_the_page_on_architecture_lists_floors_and_rooms_in_the_order_of_their_contracts():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"]
-    layers = [layer.split(" | ") for layer in settings["contracts"][0]["layers"]]
-    height = {room: i for i, layer in enumerate(reversed(layers)) for room in layer if room[0] != "_"}
+    layers = {
+        c["containers"][0]: [layer.split(" | ") for layer in c["layers"]]
+        for c in settings["contracts"]
+        if "layers" in c
+    }
+    order = []  # top to bottom: the rooms of lab and sim in the place of their floor
+    for floor in layers["lavender"]:
+        below = layers.get(f"lavender.{floor[0]}", []) if floor[0] in ("lab", "sim") else []
+        order += [[f"{floor[0]}.{room}" for room in layer] for layer in below] or [floor]
+    height = {room: i for i, layer in enumerate(reversed(order)) for room in layer if room[0] != "_"}
     page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
-    table = page[page.index("## The rooms of `lavender`") : page.index("## The rooms of `lavender_ext`")]
-    listed = [
-        re.findall(r"`(\w+)`", line.split("|")[1]) for line in table.splitlines() if line.startswith("| `")
+
+    def listed(head, end):
+        table = page[page.index(head) : page.index(end)]
+        return [
+            re.findall(r"`([\w.]+)`", line.split("|")[1]) for line in table.splitlines() if line[:3] == "| `"
+        ]
+
+    floors = [name for (name,) in listed("## Five floors", "## The flow")]
+    assert floors == [
+        "lavender.cli",
+        "lavender.out",
+        "lavender.lab",
+        "lavender.sim",
+        "lavender.io",
+        "lavender",
     ]
-    assert {room for rooms in listed for room in rooms} == set(height)
-    lowest = [min(height[room] for room in rooms) for rooms in listed]
-    assert lowest == sorted(lowest)
+    rooms = listed("## The rooms\n", "## The rooms of `lavender_ext`")
+    assert {room for row in rooms for room in row} == set(height) - {"cli", "out"}
+    highest = [max(height[room] for room in row) for row in rooms]
+    assert highest == sorted(highest, reverse=True)
 
 
 def test_files_that_the_page_on_architecture_names_are_there():

@@ -19,9 +19,16 @@ if sys.version_info >= (3, 11):
 else:
     tomllib = pytest.importorskip("tomli")
 
+import subprocess
+import sys
+
+import pytest
+
 import lavender
 import lavender_ext
+from lavender.base.errors import LavenderError
 from lavender.io.stored import write_atomically
+from lavender.sim.web import pages
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
@@ -190,7 +197,7 @@ print("scipy" in sys.modules)
 LATE = """
 import os, sys
 import numpy as np, lavender as lv
-from lavender.loop import Loop
+from lavender.solving.loop import Loop
 
 class Watch:
     running = False
@@ -337,12 +344,13 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     # The names that both writers use, beside files of the package.
     names = []
     write_atomically(tmp_path / "a.c", lambda part: part.write_text(names.append(part.name) or ""))
-    code = "from pathlib import Path; from lavender.web import compile; Path.write_bytes = lambda *what: print(*what); "
+    code = "from pathlib import Path; from lavender.sim.web import compile; "
+    code += "Path.write_bytes = lambda *what: print(*what); "
     done = python(
         "-c", code + "Path.replace = Path.unlink = lambda *_, **__: 0; compile.put(Path('a.wasm'), b'')"
     )
     names += [done.stdout.split()[0], "a.h", "a.wasm"]
-    for folder in ("lavender/web", "docs"):
+    for folder in ("lavender/sim/web", "docs"):
         (tmp_path / folder).mkdir(parents=True)
         for name in names:
             (tmp_path / folder / name).write_text("")
@@ -352,7 +360,12 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     code = "from setuptools.command.egg_info import FileList; files = FileList(); "
     code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
     done = python("-c", code, cwd=tmp_path)
-    assert done.stdout.split() == ["docs/a.h", "docs/a.wasm", "lavender/web/a.h", "lavender/web/a.wasm"]
+    assert done.stdout.split() == [
+        "docs/a.h",
+        "docs/a.wasm",
+        "lavender/sim/web/a.h",
+        "lavender/sim/web/a.wasm",
+    ]
 
 
 def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_path):
@@ -376,3 +389,40 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
     stamp.write_text("as it is asked for now")
     python("-c", code, cwd=tmp_path, status=-signal.SIGKILL)
     assert not stamp.exists()
+
+
+HERE = Path(__file__).resolve().parent
+
+
+@pytest.fixture(scope="session")
+def module():
+    """The module of these sources, as bytes; built once for each state of the sources."""
+    try:
+        return pages.module()
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def newton_module():
+    """The module of Newton's method, likewise."""
+    try:
+        return pages.module(name="newton")
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
+    # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
+    shipped = tmp_path / "lavender" / "sim" / "web"
+    command = [sys.executable, "setup.py", "-q", "build_wasm", "--build-lib", str(tmp_path)]
+    subprocess.run(command, check=True, cwd=ROOT)
+    assert (shipped / "lavender.wasm").read_bytes() == module
+    assert (shipped / "newton.wasm").read_bytes() == newton_module
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip

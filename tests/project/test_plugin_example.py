@@ -60,7 +60,7 @@ def test_is_found_by_name_and_solves_beside_a_plug_in_that_is_broken(environment
 
 
 def test_keeps_the_contract_of_every_solver(environment):
-    contract = "tests/solvers/test_contract.py"
+    contract = "tests/core/solvers/test_contract.py"
     report = python(
         "-m", "pytest", "-q", "-p", "no:cacheprovider", contract, "-k", "apgd", env=environment
     ).stdout

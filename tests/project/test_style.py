@@ -6,6 +6,8 @@ from pathlib import Path
 
 from worked import syntax_of_package
 
+import lavender as lv
+
 MOST = 5  # fields that a reader can tell apart by their places
 
 
@@ -97,11 +99,18 @@ def test_no_test_imports_a_conftest():
 def test_a_private_name_is_seen():
     source = """
 from lavender.solvers._plan import plan
-from lavender.solve import _claim
+from lavender.solving.solve import _claim
 import lavender._plan
 problem._state, self._state, numpy.float64, named._replace
 monkeypatch.setattr(registry, "_registered", {})
-monkeypatch.setattr("lavender.solve._claim", None)
+monkeypatch.setattr("lavender.solving.solve._claim", None)
 import _thread
 """
     assert [line for line, _ in private_names(ast.parse(source))] == [2, 3, 4, 6, 7, 5]
+
+
+def test_dir_holds_the_public_names_alone():
+    assert dir(lv) == sorted(lv.__all__)
+    assert not {"Any", "TYPE_CHECKING", "import_module"} & set(dir(lv))
+    for name in dir(lv):
+        getattr(lv, name)

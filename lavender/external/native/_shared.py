@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
 
 
 def set_all(target: Any, settings: Mapping[str, Any], name: str) -> None:

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.running import Answer, Limits, at_least, proof
-from lavender.solution import Status
+from lavender.judge.solution import Status
 
 
 def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:

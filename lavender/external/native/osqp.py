@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.errors import InputError
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.native._shared import certificate
 from lavender.external.running import Answer, Limits
-from lavender.solution import Status
+from lavender.judge.solution import Status
 
 
 def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
+from lavender.base.arrays import FloatArray
 from lavender.external.as_qp import QP, two_sided
 from lavender.external.native._shared import certificate, set_all
 from lavender.external.running import Answer, Limits
-from lavender.solution import Status
+from lavender.judge.solution import Status
 
 
 def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender._later import sparse as sp
-from lavender.lu import sparse_lu
+from lavender.base.arrays import FloatArray
+from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 from lavender_ext.newton.solve import WHATS, Layout, Solve
 
 __all__ = ["Augmented"]

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray
-from lavender.deadline import Deadline, Stopwatch
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline, Stopwatch
+from lavender.judge.residuals import judged, reference, remember
+from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.residuals import judged, reference, remember
-from lavender.solution import Claim, Status
 from lavender_ext.generalized.newton import ENDS, Newton
 
 FORM = "generalized velocities"

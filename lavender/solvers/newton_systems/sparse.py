@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from lavender._arrays import FloatArray, IntArray
-from lavender._later import sparse as sp
-from lavender.lu import sparse_lu
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 from lavender.solvers._factor import TINY, WIDE
 from lavender_ext.factor.sparse import SparsePanels, is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from lavender._later import sparse as sp
+from lavender.base.later import sparse as sp
+from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.residuals import reference
 from lavender.solvers._factor import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows

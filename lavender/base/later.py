@@ -1,0 +1,54 @@
+"""Modules that are loaded when something of them is first used.
+
+Parts of SciPy would be half of `import lavender`.
+
+`from lavender.base.later import sparse as sp` stands where one would write `import scipy.sparse as sp`. What is likely
+to be used while the clock of a solve runs is loaded before, by `load`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__all__ = ["above", "issparse", "lapack", "load", "sparse"]
+
+
+class _Later:
+    """A module, imported at its first attribute."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_name" or name.startswith("__"):  # of a copy that is being made
+            raise AttributeError(name)
+        value = getattr(import_module(self._name), name)
+        setattr(self, name, value)
+        return value
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _Later, (self._name,)
+
+
+if TYPE_CHECKING:
+    from scipy import sparse
+    from scipy.linalg import lapack
+else:
+    sparse, lapack = _Later("scipy.sparse"), _Later("scipy.linalg.lapack")
+
+
+def above(name: str) -> Any:
+    """A module of a floor above, by which a method of this one is a short way to a function there."""
+    return _Later(name)
+
+
+def load(*more: str) -> None:
+    """Load sparse arrays, LAPACK and further modules, if they are not."""
+    for name in ("scipy.sparse", "scipy.linalg.lapack", *more):
+        import_module(name)
+
+
+def issparse(value: object) -> bool:
+    """Whether `value` is a sparse array or matrix of SciPy; what cannot be one loads nothing."""
+    return hasattr(type(value), "tocsr") and bool(sparse.issparse(value))

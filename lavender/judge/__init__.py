@@ -1,0 +1,1 @@
+"""The judge: residuals, other measures, certificates, what each block does, and a solution that carries them."""

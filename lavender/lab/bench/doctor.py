@@ -1,0 +1,142 @@
+"""What a report of a bug needs: versions, processor, compiler, backends, and whether kernels give their bits here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender._version import __version__
+from lavender.lab.bench.machine import build_facts, clock, cpu_name, load, memory, versions
+from lavender.problem import Problem
+from lavender.problem.rows import Rows
+from lavender.sim.engine import Simulation
+from lavender.sim.scene.gallery import SCENES
+from lavender.solvers.registry import get, known, specs
+from lavender.solving.solve import solve
+from lavender_ext.sweep import serial
+
+__all__ = ["HASHES", "examine", "self_test"]
+
+#: Hash of what each part of the self-test made, on any machine: starts are exact numbers, kernels round alike.
+HASHES = {
+    "pgs, coulomb": "4d51c4d5ba92212c",
+    "block_gauss_seidel, coulomb": "c08c92ae0a6354d6",
+    "nncg, coulomb": "82f4e616d5f5208b",
+    "anderson, cone": "b0e6e8bb55d403de",
+    "sequential_impulses, bodies": "c9273bfb07c7c548",
+    "anderson, bodies": "c354da73432a620b",
+    "stack, 60 steps": "e5f91394fb7c66b5",
+    "gallery, 5 steps": "e6ecaf800bc6ccd7",
+}
+
+
+def self_test() -> dict[str, str]:
+    """Hash of each part: sweeps over a matrix and over bodies, exact blocks, steps of a stack and of every scene.
+
+    `newton`, `direct` and `admm` are left out: parts of them pass through BLAS and LAPACK, whose bits are their own.
+    """
+    made = {}
+    for name, law in (
+        ("pgs", "coulomb"),
+        ("block_gauss_seidel", "coulomb"),
+        ("nncg", "coulomb"),
+        ("anderson", "cone"),
+    ):
+        made[f"{name}, {law}"] = solve(_contacts(law), name, tol=0.0, max_iter=12).impulse
+    for name in ("sequential_impulses", "anderson"):
+        made[f"{name}, bodies"] = solve(_bodies(), name, tol=0.0, max_iter=12).impulse
+    made["stack, 60 steps"] = steps_of("stack", 60)
+    # starts of scenes, too; NumPy draws the turns of a pile, which may pass through the mathematical library
+    own = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
+    made["gallery, 5 steps"] = np.concatenate([steps_of(name, 5) for name in sorted(own) if name != "pile"])
+    return {
+        name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest()[:16] for name, x in made.items()
+    }
+
+
+def examine() -> dict[str, Any]:
+    """Everything, as plain data; `self_test` says "same" or what was expected and what came of each part."""
+    begun = perf_counter()
+    backends = {name: reason for name, reason in known().items() if specs()[name].external}
+    parts = {
+        n: "same" if h == HASHES.get(n) else f"{HASHES.get(n)} expected, {h} came"
+        for n, h in self_test().items()
+    }
+    affinity = getattr(os, "sched_getaffinity", None)
+    return {
+        "lavender": __version__,
+        "python": f"{platform.python_implementation()} {platform.python_version()}",
+        "platform": platform.platform(),
+        "machine": platform.machine(),
+        "cpu": cpu_name(),
+        "cores": os.cpu_count() or 1,
+        "cores_allowed": len(affinity(0)) if affinity else os.cpu_count() or 1,
+        "memory_bytes": memory(),
+        "threads_set": {k: v for k, v in sorted(os.environ.items()) if k.endswith("_NUM_THREADS")},
+        "versions": versions(["cython", "matplotlib", "h5py", "mujoco"]),
+        "build": build_facts() | clock(),
+        "load": load(),
+        "extension": Path(str(serial.__file__)).name,
+        "backends": {name: reason or version_of(name) for name, reason in backends.items()},
+        "self_test": parts,
+        "same_bits": all(x == "same" for x in parts.values()),
+        "seconds": round(perf_counter() - begun, 2),
+    }
+
+
+def version_of(solver: str) -> str:
+    """Versions of the packages that a backend runs on."""
+    found = versions(get(solver).requires, base=())
+    return ", ".join(f"{name} {v}" for name, v in found.items()) or "installed"
+
+
+def steps_of(scene: str, n: int) -> Any:
+    simulation = Simulation(scene)
+    for _ in range(n):
+        positions = simulation.step()[0]["positions"]
+    return positions.ravel()
+
+
+def _contacts(law: str) -> Problem:
+    """Eight contacts of three rows: whole numbers and halves alone, so that no library computes the start."""
+    m = 24
+    i, j = np.indices((m, m))
+    a = np.where(i == j, 4.0, np.where(np.abs(i - j) <= 3, -0.5, 0.0)) + np.where(
+        (i + j) % 7 == 0, 0.125, 0.0
+    )
+    b = ((np.arange(m) * 37) % 11 - 5) / 4.0
+    b[::3] = 1.0 + np.arange(m // 3) / 8.0
+    return Problem.contact(a, b, mu=np.full(m // 3, 0.5), friction=law)
+
+
+def _bodies() -> Problem:
+    """Six boxes on each other, four contacts between each two, pushed sideways: every number is a dyadic fraction."""
+    n, corners = 6, np.array([[-0.5, -0.5], [-0.5, 0.5], [0.5, -0.5], [0.5, 0.5]])
+    arm = np.repeat([[0.0, 0.0, 0.5]], 4, axis=0)
+    arm[:, :2] = corners
+    down = arm * [1.0, 1.0, -1.0]
+    bodies = np.repeat(np.array([[i - 1, i] for i in range(n)], np.int32), 4, axis=0)
+    c = 4 * n
+    inverse = np.array([2.0**-i for i in range(n)])
+    v = np.zeros((n, 6))
+    v[:, 2], v[:, 0] = -0.125, np.arange(n) / 16.0
+    rows = Rows(
+        inv_mass=inverse,
+        inv_inertia=np.multiply.outer(6.0 * inverse, np.eye(3)),
+        v_free=v,
+        jac=np.zeros((0, 12)),
+        joint_ptr=np.zeros(1, np.int32),
+        joint_body=np.zeros((0, 2), np.int32),
+        normal=np.tile([0.0, 0.0, 1.0], (c, 1)),
+        tangent=np.tile([1.0, 0.0, 0.0], (c, 1)),
+        arm_a=np.tile(arm, (n, 1)),
+        arm_b=np.tile(down, (n, 1)),
+        contact_body=bodies,
+    )
+    return Problem.from_rows(rows, mu=0.5 * np.ones(c))

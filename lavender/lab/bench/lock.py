@@ -1,0 +1,133 @@
+"""One writer for a file of records: a lock that names its holder and ends with it.
+
+The lock is the operating system's, on FILE.lock (of POSIX records, or of Windows' bytes), so a process that
+died holds nothing; the text inside says who holds it. A text of another host is believed, because its lock may
+not be seen from here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import threading
+from pathlib import Path
+from typing import Any
+
+from lavender.base.errors import InputError
+from lavender.lab.bench.record import printable
+
+__all__ = ["Lock"]
+
+TRIES = 100  # a holder that leaves takes its file with it; so often in a row nobody leaves
+HEAD = 64  # bytes left free for Windows, where a locked byte cannot be read
+_held: set[tuple[int, int]] = set()  # locks of POSIX are of a process: within one, this set
+_guard = threading.Lock()
+
+
+class Lock:
+    """Hold `path`.lock until `release`.
+
+    Raises
+    ------
+    InputError
+        Another process, or another user of this one, holds it: with its host and process.
+    OSError
+        The folder cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path.with_name(path.name + ".lock")
+        with _guard:
+            for _ in range(TRIES):
+                if self._take():
+                    return
+        raise InputError(f"{self.path} changes hands all the time; run the command again later")
+
+    def _take(self) -> bool:
+        """True when it is ours; False when the file went away meanwhile."""
+        with contextlib.suppress(OSError):
+            if _identity(os.stat(self.path)) in _held:  # to open and close it again would let the lock go
+                raise self._refusal(os.getpid(), socket.gethostname())
+        descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not _lock(descriptor):
+                raise self._refusal(*_holder(descriptor))
+            key = _identity(os.fstat(descriptor))
+            there = None
+            with contextlib.suppress(OSError):
+                there = _identity(os.stat(self.path))
+            if there == key:
+                pid, host = _holder(descriptor)
+                if host and host != socket.gethostname():
+                    raise self._refusal(pid, host)
+                # Of a process of this host that died, or of nobody.
+                _write(descriptor, {"pid": os.getpid(), "host": socket.gethostname()})
+                self._descriptor, self._key = descriptor, key
+                _held.add(key)
+                return True
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+        return False
+
+    def _refusal(self, pid: Any, host: str) -> InputError:
+        who = f"process {pid} on {host}" if host else "another process"
+        return InputError(
+            f"{self.path.with_suffix('')} is being written by {who}: wait for it, or give another folder; "
+            f"if it no longer runs, remove {self.path}"
+        )
+
+    def release(self) -> None:
+        """Let go; a second call does nothing."""
+        with _guard:
+            if self._key not in _held:
+                return
+            # The file goes first: who opened it before finds that it went, and tries again.
+            with contextlib.suppress(OSError):
+                os.unlink(self.path)
+            _held.discard(self._key)
+            os.close(self._descriptor)
+        if os.name == "nt":
+            with contextlib.suppress(OSError):  # an open file cannot be removed there
+                os.unlink(self.path)
+
+
+def _identity(found: os.stat_result) -> tuple[int, int]:
+    return found.st_dev, found.st_ino
+
+
+def _lock(descriptor: int) -> bool:
+    """Take the system's lock; False where somebody has it, or where the file system has none and a text is there."""
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined, unused-ignore]
+        else:
+            import fcntl
+
+            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:
+        return not _holder(descriptor)[1]
+    return True
+
+
+def _holder(descriptor: int) -> tuple[Any, str]:
+    """(process, host) that the file names; ("", "") of an empty or torn one."""
+    try:
+        os.lseek(descriptor, HEAD, os.SEEK_SET)
+        found = json.loads(os.read(descriptor, 4096))
+        return int(found["pid"]), printable(str(found["host"]))
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        return "", ""
+
+
+def _write(descriptor: int, what: dict[str, Any]) -> None:
+    os.ftruncate(descriptor, 0)
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    os.write(descriptor, b"lavender".ljust(HEAD - 1) + b"\n" + json.dumps(what).encode() + b"\n")

@@ -1,0 +1,176 @@
+"""What to measure: levels, budgets, starts, orders, and the rule that makes measurements of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+from lavender.base.arrays import flag, number, whole_number
+from lavender.base.errors import InputError, UnknownName
+from lavender.lab.bench.record import CaseInfo, Record
+from lavender.lab.bench.running.timing import Ask, Task
+from lavender.problem import Problem
+from lavender.problem.ordering import ORDERS
+from lavender.solvers.registry import SolverSpec
+
+__all__ = ["Plan", "passes"]
+
+# A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
+FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
+PASS_LIMIT = 5.0  # s, of one pass over a sequence
+UNLIMITED = 10_000_000  # iterations of a run to a tolerance: the time limit ends it first
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How each solver is run on each case.
+
+    Parameters
+    ----------
+    levels : relative residuals to reach, each a solve with that `tol`
+    budgets : exact iteration counts (`tol=0`), for solvers that can stop anywhere
+    repeats : solves of each kind; minimum and median are recorded. Repeats end early once they have
+        taken `time_limit` together. Steps of a sequence of more than twenty are solved once.
+    time_limit : s, of one solve
+    pass_limit : s, of one solver over all steps of a sequence at one budget or level. The steps that are left over are
+        not solved, and a note says so.
+    warm : also start from the problem's guess, where it has one that is no answer already
+    orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
+        "random:3" is random with seed 3
+    motion : tell how wrong the bodies move, by a reference that is solved for once a case
+    speed_levels : m/s, motion errors to reach; implies `motion`. Each solver is asked for the residual that takes it
+        there: again and tighter while it misses, at most `SPEED_TRIES` times a level
+    times : s, in which the report is asked to name a solver
+    sweeps : of `budgets`, those with which the report is asked to name one
+
+    Raises
+    ------
+    InputError
+        A level, budget, count or limit that is not positive, a senseless seed.
+    UnknownName
+        An order that does not exist.
+    """
+
+    levels: Sequence[float] = (1e-3, 1e-6, 1e-9)
+    budgets: Sequence[int] = (4, 8, 16, 32, 64)
+    repeats: int = 3
+    time_limit: float = 1.0
+    pass_limit: float = PASS_LIMIT
+    warm: bool = True
+    orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
+    campaign: bool = False
+    motion: bool = False
+    speed_levels: Sequence[float] = ()
+    times: Sequence[float] = ()
+    sweeps: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        for name, values in (
+            ("level", self.levels),
+            ("speed level", self.speed_levels),
+            ("time budget", self.times),
+        ):
+            for value in values:
+                number(name, value, above=0.0)
+        if not self.levels and not self.budgets:
+            raise InputError("nothing to run: give levels, budgets or both")
+        whole_number("repeats", self.repeats, 1)
+        number("time_limit", self.time_limit, above=0.0)
+        number("pass_limit", self.pass_limit, above=0.0)
+        for name in ("warm", "campaign", "motion"):
+            flag(name, getattr(self, name))
+        for word in self.orders:
+            name, _, seed = word.partition(":")
+            if name not in ORDERS:
+                raise UnknownName("order", name, ORDERS)
+            if seed and not (name == "random" and seed.isdecimal()):
+                raise InputError(f"order {word!r}: only random takes a seed, a whole number: random:3")
+        # each once: what stands twice would be run twice, and move the middle
+        for name in ("levels", "speed_levels"):
+            object.__setattr__(
+                self, name, tuple(sorted({float(x) for x in getattr(self, name)}, reverse=True))
+            )
+        for name in ("budgets", "sweeps"):
+            counts = {whole_number("budget", n, 1) for n in getattr(self, name)}
+            object.__setattr__(self, name, tuple(sorted(counts)))
+        object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
+        object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
+        object.__setattr__(self, "motion", self.motion or bool(self.speed_levels))
+
+    way = "call"  # what of a single problem is timed, as `Record.way`
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the description of a run."""
+        return asdict(self)
+
+    def carry_out(
+        self, info: CaseInfo, problem: Problem, spec: SolverSpec, make: Callable[[Task], Record]
+    ) -> None:
+        """Make the measurements of one solver on one case; each record decides what follows.
+
+        To a tolerance: an exact solver once, at the tightest level. Others level by level; one that can
+        be resumed, or that ran out of time, is not asked for a tighter level than the one it missed: the
+        iterates would be the same. Then budgets, then sweep orders at the middle budget.
+        """
+
+        def one(mode: str, tol: float, max_iter: int, start: str, **options: Any) -> Record:
+            ask = Ask(spec.name, mode, tol, max_iter, start=start, way="" if options else self.way)
+            more = {"options": options, "repeats": self.repeats, "time_limit": self.time_limit}
+            return make(Task.of(info, ask, **more))
+
+        starts = ["cold"]
+        if self.warm and info.guess == "start" and spec.impulse and not spec.exact:
+            starts.append("warm")
+        most = UNLIMITED if spec.resumable else 0
+        for start in starts:
+            for level in self.levels[-1:] if spec.exact else self.levels:
+                record = one("tol", level, most, start)
+                if not record.relative <= level and (spec.resumable or _hopeless(record)):
+                    break
+            if not spec.exact:
+                self._to_speeds(partial(one, "tol", max_iter=most, start=start))
+            if spec.resumable and not spec.exact:
+                for n in self.budgets:
+                    one("budget", 0.0, n, start)
+        if spec.order and self.budgets and not spec.exact:
+            middle = self.budgets[len(self.budgets) // 2]
+            for word in self.orders:
+                name, _, seed = word.partition(":")
+                if name in ("bottom_up", "top_down") and problem.rows is None:
+                    continue  # without bodies nobody knows the ground
+                one("budget", 0.0, middle, "cold", order=name, **({"seed": int(seed)} if seed else {}))
+
+    def _to_speeds(self, solve_to: Callable[[float], Record]) -> None:
+        """Solves to each speed level: the motion error follows the residual by a factor that the last solve tells."""
+        tol = FIRST_TOL
+        last: Record | None = None
+        for level in self.speed_levels:
+            for _ in range(SPEED_TRIES):
+                if last is not None:
+                    speed = math.inf if last.motion_speed is None else last.motion_speed
+                    if speed <= level:
+                        break
+                    # Neither this level nor a tighter one: the residual was missed, or no motion error is known.
+                    if not (last.relative <= tol and speed < math.inf) or tol <= LAST_TOL:
+                        return
+                    tol = max(LAST_TOL, min(0.3 * tol, 0.5 * last.relative * level / speed))
+                last = solve_to(tol)
+
+
+def passes(plan: Plan, spec: SolverSpec) -> list[Ask]:
+    """What is run over a sequence: each budget and level, cold and carried."""
+    most = UNLIMITED if spec.resumable else 0
+    asked = [("tol", level, most) for level in (plan.levels[-1:] if spec.exact else plan.levels)]
+    if spec.resumable and not spec.exact:
+        asked = [*(("budget", 0.0, n) for n in plan.budgets), *asked]
+    starts = ("cold", "carried") if spec.impulse and not spec.exact else ("cold",)
+    return [Ask(spec.name, *what, way="steps", start=start) for start in starts for what in asked]
+
+
+def _hopeless(record: Record) -> bool:
+    return record.status in ("TIME_LIMIT", "KILLED", "ERROR", "INFEASIBLE") or record.status.startswith(
+        "CRASHED"
+    )

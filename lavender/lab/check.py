@@ -1,0 +1,327 @@
+"""Do solvers agree? Each against the judge, and against the optimum that a QP backend found.
+
+For symmetric positive semidefinite A and a convex set of impulses (bounds, the cones of relaxed
+friction) any two impulses, with Delta = l1 - l2, eps = e1 - e2 (the judge's errors) and D = diag(d), obey
+
+    |Delta|_A^2 <= |Delta|_A |eps|_A + |eps|_D |Delta|_D                                          (1)
+
+Both p = l - e are projections of l - w/d in the metric of D, so (w1 - w2 - D eps).(Delta - eps) <= 0; expand and use
+Cauchy-Schwarz. A breach means that a residual is computed wrongly. |Delta|_A [sqrt J] is the energy of
+the difference of velocities, which is unique where impulses are not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lavender.base.errors import InputError, LavenderError
+from lavender.base.later import load
+from lavender.judge.residuals import FLOOR_MOST, WRONG
+from lavender.judge.solution import Solution, Status, uninterrupted
+from lavender.problem import Problem, check_problem
+from lavender.solvers.registry import available, get, known, specs
+from lavender.solving.solve import solve
+
+__all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
+
+REFERENCES = ("osqp", "clarabel", "piqp", "direct")
+CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
+REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 times the floor
+
+AGREES = "agrees"
+AGREES_UNCOMPARED = "solved, nothing to compare with"
+PROVED = "no solution, proved"
+NEAR_NONE = "no solution within rounding"  # of the data: theirs has huge impulses, if any
+INEXACT = "no exact solution"  # a certificate holds, and others meet the tolerance
+NOT_SOLVED = "not solved"
+NOTHING = "nothing to do"
+CONTRADICTED = "claim contradicted"
+BREACH = "breach: a residual is computed wrongly"
+REFUSED = "refused"
+
+
+@dataclass(frozen=True)
+class CrossCheckRow:
+    """One solver beside the reference; numbers are None where they mean nothing."""
+
+    solver: str  # as asked for
+    verdict: str
+    status: str = ""
+    relative: float | None = None  # -, the judge's
+    floor: float | None = None  # -
+    distance: float | None = None  # sqrt J, |Delta|_A to the reference
+    allowed: float | None = None  # sqrt J, largest distance that (1) allows
+    slack: float | None = None  # m/s, largest difference of slack
+    objective: float | None = None  # J, 1/2 l.A l - b.l minus that of the reference
+    time: float | None = None  # s, set-up and solve
+    note: str = ""  # form, message, reason
+    ran: str = ""  # the solver that is the one asked for with bounds, where that one takes free rows alone
+    solution: Solution | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """The solver claims what the judge does not find, or inequality (1) is broken."""
+        return self.verdict in (CONTRADICTED, BREACH)
+
+
+@dataclass(frozen=True)
+class CrossCheck:
+    """Table of `cross_check`; iterates over its rows, and `str()` is plain text."""
+
+    problem: Problem
+    tol: float
+    reference: str | None  # name of the solver that gave the reference, None without one
+    reference_note: str  # how good it is, or why there is none
+    rows: tuple[CrossCheckRow, ...]
+
+    def __iter__(self) -> Iterator[CrossCheckRow]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, solver: str) -> CrossCheckRow:
+        for row in self.rows:
+            if row.solver == solver:
+                return row
+        raise InputError(
+            f"no solver {solver!r} in this check; it has {', '.join(r.solver for r in self.rows)}"
+        )
+
+    @property
+    def contradicted(self) -> tuple[CrossCheckRow, ...]:
+        """Rows whose claim does not hold."""
+        return tuple(row for row in self.rows if row.contradicted)
+
+    @property
+    def agreed(self) -> tuple[CrossCheckRow, ...]:
+        """Rows that agree with the reference."""
+        return tuple(row for row in self.rows if row.verdict == AGREES)
+
+    @property
+    def refused(self) -> tuple[CrossCheckRow, ...]:
+        """Rows of solvers that do not take the problem; their notes say why."""
+        return tuple(row for row in self.rows if row.verdict == REFUSED)
+
+    @property
+    def ok(self) -> bool:
+        """Every solver that takes the problem solves it, and agrees; False where none takes it."""
+        asked = {row.verdict for row in self.rows} - {REFUSED}
+        return bool(asked) and asked <= {AGREES, AGREES_UNCOMPARED, NOTHING}
+
+    def __str__(self) -> str:
+        head = (
+            "solver", "verdict", "status", "relative", "floor", "distance", "allowed", "objective", "ms", "what ran",
+        )  # fmt: skip
+        body = [
+            (
+                f"{r.solver} → {r.ran}" if r.ran else r.solver, r.verdict, r.status,
+                _short(r.relative), _short(r.floor), _short(r.distance),
+                _short(r.allowed), _short(r.objective), "" if r.time is None else f"{1e3 * r.time:.3g}", r.note,
+            )
+            for r in self.rows
+        ]  # fmt: skip
+        widths = [max(len(line[i]) for line in (head, *body)) for i in range(len(head))]
+        lines = [
+            "  ".join(x.ljust(n) for x, n in zip(line, widths, strict=True)).rstrip()
+            for line in (head, *body)
+        ]
+        name = self.problem.name or f"{self.problem.m} rows"
+        reference = f"cold: reference {self.reference}" if self.reference else "cold: no reference"
+        return "\n".join(
+            [f"{name} ({self.problem.law}), tol {self.tol:g}, {reference}, {self.reference_note}", *lines]
+        )
+
+
+def _short(x: float | None) -> str:
+    return "" if x is None else f"{x:.1e}"
+
+
+def cross_check(
+    problem: Problem,
+    solvers: Iterable[str] | None = None,
+    reference: str = "osqp",
+    *,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+) -> CrossCheck:
+    """Solve with every solver, from doing nothing, and compare each with a judged reference.
+
+    The reference must reach max(1e-9, 10 floor), and 1e-5, by the judge; otherwise the next of osqp, clarabel, piqp,
+    direct (relaxed friction: clarabel_cone, block_gauss_seidel) is taken, and named.
+
+    Parameters
+    ----------
+    problem : Problem
+    solvers : names, optional
+        Default: all that take the problem here.
+    reference : str
+        Tried first.
+    tol : float
+        Relative residual asked of the solvers.
+    max_iter : int, optional
+        Budget of the solvers, in their own iterations; default: each spec's.
+    time_limit : float, optional, s
+        For each solver, where it can be stopped.
+
+    Returns
+    -------
+    CrossCheck
+        A solver of free rows is run as the one that is the same method with bounds ("gauss_seidel → pgs"), and `ran`
+        names it. Distances, slack and objective only for symmetric positive semidefinite A without Coulomb friction.
+
+    Raises
+    ------
+    UnknownName
+        A solver or reference that does not exist.
+    InputError
+        Wrong `tol` or limits.
+    """
+    check_problem(problem)
+    if problem.guess is not None:  # solvers are compared by what they do, not by where they begin
+        problem = replace(problem, guess=None, copy=False)
+    names = (
+        available(problem) if solvers is None else [solvers] if isinstance(solvers, str) else list(solvers)
+    )
+    reasons = known(problem)
+    for name in (reference, *names):
+        if name not in reasons:
+            get(name)  # raises UnknownName with the nearest names
+    optimum, chosen, note = _reference(problem, reference, reasons, time_limit)
+    rows = []
+    for name in names:
+        reason = reasons[name]
+        other = None if reason is None else specs()[name].standing_in(problem)
+        if reason is not None and other is None:
+            rows.append(CrossCheckRow(name, REFUSED, note=reason))
+            continue
+        run = name if other is None else other.name
+        try:
+            load(*get(run).requires)  # what the time of a first solve would hold besides
+            solution = uninterrupted(solve(problem, run, tol=tol, max_iter=max_iter, time_limit=time_limit))
+        except InputError:
+            raise
+        except LavenderError as error:  # refused only after a look at the numbers
+            rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
+            continue
+        rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
+    if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
+        rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]
+    return CrossCheck(problem, tol, chosen, note, tuple(rows))
+
+
+def _reference(
+    problem: Problem, first: str, reasons: dict[str, str | None], time_limit: float | None
+) -> tuple[Solution | None, str | None, str]:
+    """(solution, solver, how good) of the first that passes, or (None, None, why none does)."""
+    if problem.law == "coulomb":
+        return None, None, "Coulomb friction is not the optimality condition of a QP"
+    if not problem.is_symmetric:
+        return None, None, f"A is not symmetric (by {problem.asymmetry:.1e}), so the problem is no QP"
+    if not problem.is_semidefinite:
+        return None, None, "A is not positive semidefinite: solutions may be many, of different motions"
+    usual = CONE_REFERENCES if problem.law == "cone" else REFERENCES
+    chain = (first, *(r for r in usual if r != first))
+    failed = []
+    for name in chain:
+        reason = reasons.get(name, "not registered")
+        if reason is not None:
+            failed.append(f"{name} {reason}")
+            continue
+        try:
+            spec = get(name)
+            budget = 100 * spec.max_iter if spec.resumable else None  # a reference may take its time
+            solution = uninterrupted(
+                solve(problem, name, tol=0.1 * REFERENCE_TOL, max_iter=budget, time_limit=time_limit)
+            )
+        except LavenderError as error:
+            failed.append(f"{name}: {error}")
+            continue
+        r = solution.residual
+        needed = max(REFERENCE_TOL, min(10.0 * r.floor, FLOOR_MOST))
+        if r.relative <= needed:
+            note = f"relative {r.relative:.1e}"
+            return solution, name, note + (f" ({'; '.join(failed)})" if failed else "")
+        failed.append(f"{name}: relative {r.relative:.1e} above {needed:.1e}")
+    return None, None, "; ".join(failed)
+
+
+def compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
+    r = solution.residual
+    note = "; ".join(
+        x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x
+    )
+    shared: dict[str, Any] = {
+        "status": solution.status.name,
+        "relative": r.relative,
+        "floor": r.floor,
+        "time": solution.setup_time + solution.solve_time,
+        "solution": solution,
+    }
+    if optimum is not None and np.isfinite(solution.impulse).all():
+        distance, allowed = _distance(problem, solution, optimum)
+        shared |= {
+            "distance": distance,
+            "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
+            "objective": _objective(problem, solution) - _objective(problem, optimum),
+        }
+        shared["allowed"] = allowed
+        if distance > allowed:
+            return CrossCheckRow(name, BREACH, note=note, **shared)
+    if solution.contradicted:
+        return CrossCheckRow(
+            name, CONTRADICTED, note=f"{solution.contradicted}; {note}".rstrip("; "), **shared
+        )
+    if solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
+        verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
+        return CrossCheckRow(name, verdict, note=note, **shared)
+    if r.nothing_to_do and r.verdict != WRONG:
+        units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
+        return CrossCheckRow(name, NOTHING, note=f"{units}; {note}".rstrip("; "), **shared)
+    if not (solution.success or r.at_floor):
+        return CrossCheckRow(name, NOT_SOLVED, note=note, **shared)
+    return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)
+
+
+def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, float]:
+    """|Delta|_A and the largest value of it that (1) allows, rounding included [sqrt J]."""
+    delta = problem.on_disk(one.impulse - two.impulse)
+    eps = problem.on_disk(one.residual.error - two.residual.error)
+    problem = problem.disk
+    d: Any = problem.d
+    a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
+    distance = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    # The errors e themselves are known to the floor of both residuals, in the norm of D.
+    fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
+    root = 1.0 / np.sqrt(d)
+    stiff = float(np.sqrt(np.max(root * _apply(problem, root, abs), initial=0.0)))
+    eps_d = float(np.sqrt(np.sum(d * eps * eps))) + fuzz
+    eps_a = float(np.sqrt(max(eps @ a_eps, 0.0))) + stiff * fuzz
+    delta_d = float(np.sqrt(np.sum(d * delta * delta)))
+    # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
+    rounding = 2.0**-50 * stiff * delta_d
+    allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
+    return distance, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
+
+
+def _apply(problem: Problem, x: Any, part: Callable[[Any], Any] = lambda a: a) -> Any:
+    """A x (m,), without forming A where J and M are known; with `abs` a bound of abs(A) x for x >= 0."""
+    if problem.generalized is not None:
+        y = part(problem.whitened)
+        return y @ (y.T @ x) + problem.compliance * x
+    if problem.rows is None:
+        return part(problem.csr) @ x
+    assert problem.compliance is not None
+    jac = part(problem.jacobian)
+    return jac @ (part(problem.rows.inverse_mass_matrix()) @ (jac.T @ x)) + problem.compliance * x
+
+
+def _objective(problem: Problem, solution: Solution) -> float:
+    """1/2 l.A l - b.l [J]."""
+    lam = solution.impulse
+    return float(0.5 * (lam @ (solution.slack - problem.b)))

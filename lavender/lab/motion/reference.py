@@ -1,0 +1,119 @@
+"""The solution that motions are compared with: found once per problem, judged, and kept with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, read_only
+from lavender.base.errors import CapabilityError
+from lavender.judge.residuals import Residual, residual
+from lavender.judge.solution import Solution, uninterrupted
+from lavender.lab.motion import operator as operators
+from lavender.lab.motion.bound import Witness, witness
+from lavender.problem import Problem
+from lavender.solving.solve import solve
+
+__all__ = ["Reference", "adopt", "reference"]
+
+SOLVER = "auto"
+ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
+ACCEPTED = 1e-10  # relative residual that makes a reference, as does the floor
+CONVEX = ("linear", "lcp", "cone")
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """An impulse that stands for the solution, or the best that was found. `str()` is one line."""
+
+    impulse: FloatArray = field(repr=False)  # (m,) N s
+    residual: Residual
+    solver: str  # who found it, e.g. "auto: direct 1 factorisations"
+    refusal: str  # why there are no energies: asymmetric or indefinite A; empty where there are
+    witness: Witness | None = field(repr=False)  # what it proves; None under Coulomb's law, or where refused
+
+    @property
+    def accepted(self) -> bool:
+        """Near enough to a solution that distances to it are told: relative <= 1e-10, or at the floor."""
+        return self.residual.relative <= ACCEPTED or self.residual.at_floor
+
+    def __str__(self) -> str:
+        quality = "" if self.accepted else ", no solution"
+        return (
+            f"{self.solver}, relative {self.residual.relative:.1e}, floor {self.residual.floor:.1e}{quality}"
+        )
+
+
+@dataclass
+class Kept:
+    """Everything that this room keeps with a problem."""
+
+    operator: operators.Operator
+    refusal: str
+    reference: Reference | None = None
+    motions: Any = None  # `Motions` of a search, or None
+
+
+def kept(problem: Problem) -> Kept:
+    """What is kept with a problem, made when first asked for.
+
+    Raises
+    ------
+    CapabilityError
+        A problem with ellipses, whose motion is that of its disks.
+    """
+    if problem.cones.has_ellipse:
+        raise CapabilityError(
+            "the motions of ellipses are those of problem.disk: give that, and impulses as problem.on_disk(impulse)"
+        )
+    with problem.derived.lock:
+        own = problem.derived.motion
+        if own is None:
+            operator = operators.make(problem)
+            own = problem.derived.motion = Kept(operator, operator.refusal() or "")
+        return own
+
+
+def reference(problem: Problem) -> Reference:
+    """The problem's reference; solved for by `auto` when first asked, then kept with the problem.
+
+    The best that was found, also where it is no solution: ask `accepted`.
+    """
+    own = kept(problem)
+    if own.reference is None:
+        found = uninterrupted(solve(problem, SOLVER, tol=ASKED))
+        own.reference = judged(problem, found.impulse, f"{SOLVER}: {found.message}")
+    return own.reference
+
+
+def adopt(problem: Problem, impulse: Any, solver: str = "given") -> Reference:
+    """Judge an impulse (m,) [N s] and keep it as the problem's reference if it is better than the one kept."""
+    own = kept(problem)
+    new = judged(problem, problem.impulse_array(impulse, "reference"), solver)
+    if own.reference is None or new.residual.relative < own.reference.residual.relative:
+        own.reference = new
+    return own.reference
+
+
+def judged(problem: Problem, impulse: FloatArray, solver: str) -> Reference:
+    """A reference of an impulse that is finite and of the right length."""
+    own = kept(problem)
+    impulse = read_only(np.array(impulse))
+    proof = None
+    if not own.refusal and problem.law in CONVEX:
+        proof = witness(problem, own.operator, impulse)
+    return Reference(impulse, residual(problem, impulse, "float64"), solver, own.refusal, proof)
+
+
+def as_reference(problem: Problem, given: Any) -> Reference:
+    """A reference of what a caller gave: one already, a Solution, or an impulse (m,) [N s]."""
+    solver, impulse = "given", given
+    if isinstance(given, Reference):
+        if given.residual._problem is problem:
+            return given
+        solver, impulse = given.solver, given.impulse  # of another problem, or an equal one: judged anew
+    elif isinstance(given, Solution):
+        solver, impulse = given.solver.name, given.impulse
+    return judged(problem, problem.impulse_array(impulse, "reference"), solver)

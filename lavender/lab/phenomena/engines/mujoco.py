@@ -1,0 +1,140 @@
+"""MuJoCo: native shapes and joints, its default step and solver."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
+from lavender.io.mujoco import from_mujoco, impulse
+from lavender.judge.residuals import residual
+from lavender.lab.phenomena.engines import Stepping
+from lavender.lab.phenomena.engines.tree import parents, relative
+from lavender.problem import Problem
+from lavender.sim.scene import Box, Joint, Plane, Scene, Sphere
+from lavender.sim.scene.parts import rotation
+
+__all__ = ["Engine"]
+
+
+def _text(x: Any) -> str:
+    return " ".join(repr(float(v)) for v in x)
+
+
+def _tie(joint: Joint) -> str:
+    # The first body must not be the world; the anchor is in its frame.
+    first, second, anchor = (
+        (joint.b, joint.a, joint.anchor_b) if joint.a < 0 else (joint.a, joint.b, joint.anchor_a)
+    )
+    other = "" if second < 0 else f'body2="b{second}"'
+    return f'<connect body1="b{first}" {other} anchor="{_text(anchor)}"/>'
+
+
+class Engine(Stepping):
+    """`mj_step`, by default of 2 ms with Newton to 1e-8.
+
+    Parameters
+    ----------
+    cone : {"pyramidal", "elliptic"}
+    noslip : int
+        Its iterations.
+    dt : float, optional, s
+    sweeps : int, optional
+        PGS with so many at tolerance 0, in place of Newton.
+    tree : bool
+        Joints are those of a tree; False: equalities between free bodies.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        cone: str,
+        noslip: int = 0,
+        dt: float | None = None,
+        sweeps: int = 0,
+        tree: bool = True,
+    ) -> None:
+        self.scene, self.up = scene, parents(scene, "mujoco") if tree else {}
+        ties = [] if tree else scene.joints
+        p = scene.parameters
+        spin = ' condim="6"' if p.rolling_radius else ' condim="4"' if p.patch_radius else ""
+        friction = f'friction="{p.friction!r} {p.friction * p.patch_radius!r} {p.rolling_radius!r}"'
+        step = f' timestep="{dt!r}"' if dt else ""
+        solver = f' solver="PGS" iterations="{sweeps}" tolerance="0"' if sweeps else ""
+        option = (
+            f'<option cone="{cone}" noslip_iterations="{noslip}" gravity="{_text(p.gravity)}"{step}{solver}/>'
+        )
+        room = "64M" if tree else "1G"  # of contacts and rows between free bodies
+        self.apart = ' contype="0" conaffinity="0"' if scene.joints else ""
+        trees = "".join(self._body(i) for i in range(scene.n_bodies) if i not in self.up or self.up[i].a < 0)
+        self.model = mujoco.MjModel.from_xml_string(
+            f"<mujoco>{option}<size memory='{room}'/><default><geom {friction}{spin}/></default>"
+            f"<worldbody>{trees}</worldbody><equality>{''.join(map(_tie, ties))}</equality></mujoco>"
+        )
+        self.data = mujoco.MjData(self.model)
+        self.dt = float(self.model.opt.timestep)
+        how = f"{sweeps} sweeps" if sweeps else "Newton"
+        self.setting = f"{1e3 * self.dt:.3g} ms, {how}, {cone}" + (f", noslip {noslip}" if noslip else "")
+        self.ids = [
+            mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_BODY, f"b{i}") for i in range(scene.n_bodies)
+        ]
+        for i, body in enumerate(scene.bodies):
+            if i not in self.up and not body.is_static:
+                at = self.model.jnt_dofadr[self.model.body_jntadr[self.ids[i]]]
+                # of a free joint the spin is in the body's frame
+                spun = rotation(body.quaternion).T @ body.angular_velocity
+                self.data.qvel[at : at + 6] = np.concatenate([body.velocity, spun])
+        mujoco.mj_forward(self.model, self.data)
+
+    def _body(self, i: int) -> str:
+        body, joint = self.scene.bodies[i], self.up.get(i)
+        shape = body.shape
+        if isinstance(shape, Plane):
+            at = f'pos="{_text(shape.offset * np.asarray(shape.normal))}" zaxis="{_text(shape.normal)}"'
+            return f'<body name="b{i}"><geom type="plane" size="0 0 1" {at}/></body>'
+        if isinstance(shape, Sphere):
+            geom = f'type="sphere" size="{shape.radius!r}"'
+        elif isinstance(shape, Box):
+            geom = f'type="box" size="{_text(0.5 * np.asarray(shape.size))}"'
+        else:
+            raise CapabilityError(f"{body.name} has no shape that mujoco could be given")
+        above = None if joint is None or joint.a < 0 else self.scene.bodies[joint.a]
+        place, turn = relative(above, body)
+        tie = "" if body.is_static else "<freejoint/>"
+        geom += self.apart if not body.is_static else ""
+        if joint is not None:
+            kind = f'type="hinge" axis="{_text(joint.axis_b)}"' if joint.kind == "hinge" else 'type="ball"'
+            tie = f'<joint {kind} pos="{_text(joint.anchor_b)}"/>'
+        inside = "".join(self._body(j) for j, other in self.up.items() if other.a == i)
+        weight = f' mass="{body.mass!r}"' if body.mass else ""
+        return f'<body name="b{i}" pos="{_text(place)}" quat="{_text(turn)}">{tie}<geom {geom}{weight}/>{inside}</body>'
+
+    def step(self) -> None:
+        """See `Stepping.step`."""
+        mujoco.mj_step(self.model, self.data)
+
+    def problem(self) -> Problem:
+        """The constraint problem of the last step."""
+        return from_mujoco(self.model, self.data, name=f"mujoco {self.scene.name}")
+
+    def left(self) -> tuple[int, float, float]:
+        """See `Stepping.left`."""
+        d = self.data
+        depth = max(0.0, -float(d.contact.dist[: d.ncon].min())) if d.ncon else 0.0
+        if self.scene.joints:
+            depth = float(np.abs(d.efc_pos[: d.nefc]).max(initial=0.0))
+        return int(d.ncon), depth, residual(self.problem(), impulse(self.model, d)).relative
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """See `Stepping.state`; poses belong to the velocities of the same time."""
+        mujoco.mj_kinematics(self.model, self.data)
+        mujoco.mj_comPos(self.model, self.data)
+        mujoco.mj_comVel(self.model, self.data)
+        v, one = np.zeros((len(self.ids), 6)), np.zeros(6)
+        for k, i in enumerate(self.ids):
+            mujoco.mj_objectVelocity(self.model, self.data, mujoco.mjtObj.mjOBJ_BODY, i, one, 0)
+            v[k] = np.roll(one, 3)  # it gives spin first
+        return self.data.xpos[self.ids].copy(), self.data.xquat[self.ids].copy(), v

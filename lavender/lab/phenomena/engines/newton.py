@@ -1,0 +1,99 @@
+"""Newton on the CPU: native shapes, joints of a tree, its solvers by name."""
+
+from __future__ import annotations
+
+import newton
+import numpy as np
+import warp as wp
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
+from lavender.lab.phenomena.engines import Stepping
+from lavender.lab.phenomena.engines.tree import parents, relative, xyzw
+from lavender.sim.scene import Box, Plane, Scene, Sphere
+
+__all__ = ["Engine"]
+
+SUBSTEPS = 4
+
+
+class Engine(Stepping):
+    """`collide` and `step`, four times in 1/60 s."""
+
+    def __init__(self, scene: Scene, solver: str, **options: float) -> None:
+        self.scene, self.up, self.dt = scene, parents(scene, "newton"), 1.0 / 60.0
+        wp.config.quiet = True
+        wp.set_device("cpu")
+        p = scene.parameters
+        builder = newton.ModelBuilder(gravity=tuple(map(float, p.gravity)))
+        material = newton.ModelBuilder.ShapeConfig(
+            density=0.0, mu=p.friction, mu_rolling=0.0, mu_torsional=p.patch_radius * p.friction,
+            has_shape_collision=not self.up,
+        )  # fmt: skip
+        self.bodies = [self._add(builder, i, material) for i in range(scene.n_bodies)]
+        if self.up:
+            builder.add_articulation([self._join(builder, i) for i in sorted(self.up)])
+        builder.color()
+        model = builder.finalize()
+        self.solver = getattr(newton.solvers, f"Solver{solver}")(model, **options)
+        more = "".join(f", {k} {v:g}" for k, v in options.items())
+        self.setting = f"16.7 ms in {SUBSTEPS}, {solver}{more}"
+        self.now, self.next, self.control = model.state(), model.state(), model.control()
+        newton.eval_fk(model, model.joint_q, model.joint_qd, self.now)
+        self.pipeline = newton.CollisionPipeline(model)
+        self.contacts = self.pipeline.contacts()
+
+    def _add(self, builder: newton.ModelBuilder, i: int, material: newton.ModelBuilder.ShapeConfig) -> int:
+        body, shape = self.scene.bodies[i], self.scene.bodies[i].shape
+        if isinstance(shape, Plane):
+            builder.add_shape_plane(
+                (*map(float, shape.normal), -float(shape.offset)), width=0.0, length=0.0, cfg=material
+            )
+            return -1
+        if not isinstance(shape, (Sphere, Box)) or body.is_static:
+            raise CapabilityError(f"{body.name} has no shape that newton could be given")
+        add = builder.add_link if i in self.up else builder.add_body
+        made = add(
+            xform=_place(body.position, body.quaternion), mass=body.mass, inertia=wp.mat33(body.inertia)
+        )
+        if isinstance(shape, Sphere):
+            builder.add_shape_sphere(made, radius=shape.radius, cfg=material)
+        else:
+            hx, hy, hz = (0.5 * s for s in shape.size)
+            builder.add_shape_box(made, hx=hx, hy=hy, hz=hz, cfg=material)
+        if i not in self.up:
+            builder.joint_qd[-6:] = [*body.velocity, *body.angular_velocity]
+        return int(made)
+
+    def _join(self, builder: newton.ModelBuilder, i: int) -> int:
+        joint = self.up[i]
+        parent = -1 if joint.a < 0 else self.bodies[joint.a]
+        _, turn = relative(None if joint.a < 0 else self.scene.bodies[joint.a], self.scene.bodies[i])
+        at = {
+            "parent_xform": _place(joint.anchor_a, turn),
+            "child_xform": _place(joint.anchor_b, np.array([1.0, 0, 0, 0])),
+        }
+        if joint.kind == "hinge":
+            return int(builder.add_joint_revolute(parent, self.bodies[i], axis=wp.vec3(*joint.axis_b), **at))
+        return int(builder.add_joint_ball(parent, self.bodies[i], **at))
+
+    def step(self) -> None:
+        """See `Stepping.step`."""
+        for _ in range(SUBSTEPS):
+            self.now.clear_forces()
+            self.pipeline.collide(self.now, self.contacts)
+            self.solver.step(self.now, self.next, self.control, self.contacts, self.dt / SUBSTEPS)
+            self.now, self.next = self.next, self.now
+
+    def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """See `Stepping.state`; it keeps 32 bits."""
+        places, speeds = self.now.body_q.numpy().astype(float), self.now.body_qd.numpy().astype(float)
+        x, q, v = self.placed()
+        for i, k in enumerate(self.bodies):
+            if k >= 0:
+                x[i], q[i], v[i] = places[k, :3], np.roll(places[k, 3:], 1), speeds[k]
+        return x, q, v
+
+
+def _place(x: FloatArray, q: FloatArray) -> wp.transform:
+    return wp.transform(tuple(map(float, x)), tuple(xyzw(q)))

@@ -1,0 +1,404 @@
+"""Which rows repeat others, what is unique all the same, and one impulse to stand for many.
+
+Where A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's
+velocity, is unique for symmetric positive semidefinite A without Coulomb friction. A row is redundant when
+what is left of it after all rows before it are taken out,
+
+    p_i = A_ii - A_iB A_BB^-1 A_Bi   (B: rows before i that are not redundant)   [1/kg]
+
+is at most `tol` A_ii: the squared share of its direction that is new, in the metric of the masses. Where J is
+known, what is new in J alone counts, too: beside a body that is 1e13 times heavier the masses hide it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.base.arrays import FloatArray, IntArray, number
+from lavender.base.errors import CapabilityError, InputError, SolveFailed
+from lavender.base.later import lapack
+from lavender.base.later import sparse as sp
+from lavender.judge.residuals import residual
+from lavender.problem import Problem, check_problem
+from lavender.problem.cones import Cones
+from lavender.problem.derived import cached_property
+from lavender.problem.operators import semidefinite
+from lavender.problem.ordering import rows_of_each
+from lavender.solving.solve import solve
+from lavender_ext.pivot.direct import Pivoting
+
+__all__ = ["Redundancy", "redundancy"]
+
+DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
+# Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
+SHIFT = 1e-13
+TIKHONOV = 1e-7  # -, weight of the distance to the wanted impulse while its rows are found
+FALLS_BACK = 1e-10  # A_ii over the largest entry of its row, up to which d is that entry
+SOUND = 1e-8  # -, above 1, up to which |A_ij| / sqrt(A_ii A_jj) is that of a semidefinite A
+UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
+ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
+
+
+Places = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Redundancy:
+    """What `redundancy` found; `str()` says it in a few lines."""
+
+    problem: Problem
+    rank: int  # of A
+    tol: float  # -, share of A_ii up to which a row counts as redundant; the largest that was used
+    method: str  # how the rank was found, in words
+    rows: tuple[int, ...]  # redundant rows: each adds nothing to the others that are kept
+    impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
+    _scale: FloatArray = field(repr=False)  # (m,) sqrt kg, D^-1/2
+    # Rows and orthonormal null basis of D^-1/2 A D^-1/2 on them, of each dense island that has one.
+    _null: tuple[tuple[IntArray, FloatArray], ...] = field(repr=False)
+
+    @property
+    def row_names(self) -> tuple[str, ...]:
+        """Names of the redundant rows."""
+        return tuple(self.problem.row_name(i) for i in self.rows)
+
+    @cached_property
+    def blocks(self) -> tuple[int, ...]:
+        """Blocks (joints, contacts) whose rows are all redundant: without them nothing would change."""
+        ptr = self.problem.cones.ptr
+        count = np.bincount([self.problem.block_of(i) for i in self.rows], minlength=self.problem.n_blocks)
+        return tuple(int(i) for i in np.flatnonzero((count > 0) & (count == np.diff(ptr))))
+
+    @property
+    def block_names(self) -> tuple[str, ...]:
+        """Names of those blocks."""
+        first = (self.problem.row_name(int(self.problem.cones.ptr[i])) for i in self.blocks)
+        return tuple(name.rsplit(", ", 1)[0] for name in first)
+
+    @property
+    def slack_is_unique(self) -> bool:
+        """Slack and body velocities are the same in every solution."""
+        return self.problem.is_semidefinite and self.problem.law != "coulomb"
+
+    @property
+    def unique(self) -> tuple[str, ...]:
+        """What every solution shares, for a positive semidefinite A; compare nothing else."""
+        if not self.slack_is_unique:
+            return ()
+        impulse = ("impulse",) if self.rank == self.problem.m else ()
+        return ("slack", "body velocities", "objective", *impulse)
+
+    def least_norm(self) -> FloatArray:
+        """The solution of least sum d lambda^2; (m,) [N s]. As `nearest_to` zero."""
+        return self.nearest_to(np.zeros(self.problem.m))
+
+    def nearest_to(self, previous: Any) -> FloatArray:
+        """The solution with the least sum d (lambda - previous)^2 [J]; (m,) [N s].
+
+        Linear systems and boxed LCPs: to rounding. On friction cones: to about 1e-7 of its size.
+
+        Parameters
+        ----------
+        previous : (m,) N s
+
+        Raises
+        ------
+        CapabilityError
+            Coulomb friction, or bounded rows with asymmetric or indefinite A: solutions do not form one convex set.
+        SolveFailed
+            The judge did not accept the result.
+        """
+        p = self.problem
+        previous = p.impulse_array(previous, "previous")
+        if p.law == "coulomb" or (p.law != "linear" and not p.is_semidefinite):
+            raise CapabilityError(
+                "a representative impulse needs symmetric positive semidefinite A without Coulomb friction, where "
+                "solutions form one convex set; pass problem.relaxed('cone') for the convex relaxation of friction"
+            )
+        if p.law == "linear":
+            x = solve(p, "direct", impulse=previous, tol=ACCEPTED).impulse
+            return _accepted(p, self._nearest(x, previous))
+        near = _drawn_to(p, previous)
+        if p.law == "cone":
+            return _accepted(p, solve(near, _cone_solver(near), tol=1e-10).impulse, 1e-6)
+        rough = solve(
+            near, "direct", impulse=np.clip(previous, p.cones.lower, p.cones.upper), tol=1e-9
+        ).impulse
+        return _accepted(p, _polished(p, rough, previous))
+
+    def _nearest(self, x: FloatArray, previous: FloatArray) -> FloatArray:
+        # x less what of x - previous lies in the null space of A, in the metric of D.
+        z = (x - previous) / self._scale
+        for rows, basis in self._null:
+            for _ in range(2):
+                z[rows] -= basis @ (basis.T @ z[rows])
+        return previous + self._scale * z
+
+    def __str__(self) -> str:
+        m = self.problem.m
+        if self.rank == m:
+            return f"rank {m} of {m} ({self.method}): no row is redundant"
+        names = ", ".join(self.row_names[:8]) + (", ..." if len(self.rows) > 8 else "")
+        lines = [f"rank {self.rank} of {m} ({self.method}); redundant: {names}"]
+        if self.blocks:
+            more = ", ..." if len(self.blocks) > 8 else ""
+            lines.append(f"all rows of: {', '.join(self.block_names[:8])}{more}")
+        lines.append(f"unique: {', '.join(self.unique) or 'nothing is certain to be'}")
+        return "\n".join(lines)
+
+
+def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
+    """Rank of A, the rows that repeat others, and what is unique.
+
+    Islands (rows that share no body, directly or through others) are decomposed apart: up to 1,200 rows by
+    QR of J M^-1/2, and of J, with column pivoting where J is given (nothing is squared), else by Cholesky with
+    pivoting, or QR for asymmetric or indefinite A; larger ones by LDL^T of A + 1e-13 D, where pivots up to
+    1e-12 d times the number of rows count as zero.
+
+    Parameters
+    ----------
+    tol : float, default 1e-12
+        Share of A_ii up to which what is new in a row counts as nothing.
+
+    Raises
+    ------
+    InputError
+        `tol` is not between 0 and 1.
+    CapabilityError
+        Asymmetric or indefinite A with an island of more than 1,200 rows; numbers whose products are beyond float64.
+    """
+    check_problem(problem)
+    if not number("tol", tol, low=0.0) < 1.0:
+        raise InputError(f"tol is {tol}; a share from 0 to 1 is needed")
+    m = problem.m
+    unique = np.ones(m, bool)
+    dependent: list[int] = []
+    null: list[tuple[IntArray, FloatArray]] = []
+    used, methods = tol, set()
+    with np.errstate(all="ignore"):  # what is not finite is told below
+        scale = 1.0 / np.sqrt(problem.csr_data.d)
+        unit = _unit(problem, scale)
+        scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
+        roots = _roots(problem) if m and problem.matrix is None and not np.any(problem.compliance) else ()
+    if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
+        raise CapabilityError(
+            "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"
+        )
+    for island in rows_of_each(problem, np.arange(m + 1, dtype=np.int32)):
+        a = scaled[island][:, island]
+        sound = problem.is_semidefinite or (problem.is_symmetric and semidefinite(a))
+        if problem.is_symmetric and len(island) <= DENSE:
+            found, words = _dense_island(a.toarray(), [root[island] for root in roots], tol, sound)
+            if len(found):
+                basis = _null_basis(a.toarray(), found)
+                if unit is not scale:  # to the metric of d
+                    basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
+                null.append((island, basis))
+                unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
+        else:
+            found, limit, words = _other_island(a, sound, tol)
+            used = max(used, limit)
+            unique[island] = len(found) == 0
+        methods.update(words)
+        dependent += island[found].tolist()
+    return Redundancy(
+        problem=problem,
+        rank=m - len(dependent),
+        tol=used,
+        method="; ".join(sorted(methods)) or "no rows",
+        rows=tuple(sorted(dependent)),
+        impulse_is_unique=unique,
+        _scale=scale,
+        _null=tuple(null),
+    )
+
+
+def _dense_island(
+    a: FloatArray, roots: list[sp.csr_array], tol: float, sound: bool
+) -> tuple[Places, list[str]]:
+    """Dependent rows of a symmetric island, each of those before it where A is `sound`, and how they were found."""
+    if not sound:
+        return _by_qr(_even(a), tol, 1), [f"QR with pivoting, {tol:.0e}"]
+    if not roots:
+        tail, words = _by_cholesky(a, tol), [f"Cholesky with pivoting, {tol:.0e}"]
+    else:
+        # On the columns that the island has; one at least.
+        own = [root[:, np.unique(np.append(root.indices, 0))] for root in roots]
+        tails = [_by_qr(root.toarray().T, tol) for root in own]
+        tail, words = min(tails, key=len), [f"QR of J M^-1/2 with pivoting, {tol:.0e}"]
+        if len({len(t) for t in tails}) > 1:
+            words.append(
+                f"of {len(a)} rows {len(a) - len(tails[0])} by the masses and "
+                f"{len(a) - len(tails[1])} without them: the larger number counts"
+            )
+    return _in_order(a, tail, tol), words
+
+
+def _other_island(a: sp.csr_array, sound: bool, tol: float) -> tuple[Places, float, list[str]]:
+    """Dependent rows of a large or asymmetric island, the share that counts as nothing, how they were found."""
+    n = a.shape[0]
+    if sound:
+        limit = max(tol, 10.0 * SHIFT * n)
+        return _sparse(a, limit), limit, [f"LDL^T of A + {SHIFT:.0e} D, {limit:.0e}"]
+    if n > DENSE:
+        raise CapabilityError(
+            f"A is asymmetric or indefinite and {n} of its rows hang together; the rank of at most "
+            f"{DENSE} can be told: ask for parts, or for the symmetric part of A"
+        )
+    return _by_qr(_even(a.toarray().T), tol, 1), tol, [f"QR with pivoting, {tol:.0e}"]
+
+
+def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
+    """Factors (m,) that make the diagonal of A one: those of d, but where d is another number than a sound A_ii.
+
+    Beside rows of very much heavier bodies (1e20 and more) d falls back to what stands beside A_ii. Where no entry of
+    the row is above sqrt(A_ii A_jj), as in every semidefinite A, A_ii is no rounding, and the row is scaled by it.
+    """
+    if problem.matrix is None:
+        return scale
+    a = problem.csr
+    own = a.diagonal()
+    beside = abs(a).max(axis=1).toarray().ravel() if problem.m else own
+    fallen = (own > 0.0) & (own <= FALLS_BACK * beside)
+    if not fallen.any():
+        return scale
+    with np.errstate(all="ignore"):
+        tried = np.where(fallen, 1.0 / np.sqrt(np.where(fallen, own, 1.0)), scale)
+        share = (
+            abs(sp.csr_array(sp.diags_array(tried) @ a @ sp.diags_array(tried))).max(axis=1).toarray().ravel()
+        )
+    return np.where(fallen & (share <= 1.0 + SOUND), tried, scale)
+
+
+def _roots(problem: Problem) -> tuple[sp.csr_array, sp.csr_array]:
+    """Two matrices of unit rows whose rank is A's: J M^-1/2, and J with the same root of a unit mass in its place.
+
+    Each hides what is small in it: the first what heavy bodies alone would feel, the second what is small in J.
+    """
+    whole = problem.velocity_form().jacobian
+    if problem.generalized is not None:
+        bare = problem.generalized.jac
+    else:
+        rows = problem.rows
+        assert rows is not None
+        heavy = np.abs(rows.inv_inertia).max(axis=(1, 2)) if rows.n_bodies else np.zeros(0)
+        light = np.where(heavy > 0.0, heavy, 1.0)[:, None, None]
+        plain = replace(
+            rows,
+            inv_mass=(rows.inv_mass > 0.0).astype(float),
+            inv_inertia=rows.inv_inertia / light,
+            copy=False,
+        )
+        bare = Problem(problem.b, problem.cones, rows=plain, copy=False).velocity_form().jacobian
+    for squared in (False, True):  # the largest entry first: squares of large ones overflow
+        size = np.sqrt((bare * bare).sum(axis=1)) if squared else abs(bare).max(axis=1).toarray().ravel()
+        bare = sp.csr_array(sp.diags_array(1.0 / np.where(size > 0.0, size, 1.0)) @ bare)
+    return whole, bare
+
+
+def _by_qr(a: FloatArray, tol: float, power: int = 2) -> Places:
+    """Columns of `a` that depend on the others, by QR with column pivoting; `tol` of the remaining lengths ** power.
+
+    Two of a root of A, whose squares are what is new in A_ii; one of A itself.
+    """
+    from scipy.linalg import qr
+
+    r, order = qr(a, mode="r", pivoting=True)
+    size = np.abs(np.diagonal(r)) ** power
+    rank = int(np.count_nonzero(size > tol * size[0])) if len(size) and size[0] > 0.0 else 0
+    return np.sort(order[rank:])
+
+
+def _even(a: FloatArray) -> FloatArray:
+    """`a` with the largest entry of each row and column near 1, by factors that leave its rank."""
+    for axis in (0, 1, 0, 1, 0, 1, 0, 1):
+        most = np.abs(a).max(axis=axis, keepdims=True)
+        a = a / np.sqrt(np.where(most > 0.0, most, 1.0))
+    return a
+
+
+def _by_cholesky(a: FloatArray, tol: float) -> Places:
+    """Rows of a semidefinite `a` (unit diagonal) that depend on the others, by Cholesky with pivoting."""
+    # Rounding alone leaves a pivot of about len(a) 2^-53.
+    _, order, rank, _ = lapack.dpstrf(a, tol=max(tol, len(a) * 2.0**-52))
+    return np.sort(order[rank:] - 1)
+
+
+def _in_order(a: FloatArray, tail: Places, tol: float) -> Places:
+    """As many rows as `tail`, each dependent on rows before it; `tail` itself where that cannot be told."""
+    if len(tail) == 0:
+        return tail
+    m = len(a)
+    problem = Problem.linear(a, np.zeros(m))
+    pivoting = Pivoting(problem.csr_data, m - 1, np.arange(m, dtype=np.int32), max(tol, m * 2.0**-52))
+    pivoting.factor_all()
+    found = np.array(pivoting.skipped(), np.intp)
+    return found if len(found) == len(tail) else tail
+
+
+def _null_basis(a: FloatArray, found: Places) -> FloatArray:
+    """Orthonormal null vectors, from (-A_BB^-1 A_Bi, e_i) for each redundant row i."""
+    kept = np.setdiff1d(np.arange(len(a)), found)
+    vectors = np.zeros((len(a), len(found)))
+    vectors[found] = np.eye(len(found))
+    if len(kept):
+        _, share, info = lapack.dposv(a[np.ix_(kept, kept)], a[np.ix_(kept, found)])
+        if info != 0:
+            share = np.linalg.lstsq(a[np.ix_(kept, kept)], a[np.ix_(kept, found)], rcond=None)[0]
+        vectors[kept] = -share
+    return np.linalg.qr(vectors)[0]
+
+
+def _sparse(a: sp.csr_array, limit: float) -> Places:
+    """Dependent rows of a large semidefinite `a` (unit diagonal)."""
+    import qdldl
+
+    m = a.shape[0]
+    upper = sp.triu(a + SHIFT * sp.eye_array(m), format="csc")
+    _, pivot, order = qdldl.Solver(sp.csc_matrix(upper), upper=True).factors()
+    return np.sort(np.asarray(order, np.intp)[pivot <= limit])
+
+
+def _drawn_to(p: Problem, previous: FloatArray) -> Problem:
+    """The problem with TIKHONOV / 2 sum d (lambda - previous)^2 added to its energy."""
+    weight = TIKHONOV * p.csr_data.d
+    a = sp.csr_array(p.csr + sp.diags_array(weight))
+    return Problem(p.b + weight * previous, p.cones, a, friction=p.friction)
+
+
+def _cone_solver(p: Problem) -> str:
+    from lavender.solvers.registry import available
+
+    here = [name for name in ("newton", "clarabel_cone") if name in available(p)]
+    if not here:
+        raise CapabilityError("friction cones need newton or clarabel_cone here; see lavender.known(problem)")
+    return here[0]
+
+
+def _polished(p: Problem, rough: FloatArray, previous: FloatArray) -> FloatArray:
+    """Free rows of `rough` solved on A itself, nearest to `previous`, the others at their bounds."""
+    c = p.cones
+    # A free row stands off its bounds by more than the weight could have moved it.
+    slop = (
+        10.0 * TIKHONOV * max(float(np.abs(rough).max(initial=0.0)), float(np.abs(previous).max(initial=0.0)))
+    )
+    free = (rough > c.lower + slop) & (rough < c.upper - slop)
+    x = np.where(free, rough, np.where(rough <= c.lower + slop, c.lower, c.upper))
+    rows = np.flatnonzero(free)
+    if len(rows):
+        rest = p.csr[rows] @ np.where(free, 0.0, x)
+        part = Problem(p.b[rows] - rest, Cones.free(len(rows)), p.csr[rows][:, rows])
+        y = redundancy(part).nearest_to(previous[rows])
+        x[rows] = np.clip(y, c.lower[rows], c.upper[rows])
+    good, bad = residual(p, x, "float64"), residual(p, rough, "float64")
+    return x if good.relative <= bad.relative or good.at_floor else rough
+
+
+def _accepted(p: Problem, impulse: FloatArray, tol: float = ACCEPTED) -> FloatArray:
+    r = residual(p, impulse, "float64")
+    if not (r.relative <= tol or r.at_floor):
+        raise SolveFailed(f"the representative impulse is not a solution to {tol:.0e}: {r}")
+    return impulse

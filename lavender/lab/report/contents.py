@@ -1,0 +1,423 @@
+"""Every table of a report, described once: its page, the terminal, the summary and a paper show the same rows.
+
+`sections` is their order for those who read from top to bottom: the terminal and the summary walk it. The page has the
+same tables between its figures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
+from lavender.lab.bench.store import Records
+from lavender.lab.report import tables
+from lavender.lab.report.engine import Contestant
+from lavender.lab.report.findings import Report
+from lavender.lab.report.moved import idle, speed_name
+from lavender.lab.report.table import WORDS, Cell, Table
+from lavender.lab.report.tables import Advice, Line
+from lavender.lab.report.text import NONE, count, percent, residual, seconds, share, times, who, without
+
+__all__ = [
+    "Section",
+    "advice_table",
+    "backend_table",
+    "case_table",
+    "change_table",
+    "claim_table",
+    "engine_table",
+    "failure_table",
+    "idle_table",
+    "mean_table",
+    "moved_table",
+    "pass_table",
+    "reach_table",
+    "robustness_table",
+    "sections",
+    "short_table",
+    "skip_table",
+    "speed_table",
+    "spread_table",
+    "sweeps_table",
+]
+
+Rows = list[Sequence[str | Cell]]
+GOOD = ("CONVERGED", "FLOOR")
+SHOWN_TIES = 2
+NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table under its heading."""
+
+    title: str
+    note: str  # what its numbers are
+    table: Table
+    grouped: bool = False  # rows of one case or structure stand together
+    empty: str = ""  # what is said in place of no rows; a section without rows and this is left out
+
+
+def sections(report: Report) -> list[Section]:
+    """What a report has to show as tables, from the recommendations to what changed since an earlier one."""
+    records, levels = report.records, report.levels
+    moved = "how wrong the body moves that is furthest off"
+    if report.is_campaign:
+        shares = robustness_table(tables.robustness(records), levels)
+        by_speed = robustness_table(tables.robustness(report.by_speed), report.speeds, " m/s")
+        note = "no times; share of cases brought to a level, residual at each budget"
+        found = [
+            Section("Campaign", note, shares, grouped=True),
+            Section("By motion error", moved, by_speed, grouped=True),
+        ]
+    else:
+        by_structure = (
+            "to a level: mean time (cold, if not carried), share of cases that get there, budget; in a time or with "
+            "sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good within "
+            "noise"
+        )
+        by_sweeps = "share of cases served, residual at the 90th percentile"
+        inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
+        every = "floor: rounding to float64 allows no better"
+        carried = "median residual, time of all steps; carried from step to step, or cold"
+        cases = reach_table(tables.reaches(records, levels), levels).without("form")
+        found = [
+            Section("By structure", by_structure, advice_table(report)),
+            Section("By sweeps", by_sweeps, sweeps_table(report.lines)),
+            Section("Inside the engine", inside, engine_table(report.engines)),
+            Section("By motion error", moved, speed_table(report)),
+            Section("Motion error of each case", moved, moved_table(report), grouped=True),
+            Section("Cases", every, cases, grouped=True),
+            Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True),
+        ]
+    if report.before is not None:
+        changed = change_table(report.before, records)
+        title = f"Against {printable(report.before.source)}"
+        empty = "nothing beyond noise" if tables.changes(report.before, records) else NOT_COMPARED
+        found.append(Section(title, "times to a level", changed, empty=empty))
+    return [s for s in found if s.table.rows or s.empty]
+
+
+def short_table(report: Report) -> Table:
+    """To the middle level alone: who is first in each structure, of one structure its solvers; shares of a campaign."""
+    middle = len(report.levels) // 2
+    if report.is_campaign:
+        found = robustness_table(tables.robustness(report.records), report.levels[middle : middle + 1])
+        return found.without(*(head for head in found.heads if "iterations" in head), "hardest")
+    by_motion = any(run.plan.get("speed_levels") for run in report.every.runs.values())
+    if len(report.lines) == 1 and not by_motion:
+        ranking = report.lines[0].by_level[report.levels[middle]].ranking
+        rows: Rows = [
+            [c.solver, seconds(c.score) + share(c.solved, c.cases), c.how] for c in ranking if c.solved
+        ]
+        return Table(["solver", f"to {level_name(report.levels[middle])}", "asked"], rows)
+    found = speed_table(report) if by_motion else advice_table(report)
+    column = 1 + (len(report.speeds) // 2 if by_motion else middle)
+    rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
+    return Table(["structure", found.heads[column]], rows, words=WORDS | {found.heads[column]})
+
+
+# -- recommendations ---------------------------------------------------------------------------------------
+
+
+def advised(advice: Advice, in_time: bool) -> Cell:
+    """Who is first, in what time or with what residual, on how many cases and with which budget."""
+    best, ties = advice.best, advice.ties
+    if best is None:
+        most = advice.ranking[0] if advice.ranking else None
+        return Cell("nobody", after=f" ({most.solved}/{most.cases} at most)" if most and most.solved else "")
+    say = residual if in_time else seconds
+    after = f", {best.how}" if best.how else ""
+    if ties:
+        left = f" and {len(ties) - SHOWN_TIES} more" if len(ties) > SHOWN_TIES else ""
+        after += f" ≈ {', '.join(ties[:SHOWN_TIES])}{left}"
+    more, title = "", ", ".join(ties)
+    if best.cases > 1 and not math.isnan(best.worst):
+        p95 = f"p95 {say(best.p95)}, " if best.cases >= 20 and not in_time else ""
+        more, title = (
+            f"{p95}worst {say(best.worst)}",
+            f"worst: {best.hardest}" + (f"; ≈ {title}" if ties else ""),
+        )
+    mark = "warn" if best.solved < best.cases else ""
+    text = ("to " if in_time else "") + say(best.score) + share(best.solved, best.cases)
+    return Cell(text, best.solver, after, more, title, mark=mark)
+
+
+def advice_table(report: Report, links: Mapping[str, str] | None = None) -> Table:
+    """Each structure and sequence: who gets to each level, and who serves most within each time [s].
+
+    `links` are the parts of the page that a name leads to.
+    """
+    heads = [*(f"to {level_name(x)}" for x in report.levels), *(f"in {seconds(t)}" for t in report.times)]
+    rows: Rows = [
+        [
+            Cell(
+                line.name,
+                after=without(line.left_out),
+                more=count(line.size, "step" if line.sequence else "case"),
+                link=(links or {}).get(line.name, ""),
+            ),
+            *(advised(a, False) for a in line.by_level.values()),
+            *(advised(a, True) for a in line.by_time.values()),
+        ]
+        for line in report.lines
+    ]
+    return Table(["structure", *heads], rows, folds=True)
+
+
+def sweeps_table(lines: Sequence[Line]) -> Table:
+    """The same with each budget of sweeps; no rows where none was run."""
+    budgets = sorted({n for line in lines for n in line.by_sweeps})
+    heads = [count(int(n), "sweep") for n in budgets]
+    rows: Rows = [
+        [Cell(line.name, after=without(line.left_out)), *(advised(x, True) for x in line.by_sweeps.values())]
+        for line in lines
+        if line.by_sweeps
+    ]
+    return Table(["structure", *heads], rows, folds=True)
+
+
+def speed_table(report: Report) -> Table:
+    """Each structure: who gets to each motion error [m/s]."""
+    heads = [f"to {speed_name(x)}" for x in report.speeds]
+    rows: Rows = [
+        [line.name, *(advised(a, False) for a in line.by_level.values())]
+        for line in tables.advice(report.by_speed)
+        if not line.sequence
+    ]
+    return Table(["structure", *heads], rows, folds=True)
+
+
+# -- cases -------------------------------------------------------------------------------------------------
+
+
+def case_table(
+    records: Records, fastest: Mapping[str, tables.Reach | None], level: float, stored: bool
+) -> Table:
+    """Each case: what it is, who is first to the level, and the answer stored beside it where any has one."""
+    rows: Rows = []
+    for name, best in fastest.items():
+        info = records.cases[name]
+        time = math.inf if best is None else best.times[level]
+        answer = residual(info.stored) if math.isfinite(info.stored) else NONE
+        rows.append(
+            [
+                Cell(name, link=f"case-{file_name(name)}"), info.law, str(info.rows), str(info.contacts),
+                ", ".join(info.structure), "nobody" if best is None else best.solver, Cell(seconds(time), value=time),
+                Cell(answer, value=info.stored),
+            ]
+        )  # fmt: skip
+    head = f"fastest to {level_name(level)}"
+    heads = ["case", "law", "rows", "contacts", "structure", head, "time", "stored answer"]
+    found = Table(heads, rows, words=WORDS | {head})
+    return found if stored else found.without("stored answer")
+
+
+def reach_table(reaches: Sequence[tables.Reach], levels: Sequence[float]) -> Table:
+    """Each case and solver: time to each level, smallest residual, status, and whether the claim holds."""
+    rows: Rows = [
+        [
+            r.case,
+            who(r.solver, r.start),
+            *(seconds(r.times[x]) for x in levels),
+            Cell(residual(r.best), after=" floor" if r.at_floor else ""),
+            Cell(r.status, mark="good" if r.status in GOOD else "warn"),
+            Cell("✗ contradicted" if r.contradicted else "", more=r.contradicted),
+            r.form,
+        ]
+        for r in reaches
+    ]
+    marks = ["bad" if r.contradicted else "" for r in reaches]
+    heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status", "claim", "form"]
+    return Table(heads, rows, marks)
+
+
+def moved_table(report: Report) -> Table:
+    """Each case and solver: time to each motion error, the smallest, relative, and its bound."""
+    levels = report.speeds
+    rows: Rows = []
+    for m in tables.reaches(report.by_speed, levels):
+        known = [
+            f"{residual(x)}{unit}" if math.isfinite(x) else NONE
+            for x, unit in ((m.best, " m/s"), (m.motion, ""), (m.bound, " √J"))
+        ]
+        rows.append([m.case, who(m.solver, m.start), *(seconds(m.times[x]) for x in levels), *known])
+    heads = [f"to {speed_name(x)}" for x in levels]
+    return Table(["case", "solver", *heads, "best", "relative", "bound"], rows)
+
+
+def idle_table(records: Records) -> Table:
+    """Cases where doing nothing is right, and the worst that a solver made of each, in units."""
+    rows: Rows = [
+        [c.case, str(c.rows), c.solver or "nobody", f"{residual(c.velocity)} m/s", f"{residual(c.energy)} √J"]
+        for c in idle(records)
+    ]
+    return Table(["case", "rows", "solver", "velocity", "energy"], rows)
+
+
+def failure_table(failures: Sequence[Record], campaign: bool) -> Table:
+    """Runs that missed what they were asked for, and false claims; of a campaign cases have no part of the page."""
+    rows: Rows = [
+        [
+            Cell(f.case, link="" if campaign else f"case-{file_name(f.case)}"), who(f.solver, f.start), f.asked,
+            f.status, residual(f.relative), residual(f.floor), f.worst_name,
+            (f"✗ {f.contradicted}. " if f.contradicted else "") + f.message,
+        ]
+        for f in failures
+    ]  # fmt: skip
+    marks = ["bad" if f.contradicted else "" for f in failures]
+    return Table(
+        ["case", "solver", "asked", "status", "residual", "floor", "worst row", "message"], rows, marks
+    )
+
+
+def skip_table(skips: Sequence[Skip]) -> Table:
+    """Pairs of case and solver that were not run, or not to the end."""
+    return Table(["case", "solver", "reason"], [[s.case, s.solver, s.reason] for s in skips])
+
+
+def change_table(old: Records, new: Records) -> Table:
+    """What differs from an earlier run beyond noise."""
+    found = [c for c in tables.changes(old, new) if c.kind != "same"]
+    rows: Rows = []
+    for c in found:
+        factor = f" {c.new / c.old:.3g} times" if c.kind in ("faster", "slower") else ""
+        times_of = (level_name(c.level), seconds(c.old), seconds(c.new))
+        rows.append([c.case, who(c.solver, c.start), *times_of, c.kind + factor])
+    marks = ["bad" if c.kind in ("lost", "slower") else "good" for c in found]
+    return Table(["case", "solver", "level", "before", "now", "change"], rows, marks)
+
+
+# -- over many cases ---------------------------------------------------------------------------------------
+
+
+def robustness_table(rows: Sequence[tables.Robustness], levels: Sequence[float], unit: str = "") -> Table:
+    """Campaigns: shares of cases brought to each level, false claims, residual (motion error) by budget."""
+    budgets = sorted({n for row in rows for n in row.budgets})
+    cells: Rows = [
+        [
+            r.family,
+            r.solver,
+            str(r.cases),
+            *(percent(r.reached[x], r.cases, 1) for x in levels),
+            str(r.wrong),
+            str(r.died),
+            *(", ".join(map(residual, r.budgets[n])) if n in r.budgets else NONE for n in budgets),
+            r.hardest,
+        ]
+        for r in rows
+    ]
+    marks = ["bad" if r.wrong or r.died else "" for r in rows]
+    ends = [f"{n} iterations: median, 95 %" for n in budgets]
+    heads = [
+        "structure",
+        "solver",
+        "cases",
+        *(f"to {level_name(x)}{unit}" for x in levels),
+        "false claims",
+        "died",
+    ]
+    return Table([*heads, *ends, "hardest"], cells, marks)
+
+
+def claim_table(records: Records) -> Table:
+    """Each solver: how often what it says of itself holds."""
+    found = tables.claims(records)
+    rows: Rows = [
+        [
+            c.solver, str(c.runs), percent(c.claims - c.wrong, c.claims) if c.claims else NONE, str(c.claims),
+            f"✗ {c.wrong}" if c.wrong else "0", f"{c.reached} of {c.asked}", str(c.crashed),
+        ]
+        for c in found
+    ]  # fmt: skip
+    marks = ["bad" if c.wrong or c.crashed else "" for c in found]
+    return Table(["solver", "runs", "correct rate", "claims", "wrong", "levels reached", "died"], rows, marks)
+
+
+def mean_table(by_level: Mapping[float, Mapping[str, tuple[float, int, int]]]) -> Table:
+    """`tables.geometric_means` of one law: each solver's mean time to each level, and how many cases get there."""
+    levels = list(by_level)
+    rows: Rows = [
+        [
+            solver,
+            *(Cell(seconds(t), after=f" {n}/{of}") for t, n, of in (by_level[x][solver] for x in levels)),
+        ]
+        for solver in by_level[levels[0]]
+    ]
+    return Table(["solver", *(f"to {level_name(x)}" for x in levels)], rows)
+
+
+def backend_table(records: Records) -> Table:
+    """Solvers of other packages: the whole way, its two parts, and wins of their own solve against all of ours."""
+    rows: Rows = [
+        [b.solver, str(b.solved), *map(seconds, (b.whole, b.whole - b.own, b.own)), str(b.wins)]
+        for b in tables.backends(records)
+    ]
+    return Table(["solver", "cases", "whole way", "conversion", "own interface", "less than ours"], rows)
+
+
+def spread_table(spreads: Sequence[tables.Spread]) -> Table:
+    """Residuals after one budget in several orders of the blocks."""
+    rows: Rows = [
+        [
+            s.case, s.solver, str(s.budget), times(s.factor),
+            ", ".join(f"{order} {residual(x)}" for order, x in s.by_order.items()),
+        ]
+        for s in spreads
+    ]  # fmt: skip
+    return Table(["case", "solver", "budget", "spread", "residual by order"], rows)
+
+
+def pass_table(passes: Sequence[tables.Pass]) -> Table:
+    """Sequences: residual and time of each solver, carried against cold, and of how many steps where it was stopped."""
+    starts = ("carried", "cold")
+    rows: Rows = []
+    for w in passes:
+        rows.append(
+            [
+                Cell(w.sequence, after=without(w.left_out)), w.solver, w.asked, str(w.steps),
+                f"{w.gain:.3g}" if math.isfinite(w.gain) and w.mode == "budget" else NONE,
+                *(residual(w.middle(s)) if s in w.residuals else NONE for s in starts),
+                *(seconds(w.time[s]) + share(len(w.times[s]), w.steps) if s in w.time else NONE for s in starts),
+                *(str(w.iterations.get(s, NONE)) for s in starts),
+            ]
+        )  # fmt: skip
+    heads = [f"{what}, {start}" for what in ("median", "time", "iterations") for start in starts]
+    return Table(["sequence", "solver", "asked", "steps", "gain", *heads], rows)
+
+
+def engine_table(found: Sequence[Contestant]) -> Table:
+    """Engines' own answers beside the solver here that is the fastest to a level as good in every step."""
+    rows: Rows = []
+    for c in found:
+        own = [
+            c.folder,
+            f"{c.steps}{without(c.left_out)}",
+            f"{c.rows:g}",
+            c.solver,
+            seconds(c.seconds),
+            residual(c.relative),
+            residual(c.worst),
+        ]
+        here = (
+            [c.ours, seconds(c.our_seconds), residual(c.our_worst)]
+            if c.ours
+            else ["none in every step", NONE, NONE]
+        )
+        short = f"{c.velocity:.2g} m/s, {c.where}" if c.early and c.where else NONE
+        rows.append([*own, str(c.above_floor), str(c.early), short, *here])
+    heads = [
+        "recorded",
+        "steps",
+        "rows",
+        "engine's own",
+        "time",
+        "residual, median",
+        "worst",
+        "above floor",
+        "stopped early",
+        "furthest off",
+    ]
+    return Table([*heads, "fastest here", "time here", "worst here"], rows)

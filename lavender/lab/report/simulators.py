@@ -1,0 +1,93 @@
+"""Our Newton beside that of a simulator, as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
+from lavender.lab.report.table import Table, markdown
+
+__all__ = ["table", "warm_table"]
+
+S = TypeVar("S", bound=WarmStep)
+PARTS = ("ours", "many", "kernel", "prepare", "judge")  # of one call, over MuJoCo's time
+CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
+
+
+def _mean(x: Sequence[float]) -> float:
+    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
+
+
+def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
+    found = []
+    for low, high in CLASSES:
+        name = f"under {high}" if low == 0 else f"{low} and more" if high > 10**6 else f"{low}-{high}"
+        found.append((name, [s for s in steps if low <= s.rows < high]))
+    return [(name, part) for name, part in found if part]
+
+
+def _sizes(x: Sequence[float]) -> tuple[str, str]:
+    return f"{np.median(x):.1e}", f"{max(x):.1e}"
+
+
+def table(steps: Sequence[Step]) -> str:
+    """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
+    heads = [
+        "rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`", "kernel", "prepare", "judge", "Python",
+        "worst one call",
+    ]  # fmt: skip
+    rows = []
+    for name, part in _by_class(steps):
+        worst = max(part, key=lambda s: s.ours / s.engine)
+        ratios = [_mean([getattr(s, what) / s.engine for s in part]) for what in PARTS]
+        ratios.append(_mean([max(s.ours - s.kernel - s.prepare - s.judge, 1e-9) / s.engine for s in part]))
+        rows.append(
+            [
+                *(name, str(len({s.model for s in part})), str(len(part))),
+                f"{1e6 * _mean([s.engine for s in part]):.1f}",
+                *(f"{x:.2f}" for x in ratios),
+                f"{worst.ours / worst.engine:.1f} ({worst.model}, {worst.rows} rows)",
+            ]
+        )
+    convex = [s for s in steps if s.strict <= STRICT]
+    coulomb = [s for s in steps if s.coulomb is not None]
+    solved = sum(s.coulomb <= STRICT for s in coulomb if s.coulomb is not None)
+    never = sum(s.tolerance == 0.0 for s in steps)
+    told = (
+        f"{len(convex)} of {len(steps)} solved to {STRICT:.0e} or the floor of float64 under MuJoCo's own law, "
+        f"{solved} of {len(coulomb)} under Coulomb's (contacts of up to two tangents); {never} that MuJoCo brings "
+        f"to {TARGET:.0e} at no tolerance count with its default."
+    )
+    next_step = [
+        [
+            word,
+            *_sizes([getattr(s, "engine_" + name) for s in steps]),
+            *_sizes([getattr(s, name) for s in steps]),
+        ]
+        for word, name in (("momentum", "momentum"), ("kinetic energy", "energy"))
+    ]
+    errors = Table(
+        ["next step, relative error", "MuJoCo, median", "worst", "ours, median", "worst"], next_step
+    )
+    return "\n".join([*markdown(Table(heads, rows)), "", told, "", *markdown(errors)])
+
+
+def warm_table(steps: Sequence[WarmStep]) -> str:
+    """The same over consecutive steps, both sides from what they knew of the last one."""
+    rows = [
+        [
+            *(name, str(len({s.model for s in part})), str(len(part))),
+            f"{1e6 * _mean([s.engine for s in part]):.1f}",
+            f"{_mean([s.ours / s.engine for s in part]):.2f}",
+            *_sizes([s.engine_residual for s in part]),
+            *_sizes([s.residual for s in part]),
+        ]
+        for name, part in _by_class(steps)
+    ]
+    residuals = ["MuJoCo's residual, median", "worst", "ours, median", "worst"]
+    return "\n".join(
+        markdown(Table(["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals], rows))
+    )

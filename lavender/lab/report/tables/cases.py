@@ -1,0 +1,176 @@
+"""Tables of single cases: how far and how fast, what failed, whether claims hold, what an order of sweeps does.
+
+Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
+for: runs are matched by the accuracy they reached, never by the one they were asked for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from lavender.judge.residuals import at_floor
+from lavender.lab.bench.record import Record
+from lavender.lab.bench.store import Records
+from lavender.lab.report.tables.groups import DIED, levels_of, pairs
+
+__all__ = ["Claims", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far and how fast one solver came on one case."""
+
+    case: str
+    solver: str
+    start: str
+    times: Mapping[float, float]  # s to each level, inf where it was not reached
+    best: float  # smallest relative residual of any run
+    best_time: float  # s, of that run
+    floor: float  # of that run
+    status: str  # of the run to the tightest level asked for
+    contradicted: str
+    message: str
+    worst_name: str
+    form: str
+    motion: float  # -, relative motion error of the best run; nan where there is none
+    bound: float  # sqrt J, proved bound of it; nan where nothing is proved
+
+    @property
+    def at_floor(self) -> bool:
+        """No better residual can be asked of float64."""
+        return at_floor(self.best, self.floor)
+
+
+@dataclass(frozen=True)
+class Claims:
+    """What a solver said of itself, against the judge."""
+
+    solver: str
+    runs: int
+    claims: int  # says CONVERGED, FLOOR or INFEASIBLE
+    wrong: int
+    reached: int  # runs to a level that the judge confirms
+    asked: int
+    crashed: int  # ERROR, KILLED, CRASHED
+
+    @property
+    def rate(self) -> float:
+        """Share of claims that the judge confirms; nan without claims."""
+        return 1.0 - self.wrong / self.claims if self.claims else math.nan
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Residual at one budget over sweep orders."""
+
+    case: str
+    solver: str
+    budget: int
+    by_order: Mapping[str, float]
+    floor: float = 0.0  # below it residuals are rounding
+
+    @property
+    def factor(self) -> float:
+        """Worst over best order, neither counted as better than the floor."""
+        values = [max(v, self.floor) for v in self.by_order.values() if max(v, self.floor) > 0.0]
+        return max(values) / min(values) if values else 1.0
+
+
+def reaches(records: Records, levels: Sequence[float] | None = None) -> list[Reach]:
+    """One row for each case, solver and start, in the order of the records."""
+    levels = levels_of(records) if levels is None else tuple(levels)
+    out = []
+    for (case, solver, start), group in pairs(records).items():
+        good = [r for r in group if r.usable]
+        best = min(good, key=lambda r: (r.relative, r.time_min), default=None)
+        asked = [r for r in group if r.mode == "tol"] or group
+        last = asked[-1]
+        out.append(
+            Reach(
+                case=case,
+                solver=solver,
+                start=start,
+                times={
+                    level: min((r.time_min for r in good if r.relative <= level), default=math.inf)
+                    for level in levels
+                },
+                best=best.relative if best else math.inf,
+                best_time=best.time_min if best else math.nan,
+                floor=best.floor if best else math.nan,
+                status=last.status,
+                contradicted=next((r.contradicted for r in group if r.contradicted), ""),
+                message=last.message,
+                worst_name=last.worst_name,
+                form=last.form,
+                motion=math.nan if best is None or best.motion is None else best.motion,
+                bound=math.nan if best is None or best.bound is None else best.bound,
+            )
+        )
+    return out
+
+
+def _is_again(r: Record) -> bool:
+    """A run that was made before, again in turns with others; only those to a limit of time are run in turns alone."""
+    return bool(r.turns) and r.mode != "time"
+
+
+def failures(records: Records) -> list[Record]:
+    """Runs to a level that the judge does not confirm (nor the floor excuses), crashes, and false claims."""
+    out = []
+    for r in records:
+        if _is_again(r):
+            continue
+        missed = r.mode == "tol" and not r.success and not at_floor(r.relative, r.floor)
+        proven = r.status == "INFEASIBLE" and not r.contradicted
+        lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
+        if (missed and not proven) or lost or r.contradicted:
+            out.append(r)
+    return out
+
+
+def claims(records: Records) -> list[Claims]:
+    """By solver: how often its claim holds."""
+    out = []
+    for solver in sorted({r.solver for r in records}):
+        mine = [r for r in records if r.solver == solver and not _is_again(r)]
+        asked = [r for r in mine if r.mode == "tol"]
+        out.append(
+            Claims(
+                solver=solver,
+                runs=len(mine),
+                claims=sum(r.claims for r in mine),
+                wrong=sum(r.claims and bool(r.contradicted) for r in mine),
+                reached=sum(r.success for r in asked),
+                asked=len(asked),
+                crashed=sum(r.status.startswith(DIED) for r in mine),
+            )
+        )
+    return out
+
+
+def spreads(records: Records) -> list[Spread]:
+    """Where one budget was run in several sweep orders, the residual of each."""
+    groups: dict[tuple[str, str, int], dict[str, Record]] = defaultdict(dict)
+    for r in records:
+        if r.mode == "budget" and r.start == "cold" and r.step < 0 and not r.turns:
+            name = f"{r.order} {r.seed}" if r.order == "random" else r.order
+            groups[r.case, r.solver, r.max_iter][name] = r
+    return [
+        Spread(*key, {name: r.relative for name, r in by.items()}, max(r.floor for r in by.values()))
+        for key, by in groups.items()
+        if len(by) > 1
+    ]
+
+
+def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, float]]]:
+    """(case, solver, start) -> (iterations, residual) of the exact budgets, given order."""
+    groups: dict[tuple[str, str, str], list[tuple[int, float]]] = defaultdict(list)
+    for r in records:
+        if r.mode != "budget" or r.turns:
+            continue
+        if r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
+            groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
+    return {key: sorted(points) for key, points in groups.items()}

@@ -1,0 +1,283 @@
+"""Lines that were timed interleaved with each other: which wins, and in how many resamplings.
+
+A resampling draws the cases and the repetitions of the whole with replacement (a sequence's steps in blocks of
+consecutive ones, since neighbours are alike). In each the lines are ranked as the tables rank; who is within noise of
+the best wins. Noise is of what a score differs by between repetitions of the whole, not between repeats in one loop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.lab.bench.line import code_of
+from lavender.lab.bench.record import Record
+from lavender.lab.bench.store import Records
+from lavender.lab.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
+from lavender.lab.report.tables.means import SHIFT, limit_of
+
+__all__ = ["STARTS", "Final", "Race", "in_time", "lines", "serves_in", "to_level"]
+
+SAMPLES = 500
+SURE = 0.8  # share of resamplings below which a second name is told
+SOMETIMES = 0.2  # share from which another is as good a choice
+NOISE = 1.05  # at least: what nobody notices
+BLOCKS = 10  # that the steps of a sequence are cut into
+QUIET = 0.25  # quantile of the repetitions that is a line's time: what else the machine does only ever adds
+TICK = 1e-12  # s, less than any clock tells
+LATE = 0.95  # of the repeats, that have to be in time
+
+
+@dataclass(frozen=True)
+class Final:
+    """One line on all of its cases."""
+
+    runs: Mapping[str, Record]  # by case
+    guessed: bool  # some of these bring a guess
+
+    @property
+    def line(self) -> Record:
+        """A record that says what the line is."""
+        return next(iter(self.runs.values()))
+
+    @property
+    def code(self) -> tuple[str, ...]:
+        """To copy."""
+        return code_of(self.line, self.guessed)
+
+    @property
+    def time(self) -> float:
+        """Geometric mean over the cases of the lower quartile of the repetitions [s], with the shift of the tables."""
+        each = [float(np.quantile(r.times or (r.time_min,), QUIET)) for r in self.runs.values()]
+        return float(np.exp(np.mean(np.log(np.array(each) + SHIFT))) - SHIFT)
+
+
+@dataclass(frozen=True)
+class Race:
+    """Who is to be recommended, and how sure that is."""
+
+    ranking: tuple[tuple[Final, Choice], ...]  # the recommended one first
+    shares: tuple[float, ...]  # of the resamplings that each wins, in this order
+    loss: float  # score of the recommended over the best's where it does not win, median; 1 where it always wins
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """The recommended solver, and those that are as good a choice; a second where it is not sure."""
+        solvers = [choice.solver for _, choice in self.ranking]
+        others = [s for s, share in zip(solvers[1:], self.shares[1:], strict=True) if share >= SOMETIMES]
+        if not others and self.shares[0] < SURE and len(solvers) > 1:
+            others = [solvers[1 + int(np.argmax(self.shares[1:]))]]
+        return tuple(dict.fromkeys([solvers[0], *others]))
+
+
+def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
+    """Every line of that way ("call", "steps", "batch") that was run on as many cases as any.
+
+    Parameters
+    ----------
+    records : Records
+    way : str
+    rounds : bool
+        Those that were timed in turns; False: what was measured one after the other, which records of old have alone.
+    """
+    groups: dict[tuple[object, ...], dict[str, Record]] = {}
+    for r in records:
+        mine = r.way == way or (not r.way and not rounds and (r.step >= 0) is (way == "steps"))
+        plain = r.order == "given" and r.start != "warm" and (r.mode != "budget" or counts_sweeps(r))
+        if mine and plain and bool(r.turns) is rounds and r.case in records.cases:
+            key = (r.solver, r.mode, r.tol, r.max_iter, r.time_limit, r.start)
+            groups.setdefault(key, {})[r.case] = r
+    most = max((len(runs) for runs in groups.values()), default=0)
+    found = [
+        Final(runs, any(records.cases[c].guess for c in runs))
+        for runs in groups.values()
+        if len(runs) == most
+    ]
+    if way != "batch":
+        return found
+    # A batch of some of the cases says nothing beside a call on all of them.
+    whole = {(f.line.solver, *sorted(f.runs)) for one in ("call", "steps") for f in lines(records, one)}
+    return [f for f in found if (f.line.solver, *sorted(f.runs)) in whole]
+
+
+STARTS = {"cold": "cold", "carried": "warm from the step before"}
+
+
+def _best_of_each(some: Sequence[Final], level: float) -> list[Final]:
+    """One line of each solver: cold or carried, whichever brings more cases to the level, then the quicker."""
+    best: dict[str, Final] = {}
+    for final in sorted(some, key=lambda f: (sum(not r.relative <= level for r in f.runs.values()), f.time)):
+        best.setdefault(final.line.solver, final)
+    return list(best.values())
+
+
+def to_level(records: Records, some: Sequence[Final], level: float, cases: int = 0) -> Race | None:
+    """Lines that ask for a residual: first who brings most cases there, then the geometric mean of times.
+
+    `cases` there are, where lines were timed on fewer.
+    """
+    some = _best_of_each([f for f in some if f.line.mode == "tol" and f.line.tol <= level], level)
+    if not some:
+        return None
+    limit, names = limit_of(records), _names(some)
+    missed = np.array([[c not in f.runs or not f.runs[c].relative <= level for c in names] for f in some])
+    times = _repeats(some, names, lambda r: r.times or (r.time_min,))
+    charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
+
+    def score(values: FloatArray) -> FloatArray:
+        found = np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=1)) - SHIFT
+        return np.asarray(np.maximum(found, TICK))
+
+    def choice(i: int, value: float) -> Choice:
+        each = np.where(missed[i], math.inf, np.quantile(times[i], QUIET, axis=1))
+        found = dict(zip(names, each.tolist(), strict=True))
+        solved = int((~missed[i]).sum())
+        return Choice.of(some[i].line.solver, found, solved, value, cases=max(cases, len(found)))
+
+    return _race(records, some, names, charged, missed, score, choice)
+
+
+def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 0) -> Race | None:
+    """Lines within a time [s]: first the share of cases served, then the residual at the 90th percentile.
+
+    Served: in 95 of 100 repetitions the line took no more than the time and left at most half of the start's residual.
+    """
+    some = [
+        f for f in some if f.line.mode == "budget" or (f.line.mode == "time" and f.line.time_limit < limit)
+    ]
+    if not some:
+        return None
+    names = _names(some)
+    times = _repeats(some, names, lambda r: r.times or (r.time_min,))
+    left = np.minimum(_repeats(some, names, lambda r: r.reached or (r.relative,)), 1.0)
+    got = np.where(times <= limit, np.nan_to_num(left, nan=1.0), 1.0)
+    served = np.quantile(got, LATE, axis=2, method="lower") <= HALF
+
+    def score(values: FloatArray) -> FloatArray:
+        each = _lower_quantile(values, LATE)
+        return np.asarray(np.maximum(_inverted_cdf(each, QUANTILE), 1e-17))
+
+    def choice(i: int, value: float) -> Choice:
+        line, each = some[i].line, np.quantile(got[i], LATE, axis=1, method="lower")
+        return Choice.of(
+            line.solver,
+            dict(zip(names, each.tolist(), strict=True)),
+            int(served[i].sum()),
+            value,
+            cases=max(cases, len(each)),
+            how=f"{line.max_iter} sweeps" if line.mode == "budget" else "",
+            iterations=line.max_iter,
+            overrun=float(np.nanquantile(times[i], LATE, method="lower")) / limit,
+        )
+
+    return _race(records, some, names, got, ~served, score, choice)
+
+
+def serves_in(final: Final) -> float:
+    """Time [s] in which a line of exactly so many sweeps serves nine cases of ten, as `in_time`; inf if in none."""
+    if final.line.mode != "budget":
+        return math.inf
+    times = _repeats([final], list(final.runs), lambda r: r.times or (r.time_min,))[0]
+    left = np.array([r.relative for r in final.runs.values()])
+    return float(_inverted_cdf(np.where(left <= HALF, _lower_quantile(times, LATE), math.inf), QUANTILE))
+
+
+def _names(some: Sequence[Final]) -> list[str]:
+    """The cases of all lines; what a line was not run on, for it was refused, it misses."""
+    return list(dict.fromkeys(name for f in some for name in f.runs))
+
+
+def _repeats(
+    some: Sequence[Final], names: Sequence[str], what: Callable[[Record], Sequence[float]]
+) -> FloatArray:
+    """(lines, cases, repetitions), nan where not run; what was repeated less often again from its start."""
+    most = max(len(what(r)) for f in some for r in f.runs.values())
+    return np.array(
+        [[np.resize(what(f.runs[c]) if c in f.runs else np.nan, most) for c in names] for f in some], float
+    )
+
+
+def _quantile(values: FloatArray, q: float) -> FloatArray:
+    """np.quantile along the last axis, at a tenth of its price for the few numbers that are drawn again and again."""
+    place = q * (values.shape[-1] - 1)
+    low = int(place)
+    some = np.sort(values, axis=-1)[..., low : low + 2]
+    return np.asarray(some[..., 0] + (place - low) * (some[..., -1] - some[..., 0]))
+
+
+def _lower_quantile(values: FloatArray, q: float) -> FloatArray:
+    """The same with method="lower"."""
+    return np.asarray(np.sort(values, axis=-1)[..., int(q * (values.shape[-1] - 1))])
+
+
+def _inverted_cdf(values: FloatArray, q: float) -> FloatArray:
+    """The same with method="inverted_cdf"."""
+    return np.asarray(np.sort(values, axis=-1)[..., max(math.ceil(q * values.shape[-1]) - 1, 0)])
+
+
+def _blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
+    # What is drawn together: a case alone, the consecutive steps of a part of a sequence.
+    found: dict[tuple[str, int], list[int]] = {}
+    steps: dict[str, int] = {}
+    for name in names:
+        steps[records.cases[name].sequence] = steps.get(records.cases[name].sequence, 0) + 1
+    for i, name in enumerate(names):
+        info = records.cases[name]
+        size = max(1, steps[info.sequence] // BLOCKS)
+        found.setdefault((info.sequence, info.step // size) if info.sequence else (name, -1), []).append(i)
+    return list(found.values())
+
+
+def _race(
+    records: Records,
+    some: Sequence[Final],
+    names: Sequence[str],
+    values: FloatArray,
+    missed: np.ndarray,
+    score: Callable[[FloatArray], FloatArray],
+    choice: Callable[[int, float], Choice],
+) -> Race:
+    n, _, repeats = values.shape
+    blocks = _blocks(records, names)
+    draw = np.random.default_rng(0)
+    single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, lines)
+    # Two standard errors of the difference of two scores; that of a quartile is 1.36 times a mean's.
+    deviation = float(np.median(np.log(single).std(axis=0)))
+    noise = max(NOISE, math.exp(2.0 * math.sqrt(2.0) * 1.36 * deviation / math.sqrt(repeats)))
+    whole = score(values)
+    wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
+    lying = np.array([any(r.contradicted for r in f.runs.values()) for f in some])
+    for _ in range(SAMPLES):
+        cases = [i for b in draw.integers(0, len(blocks), len(blocks)) for i in blocks[b]]
+        again = draw.integers(0, repeats, repeats)
+        found = score(values[:, cases][:, :, again])
+        # A false claim comes last, then whoever misses more cases.
+        behind = missed[:, cases].sum(axis=1) + 1e6 * lying
+        first = behind == behind.min()
+        best = found[first].min()
+        won = first & (found <= noise * best)
+        wins += won
+        for i in np.flatnonzero(~won):
+            losses[i].append(found[i] / best)
+    shares = wins / SAMPLES
+    # Of those that win about as often as anybody, the one that needs no choice, else by name: a rerun agrees.
+    order = sorted(
+        range(n),
+        key=lambda i: (
+            shares[i] < SURE * shares.max(),
+            -shares[i] if shares[i] < SURE * shares.max() else 0.0,
+            some[i].line.solver != FIRST,
+            some[i].line.solver,
+            whole[i],
+        ),
+    )
+    head = order[0]
+    return Race(
+        ranking=tuple((some[i], choice(i, float(whole[i]))) for i in order),
+        shares=tuple(float(shares[i]) for i in order),
+        loss=float(np.median(losses[head])) if losses[head] else 1.0,
+    )

@@ -1,0 +1,124 @@
+"""Problems that say why they are there: families with parameters, and what their solution is known to be.
+
+```python
+from lavender import suite
+
+case = suite.pyramid(k=10, mass_ratio=1e6)
+case = suite.case("pyramid(k=10, mass_ratio=1e6)")      # the same by name
+case.problem, case.reason, case.reference, case.expect
+suite.families()                                        # every family with its parameters
+suite.cases("default"), suite.cases("hard")             # sets, or a single name
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from lavender.base.errors import UnknownName
+from lavender.lab.suite import friction, hard
+from lavender.lab.suite.case import FAMILIES, Case, Reference, parse, spell
+from lavender.lab.suite.families import (
+    box_stack,
+    boxed_friction,
+    chain,
+    granular,
+    hang,
+    pyramid,
+    random_spd,
+    stack,
+    toy_stack,
+    two_particles,
+)
+
+__all__ = [
+    "FAMILIES",
+    "SETS",
+    "Case",
+    "Reference",
+    "box_stack",
+    "boxed_friction",
+    "case",
+    "cases",
+    "chain",
+    "default",
+    "families",
+    "friction",
+    "granular",
+    "hang",
+    "hard",
+    "parse",
+    "pyramid",
+    "random_spd",
+    "stack",
+    "toy_stack",
+    "two_particles",
+]
+
+#: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that
+#: separates solvers, small enough for all of them.
+SETS: dict[str, tuple[str, ...]] = {
+    "default": (
+        "two_particles",
+        "toy_stack",
+        "stack(n=64)",
+        "chain(n=33, tip_mass=1e4)",
+        "hang(n=33)",
+        "random_spd(n=100, condition=1e4)",
+        "box_stack(n=10)",
+        "box_stack(n=10, mass_ratio=1e6)",
+        "pyramid(k=10)",
+        "pyramid(k=10, mass_ratio=1e3)",
+        "granular(n=4)",
+        "granular(n=9)",
+        "boxed_friction(n=3, scene=granular)",
+        "box_stackF(n=10)",
+        "pyramidF(k=6, sliding=0.5)",
+        "granularF(n=3, sliding=0.5)",
+        "granular(n=4, friction=cone)",
+    ),
+    "hard": hard.SET,
+}
+
+
+def families() -> dict[str, str]:
+    """Every family: its name with parameters and their defaults, and one line."""
+    out = {}
+    for f in FAMILIES.values():
+        shown = [f"{n}={spell(p.default)}" for n, p in f.signature.parameters.items() if n not in f.preset]
+        out[f"{f.name}({', '.join(shown)})"] = f.summary
+    return out
+
+
+def case(text: str) -> Case:
+    """The case of a name such as "stack(n=64)"; parameters that are left out take their defaults.
+
+    Raises
+    ------
+    UnknownName
+        No such family or parameter; the nearest are listed.
+    InputError
+        Not a name with parameters, or a value out of range.
+    """
+    name, values = parse(text)
+    if name not in FAMILIES:
+        raise UnknownName("case", name, [*FAMILIES, *SETS])
+    return FAMILIES[name].case(**values)
+
+
+def cases(text: str) -> Iterator[Case]:
+    """The cases of a set ("default", "hard"), or the one case of that name; made one by one.
+
+    Raises
+    ------
+    UnknownName, InputError
+        As `case`, at once.
+    """
+    if text in SETS:
+        return (case(name) for name in SETS[text])
+    return iter([case(text)])
+
+
+def default() -> list[Case]:
+    """What `lavender report` runs when no file is named."""
+    return list(cases("default"))

@@ -1,0 +1,148 @@
+"""From bodies and contact points to factored rows, all at once. Unit: kg, m, s; one time step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.errors import InputError
+from lavender.problem import Problem
+from lavender.problem.rows import Rows
+
+__all__ = [
+    "GRAVITY",
+    "STEP",
+    "Bodies",
+    "Contacts",
+    "contact_problem",
+    "joint_problem",
+    "manifold",
+    "sideways",
+    "static_loads",
+    "tower",
+]
+
+GRAVITY = 9.81  # m/s^2, along -z
+STEP = 0.01  # s
+FALL = GRAVITY * STEP  # m/s, speed that one step of gravity adds
+
+FRICTIONS = ("none", "coulomb", "cone")
+
+
+class Bodies:
+    """Bodies with isotropic inertia; v_free holds one step of gravity."""
+
+    def __init__(self, position: Any, mass: Any, inertia_per_mass: float) -> None:
+        self.position = np.asarray(position, float).reshape(-1, 3)  # (n, 3) m
+        self.mass = np.broadcast_to(np.asarray(mass, float), (len(self.position),)).copy()  # (n,) kg
+        self.inertia = inertia_per_mass * self.mass  # (n,) kg m^2
+        self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
+        self.v_free[:, 2] = -FALL
+
+    def rows(self, **more: Any) -> Rows:
+        """These bodies with joints or contacts; point masses (no inertia) do not turn."""
+        inv_inertia = np.zeros((len(self.mass), 3, 3))
+        inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (
+            (1.0 / self.inertia)[:, None] if np.all(self.inertia > 0.0) else 0.0
+        )
+        return Rows(1.0 / self.mass, inv_inertia, self.v_free, copy=False, **more)
+
+
+class Contacts:
+    """Contact points: normal (c, 3) from body a to body b, `body` (c, 2), -1 = ground."""
+
+    def __init__(self, body: Any, point: Any, normal: Any) -> None:
+        self.body: IntArray = np.asarray(body, np.int32).reshape(-1, 2)
+        self.point: FloatArray = np.asarray(point, float).reshape(-1, 3)
+        self.normal: FloatArray = np.broadcast_to(np.asarray(normal, float), self.point.shape).copy()
+
+    def arms(self, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """From the centre of a, and of b, to the point; zero for the ground."""
+        a, b = (
+            np.where(side[:, None] >= 0, self.point - position[np.maximum(side, 0)], 0.0)
+            for side in (self.body[:, 0], self.body[:, 1])
+        )
+        return a, b
+
+    def tangent(self) -> FloatArray:
+        """n x e_x, or n x e_y where n is close to e_x; unit."""
+        other = np.where(np.abs(self.normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+        t = np.cross(self.normal, other)
+        return t / np.linalg.norm(t, axis=1, keepdims=True)
+
+
+def contact_problem(
+    bodies: Bodies, contacts: Contacts, friction: str = "none", mu: Any = 0.5, target: Any = 0.0, **more: Any
+) -> Problem:
+    """Contacts without friction, or with two tangents and the law "coulomb" or "cone".
+
+    Raises
+    ------
+    InputError
+        Another word for `friction`.
+    """
+    if friction not in FRICTIONS:
+        raise InputError(f"friction is {friction!r}; {', '.join(FRICTIONS)} are known")
+    arm_a, arm_b = contacts.arms(bodies.position)
+    rows = bodies.rows(
+        normal=contacts.normal,
+        tangent=contacts.tangent(),
+        arm_a=arm_a,
+        arm_b=arm_b,
+        contact_body=contacts.body,
+    )
+    if friction == "none":
+        return Problem.from_rows(rows, target, **more)
+    return Problem.from_rows(rows, target, mu=mu, tangents=2, friction=friction, **more)
+
+
+def joint_problem(bodies: Bodies, body: Any, jac: Any, size: int, target: Any = 0.0, **more: Any) -> Problem:
+    """Joints of `size` rows each: jac (k size, 12), body (k, 2)."""
+    ptr = np.arange(0, len(jac) + 1, size, dtype=np.int32)
+    rows = bodies.rows(jac=np.asarray(jac, float), joint_ptr=ptr, joint_body=np.asarray(body, np.int32))
+    return Problem.from_rows(rows, target, **more)
+
+
+def manifold(body: Any, centre: Any, half_x: Any, half_y: float = 0.5) -> Contacts:
+    """Four corner points of horizontal rectangles: body (k, 2), centre (k, 3), half widths; normals up."""
+    sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
+    half = np.broadcast_to(np.asarray(half_x, float), (len(body),))
+    point = np.repeat(np.asarray(centre, float), 4, axis=0)
+    point[:, 0] += (half[:, None] * sign[:, 0]).ravel()
+    point[:, 1] += np.tile(half_y * sign[:, 1], len(body))
+    return Contacts(np.repeat(np.asarray(body), 4, axis=0), point, [0.0, 0.0, 1.0])
+
+
+def tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Unit bodies on each other: positions (n, 3), pairs (n, 2) from the ground on, and feet (n, 3) [m]."""
+    k = np.arange(n)
+    foot = np.stack([0.0 * k, 0.0 * k, k], 1)
+    return foot + np.array([0.0, 0.0, 0.5]), np.stack([k - 1, k], 1), foot
+
+
+def sideways(bodies: Bodies, speed: float, seed: int = 5) -> None:
+    """Add a horizontal velocity of `speed` [m/s] to every body, each in a direction of its own."""
+    angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, len(bodies.mass))
+    bodies.v_free[:, 0] += speed * np.cos(angle)
+    bodies.v_free[:, 1] += speed * np.sin(angle)
+
+
+def static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:
+    """Guess of the normal impulses (c,) [N s]: each body's load shared equally by the contacts below it."""
+    z = np.append(bodies.position[:, 2], -np.inf)  # the ground is index -1
+    a, b = contacts.body.T
+    upper = np.where(z[b] > z[a], b, a)
+    lower = np.where(z[b] > z[a], a, b)
+    order = np.argsort(upper, kind="stable")
+    first = np.searchsorted(upper[order], np.arange(len(bodies.mass) + 1))
+    load = np.append(bodies.mass * FALL, 0.0)
+    impulse = np.zeros(len(upper))
+    for k in np.argsort(-bodies.position[:, 2], kind="stable"):
+        below = order[first[k] : first[k + 1]]
+        if len(below):
+            share = load[k] / len(below)
+            impulse[below] = share
+            np.add.at(load, lower[below], share)
+    return impulse

@@ -1,0 +1,487 @@
+"""Families of problems with parameters: stacks, pyramids, piles, chains, and small ones to look at.
+
+Each function gives a `Case`; the same parameters give the same bits. Names ending in F have friction
+(`boxes`, `stackF(n=64)` is `stack(n=64, friction="coulomb")`); `sliding` [m/s] pushes every body sideways,
+each in its own direction, without which most frictional contacts stick and Coulomb's law and its convex
+relaxation have the same answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.lab.suite.build import (
+    FALL,
+    Bodies,
+    Contacts,
+    contact_problem,
+    joint_problem,
+    manifold,
+    sideways,
+    static_loads,
+    tower,
+)
+from lavender.lab.suite.case import Draft, Reference, family
+from lavender.lab.suite.exact import at_rest, solve_boxed, solve_linear
+from lavender.problem import Problem
+from lavender.solving.solve import solve
+
+WITH_FRICTION = {"friction": "coulomb"}
+MU = 0.5
+SPHERE, BOX, PEBBLE, ROD = 0.1, 1.0 / 6.0, 0.1, 0.1  # inertia / mass [m^2]
+
+
+def at_least(least: int, **sizes: int) -> None:
+    """Refuse sizes below `least`."""
+    for name, value in sizes.items():
+        if value < least:
+            raise InputError(f"{name} is {value}; at least {least} is needed")
+
+
+def positive(**values: float) -> None:
+    """Refuse values that are not above 0."""
+    for name, value in values.items():
+        if not value > 0.0:
+            raise InputError(f"{name} is {value}; a number above 0 is needed")
+
+
+def rest_reference(problem: Problem) -> Callable[[], Reference]:
+    """The reference of bodies that stay where they are: w = 0."""
+    return lambda: Reference(
+        at_rest(problem), "at rest: impulses from a linear program, proved in 100 bits", "slack"
+    )
+
+
+def boxed_reference(problem: Problem) -> Callable[[], Reference]:
+    """The reference of a boxed LCP: sweeps propose the active set, and what they propose is proved."""
+
+    def proved() -> Reference:
+        candidate = solve(problem, "pgs", tol=1e-10, max_iter=50_000).impulse
+        return Reference(
+            solve_boxed(problem, candidate), "active set from sweeps, solved and proved in 100 bits", "slack"
+        )
+
+    return proved
+
+
+# -- stacks ---------------------------------------------------------------------------------------
+
+
+@family(stackF=WITH_FRICTION)
+def stack(n: int = 64, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
+    """n spheres in a column, one contact between neighbours; the top one weighs `mass_ratio` times the others.
+
+    A is tridiagonal with condition number near n^2 (and mass_ratio on top). Frictionless and in one step
+    of gravity, contact i carries what is above it: lambda_i = g h sum of masses above.
+    """
+    at_least(1, n=n)
+    positive(mass_ratio=mass_ratio)
+    mass = np.ones(n)
+    mass[-1] = mass_ratio
+    position, pairs, foot = tower(n)
+    bodies = Bodies(position, mass, SPHERE)
+    sideways(bodies, sliding)
+    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
+    problem = contact_problem(bodies, contacts, friction, MU)
+    reason = "information must travel from the ground to the top: sweeps grow as n^2, a tridiagonal factorisation as n"
+    if friction != "none" and sliding != 0.0:
+        return Draft(problem, reason)
+
+    def closed_form() -> Reference:
+        load = FALL * np.cumsum(mass[::-1])[::-1]
+        impulse = np.zeros(problem.m)
+        impulse[problem.cones.ptr[:-1]] = load
+        return Reference(impulse, "closed form: the weight above")
+
+    return Draft(problem, reason, closed_form)
+
+
+@family(box_stackF=WITH_FRICTION)
+def box_stack(n: int = 10, mass_ratio: float = 1.0, friction: str = "none", sliding: float = 0.0) -> Draft:
+    """n unit cubes on four points each; the top one weighs `mass_ratio` times the others.
+
+    Four normals of one face have rank 3 (twelve rows with friction have rank 6): impulses are not unique,
+    velocities are. With friction every body also gets a small random velocity, so that contacts slide and lift.
+    """
+    bodies, contacts = _column(n, mass_ratio)
+    problem = _boxes(bodies, contacts, friction, sliding)
+    reason = (
+        "redundant: four points where three would do, so A is singular; heavy on light makes sweeps stall"
+    )
+    if friction != "none":
+        return Draft(problem, reason)
+
+    def closed_form() -> Reference:
+        load = FALL * np.cumsum(bodies.mass[::-1])[::-1]
+        return Reference(
+            np.repeat(0.25 * load, 4), "closed form: the weight above, a quarter on each point", "slack"
+        )
+
+    return Draft(problem, reason, closed_form)
+
+
+def _column(n: int, mass_ratio: float) -> tuple[Bodies, Contacts]:
+    at_least(1, n=n)
+    positive(mass_ratio=mass_ratio)
+    mass = np.ones(n)
+    mass[-1] = mass_ratio
+    position, pairs, foot = tower(n)
+    return Bodies(position, mass, BOX), manifold(pairs, foot, 0.5)
+
+
+@family(pyramidF=WITH_FRICTION)
+def pyramid(
+    k: int = 10,
+    mass_ratio: float = 1.0,
+    friction: str = "none",
+    sliding: float = 0.0,
+    bottom_ratio: float = 1.0,
+) -> Draft:
+    """k rows of unit cubes, each standing on two below, four points per pair; the top weighs `mass_ratio`.
+
+    4 k^2 contacts on 3 k (k + 1) degrees of freedom: redundant. `bottom_ratio` makes the lowest row heavy.
+    """
+    bodies, contacts = _triangle(k, mass_ratio, bottom_ratio)
+    problem = _boxes(bodies, contacts, friction, sliding)
+    reason = "more contacts than degrees of freedom, loads that spread sideways, heavy on light"
+    return Draft(problem, reason, rest_reference(problem) if friction == "none" else None)
+
+
+def _triangle(k: int, mass_ratio: float, bottom_ratio: float = 1.0) -> tuple[Bodies, Contacts]:
+    at_least(1, k=k)
+    positive(mass_ratio=mass_ratio, bottom_ratio=bottom_ratio)
+    row = np.repeat(np.arange(k), k - np.arange(k))
+    first = np.concatenate([[0], np.cumsum(k - np.arange(k))])  # first box of each row
+    column = np.arange(len(row)) - first[row]
+    x = 1.1 * (column + 0.5 * row)
+    mass = np.ones(len(row))
+    mass[row == 0] = bottom_ratio
+    mass[-1] = mass_ratio
+    bodies = Bodies(np.stack([x, 0.0 * x, 0.5 + row], 1), mass, BOX)
+    above = np.flatnonzero(row > 0)
+    left = first[row[above] - 1] + column[above]
+    # Ground contacts, then for every box above its left and its right support.
+    pairs = np.concatenate([
+        np.stack([np.full(k, -1), np.arange(k)], 1),
+        np.stack([np.stack([left, left + 1], 1).ravel(), np.repeat(above, 2)], 1),
+    ])  # fmt: skip
+    a, b = pairs.T
+    low = np.where(a < 0, x[b], np.maximum(x[np.maximum(a, 0)], x[b])) - 0.5
+    high = np.where(a < 0, x[b], np.minimum(x[np.maximum(a, 0)], x[b])) + 0.5
+    centre = np.stack([0.5 * (low + high), 0.0 * low, row[b].astype(float)], 1)
+    return bodies, manifold(pairs, centre, 0.5 * (high - low))
+
+
+def _boxes(bodies: Bodies, contacts: Contacts, friction: str, sliding: float) -> Problem:
+    if friction != "none":
+        # Some contacts slide, some lift.
+        _shake(bodies)
+    sideways(bodies, sliding)
+    return contact_problem(bodies, contacts, friction, MU)
+
+
+def _shake(bodies: Bodies) -> None:
+    bodies.v_free += 0.05 * np.random.default_rng(3).standard_normal(bodies.v_free.size).reshape(-1, 6)
+
+
+# -- piles ----------------------------------------------------------------------------------------
+
+
+@family(granularF=WITH_FRICTION)
+def granular(n: int = 4, friction: str = "none", sliding: float = 0.0, seed: int = 7) -> Draft:
+    """n^3 pebbles on a jittered lattice in a box, contacts with neighbours, floor and four walls.
+
+    n = 4, 9, 18 give 299, 3,402 and 27,570 contacts (seed 7). Well conditioned and three-dimensional: sparse
+    factorisations fill in, sweeps converge fast.
+    """
+    at_least(1, n=n)
+    bodies, contacts = _pile(n, seed)
+    sideways(bodies, sliding)
+    problem = contact_problem(bodies, contacts, friction, MU)
+    reason = "a large well-conditioned pile: the home ground of sweeps, where factorisations fill in"
+    return Draft(problem, reason, boxed_reference(problem) if friction == "none" else None)
+
+
+def _pile(n: int, seed: int) -> tuple[Bodies, Contacts]:
+    """Site by site (x slowest): face neighbours, 30 % of the edge neighbours, walls; arithmetic after all draws."""
+    rng = np.random.default_rng(seed)
+    count = n**3
+    grid = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    position = grid + rng.uniform(-0.15, 0.15, (count, 3))
+    mass = rng.uniform(0.5, 2.0, count)
+    faces = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    edges = ((1, 1, 0), (1, 0, 1), (0, 1, 1), (1, -1, 0), (1, 0, -1), (0, 1, -1))
+    step = np.array([n * n, n, 1])
+
+    def inside(offsets: tuple[tuple[int, int, int], ...]) -> list[list[int]]:
+        # Bodies that a site's offsets lead to, -1 outside the box; (count, len(offsets)).
+        to = grid[:, None, :] + np.array(offsets)
+        ok = np.all((to >= 0) & (to < n), axis=2)
+        return np.where(ok, to @ step, -1).tolist()
+
+    ground = np.stack(
+        [grid[:, 0] == 0, grid[:, 0] == n - 1, grid[:, 1] == 0, grid[:, 1] == n - 1, grid[:, 2] == 0], 1
+    )
+    # A site that touches both of two opposite walls (n = 1) has one contact along that axis.
+    ground[:, 1] &= ~ground[:, 0]
+    ground[:, 3] &= ~ground[:, 2]
+    axes = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0], [0, 0, 1.0]])
+    body: list[tuple[int, int]] = []
+    wall: list[int] = []  # which wall, -1 between pebbles
+    draws: list[FloatArray] = []  # 6 numbers between pebbles, 3 at a wall
+    walls_of = [np.flatnonzero(g).tolist() for g in ground]
+    random, normal = rng.random, rng.standard_normal
+    for a, (face, edge) in enumerate(zip(inside(faces), inside(edges), strict=True)):
+        near = [b for b in face if b >= 0]
+        if near:
+            draws.append(normal(6 * len(near)))
+            body += [(a, b) for b in near]
+        for b in edge:
+            if b >= 0 and random() < 0.3:
+                draws.append(normal(6))
+                body.append((a, b))
+        wall += [-1] * (len(body) - len(wall))
+        walls = walls_of[a]
+        if walls:
+            draws.append(normal(3 * len(walls)))
+            body += [(-1, a)] * len(walls)
+            wall += walls
+    flat = np.concatenate(draws) if draws else np.zeros(0)
+    pair, side = np.array(body, np.int32).reshape(-1, 2), np.array(wall, np.int32)
+    between = side < 0
+    start = np.concatenate([[0], np.cumsum(np.where(between, 6, 3))])[:-1]
+    jitter = flat[start[:, None] + np.arange(3)]
+    second = flat[np.minimum(start[:, None] + 3, len(flat) - 3) + np.arange(3)]
+    one, two = np.maximum(pair[:, 0], 0), pair[:, 1]
+    away = position[two] - position[one]
+    away /= np.where(between, np.linalg.norm(away, axis=1), 1.0)[:, None]
+    away += 0.25 * jitter
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    flat_wall = axes[np.maximum(side, 0)]
+    point = np.where(
+        between[:, None],
+        0.5 * (position[one] + position[two]) + 0.08 * second,
+        position[two] - 0.5 * flat_wall + 0.05 * jitter,
+    )
+    bodies = Bodies(position, mass, PEBBLE)
+    bodies.v_free = 0.05 * normal(6 * count).reshape(-1, 6)
+    bodies.v_free[:, 2] -= FALL
+    return bodies, Contacts(pair, point, np.where(between[:, None], away, flat_wall))
+
+
+# -- joints ---------------------------------------------------------------------------------------
+
+
+@family()
+def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
+    """n rods in a slack zig-zag arm from a fixed point, ball joints of 3 rows, the last one weighs `tip_mass`.
+
+    Half-bandwidth 5. Little tension travels: the easy chain.
+    """
+    at_least(1, n=n)
+    positive(tip_mass=tip_mass)
+    k = np.arange(n)
+    link = np.stack([0.8 + 0.0 * k, 0.3 * np.cos(k), -0.5 + 0.3 * np.sin(1.7 * k)], 1)
+    problem = _chain(link, tip_mass, 0.02)
+    return Draft(
+        problem,
+        "bilateral and banded, little tension: easy for everything that knows the band",
+        _linear(problem),
+    )
+
+
+@family()
+def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
+    """n rods hanging almost straight down under their weight and that of the last, `tip_mass`.
+
+    Half-bandwidth 5; the condition number grows as n^2 and with tip_mass: the hard chain.
+    """
+    at_least(1, n=n)
+    positive(tip_mass=tip_mass)
+    k = np.arange(n)
+    link = np.stack([1e-4 * np.cos(k), 1e-4 * np.sin(1.7 * k), -1.0 + 0.0 * k], 1)
+    problem = _chain(link, tip_mass, 1e-4)
+    return Draft(
+        problem,
+        "tension through the whole chain: sweeps need n^2 times tip_mass, a band factorisation n",
+        _linear(problem),
+    )
+
+
+def _chain(link: FloatArray, tip_mass: float, jitter: float) -> Problem:
+    n = len(link)
+    link = link / np.linalg.norm(link, axis=1, keepdims=True)
+    anchor = np.concatenate([np.zeros((1, 3)), np.cumsum(link, axis=0)])
+    mass = np.ones(n)
+    mass[-1] = tip_mass
+    bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), mass, ROD)
+    bodies.v_free = jitter * np.random.default_rng(11).standard_normal(6 * n).reshape(-1, 6)
+    bodies.v_free[:, 2] -= FALL
+    body = np.stack([np.arange(n) - 1, np.arange(n)], 1)
+    return joint_problem(bodies, body, ball_joints(bodies.position, body, anchor[:-1]), 3)
+
+
+def ball_joints(position: FloatArray, body: np.ndarray, anchor: FloatArray) -> FloatArray:
+    """Jacobian (3 k, 12) of ball joints: the anchor of b moves as the anchor of a does."""
+    k = len(body)
+    jac = np.zeros((k, 3, 12))
+    for side, (sign, at) in enumerate(((-1.0, 0), (1.0, 6))):
+        moving = body[:, side] >= 0
+        arm = anchor[moving] - position[body[moving, side]]
+        for axis in range(3):
+            e = np.zeros(3)
+            e[axis] = 1.0
+            jac[moving, axis, at + axis] = sign
+            jac[moving, axis, at + 3 : at + 6] = sign * np.cross(arm, e)
+    return jac.reshape(-1, 12)
+
+
+def _linear(problem: Problem) -> Callable[[], Reference]:
+    return lambda: Reference(solve_linear(problem), "factorised in float64, refined in 100 bits")
+
+
+@family()
+def two_particles(m1: float = 1.0, m2: float = 2.0, drift: float = 0.01) -> Draft:
+    """Two particles joined by one distance row: the smallest problem, A derived here.
+
+    C = |x2 - x1| - L must stay 0. With n = (x2 - x1) / |x2 - x1|,
+
+        dC/dt = n . (v2 - v1) = J v,        J = [-n^T, n^T]
+        A = J M^-1 J^T = n.n / m1 + n.n / m2 = 1/m1 + 1/m2      [1/kg]
+        b = target - J v*,   target = -drift / h               [m/s]: closes the error C = drift in one step
+        lambda = b / A                                         [N s], along n on 2, against n on 1
+
+    The reduced mass 1/A answers: the impulse of a rod is its closing speed times m1 m2 / (m1 + m2).
+    """
+    positive(m1=m1, m2=m2)
+    x = np.array([[0.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
+    bodies = Bodies(x, [m1, m2], 0.0)
+    bodies.v_free[0, :3], bodies.v_free[1, :3] = [0.3, 0.0, -FALL], [0.0, 0.1, -FALL]
+    n = x[1] - x[0]  # its length is 1: 0.36 + 0.64
+    jac = np.concatenate([-n, np.zeros(3), n, np.zeros(3)])[None]
+    problem = joint_problem(bodies, [[0, 1]], jac, 1, target=-drift / 0.01, names=["rod"])
+    closing = -drift / 0.01 - n @ (bodies.v_free[1, :3] - bodies.v_free[0, :3])
+
+    def closed_form() -> Reference:
+        return Reference(np.array([closing / (1.0 / m1 + 1.0 / m2)]), "closed form: b / (1/m1 + 1/m2)")
+
+    return Draft(problem, "one row, one number: everything can be checked by hand", closed_form)
+
+
+# -- small and plain ------------------------------------------------------------------------------
+
+
+@family()
+def toy_stack(kick: float = 1.0, friction: str = "none") -> Draft:
+    """Eight unit spheres in a column, eight contacts; the fifth is kicked upwards by `kick` [m/s].
+
+    A is tridiagonal (2, -1; first entry 1). The kick opens the contact below the fifth sphere and presses those
+    above: solving A lambda = b and clamping the negative impulse once leaves an error that the LCP does not have.
+    "box" puts friction bounds of fixed size on two tangents per contact.
+    """
+    n = 8
+    if kick < 0.0:
+        raise InputError(f"kick is {kick}; upwards (0 or more) is needed")
+    if friction not in ("none", "box"):
+        raise InputError(f"friction is {friction!r}; none, box are known")
+    position, pairs, foot = tower(n)
+    bodies = Bodies(position, 1.0, SPHERE)
+    bodies.v_free[4, 2] += kick
+    contacts = Contacts(pairs, foot, [0.0, 0.0, 1.0])
+    reason = "eight contacts that fit on a page, one of which must open"
+    if friction == "none":
+        problem = contact_problem(bodies, contacts)
+        return Draft(
+            problem, reason, lambda: Reference(_toy_solution(problem.b), "active set known: contact 4 open")
+        )
+    bodies.v_free[:, 0] = 0.05 * np.arange(1, n + 1)
+    problem = _boxed(bodies, contacts)
+    return Draft(problem, reason + ", with friction bounded by fixed loads", boxed_reference(problem))
+
+
+def _toy_solution(b: FloatArray) -> FloatArray:
+    # Tridiagonal (-1, 2, -1) chains below (fixed at the ground) and above (free) the open contact 4. A kick
+    # too weak to open it leaves one chain.
+    a = 2.0 * np.eye(8) - np.eye(8, k=1) - np.eye(8, k=-1)
+    a[0, 0] = 1.0
+    impulse: FloatArray = np.zeros(8)
+    impulse[:] = np.linalg.solve(a, b)
+    if impulse.min() >= 0.0:
+        return impulse
+    impulse[4] = 0.0
+    for part in (slice(0, 4), slice(5, 8)):
+        impulse[part] = np.linalg.solve(a[part, part], b[part])
+    return impulse
+
+
+@family()
+def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
+    """A dense symmetric positive definite linear system: eigenvalues from 1/condition to 1, evenly in the logarithm.
+
+    b = A x with x of standard normal entries, so that every eigenvector matters.
+    """
+    at_least(1, n=n)
+    if not condition >= 1.0:
+        raise InputError(f"condition is {condition}; 1 or more is needed")
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    a = (q * np.logspace(-np.log10(condition), 0.0, n)) @ q.T
+    a = 0.5 * (a + a.T)
+    problem = Problem.linear(a, a @ rng.standard_normal(n))
+    return Draft(
+        problem,
+        "no structure, only a condition number: what separates direct from iterative",
+        _linear(problem),
+    )
+
+
+@family()
+def boxed_friction(
+    n: int = 4, scene: str = "box_stack", mass_ratio: float = 1.0, sliding: float = 0.5
+) -> Draft:
+    """Contacts whose tangents are bounded by mu times an estimated load: a square, so a boxed LCP.
+
+    Every QP solver takes it, and the exact solution is unique in velocities. Scenes: box_stack, pyramid, granular,
+    of size n.
+    """
+    if scene == "box_stack":
+        bodies, contacts = _column(n, mass_ratio)
+        _shake(bodies)
+    elif scene == "pyramid":
+        bodies, contacts = _triangle(n, mass_ratio)
+        _shake(bodies)
+    elif scene == "granular":
+        at_least(1, n=n)
+        bodies, contacts = _pile(n, 7)
+    else:
+        raise InputError(f"scene is {scene!r}; box_stack, pyramid, granular are known")
+    sideways(bodies, sliding)
+    problem = _boxed(bodies, contacts)
+    return Draft(
+        problem,
+        "friction that every QP solver takes: a boxed LCP with finite bounds",
+        boxed_reference(problem),
+    )
+
+
+def _boxed(bodies: Bodies, contacts: Contacts) -> Problem:
+    """Rows n, t1, t2 per contact as one block of bounded rows; tangents within mu times the static load."""
+    arm_a, arm_b = contacts.arms(bodies.position)
+    n, t = contacts.normal, contacts.tangent()
+    axes = np.stack([n, t, np.cross(n, t)], 1)  # (c, 3, 3)
+    moving = (contacts.body >= 0).astype(float)[:, :, None, None]
+    jac = np.concatenate([
+        -axes * moving[:, 0], -np.cross(arm_a[:, None], axes) * moving[:, 0],
+        axes * moving[:, 1], np.cross(arm_b[:, None], axes) * moving[:, 1],
+    ], axis=2)  # fmt: skip
+    bound = MU * static_loads(bodies, contacts)
+    high = np.stack([np.full(len(n), np.inf), bound, bound], 1)
+    low = np.stack([np.zeros(len(n)), -bound, -bound], 1)
+    names = [f"contact {i}" for i in range(len(n))]
+    return joint_problem(
+        bodies, contacts.body, jac.reshape(-1, 12), 3, lower=low.ravel(), upper=high.ravel(), names=names
+    )

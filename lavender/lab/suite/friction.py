@@ -1,0 +1,250 @@
+"""Hard cases of friction, as those of `lavender.lab.suite.hard`: what slides, sticks or stands by friction alone."""
+
+from __future__ import annotations
+
+from decimal import Decimal, localcontext
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.lab.suite.build import FALL, Bodies, Contacts, contact_problem, manifold
+from lavender.lab.suite.case import Draft, Reference, family
+from lavender.lab.suite.families import BOX, at_least, positive, rest_reference
+from lavender.lab.suite.hard import EXACT
+from lavender.problem import Problem
+
+
+@family()
+def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: str = "coulomb") -> Draft:
+    """A point mass sliding across the slope of a ramp of `angle` [degrees]: one contact, solved by hand.
+
+    Coulomb: lambda_n = m g h cos angle; it sticks where mu lambda_n >= m |v_t|, else friction opposes v_t. The convex
+    relaxation lifts off: with v_t along t, w_n = mu w_t.
+    """
+    if mu < 0.0:
+        raise InputError(f"mu is {mu}; 0 or more is needed")
+    a = np.deg2rad(angle)
+    bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
+    bodies.v_free[0, :3] = [speed, -FALL * np.sin(a), -FALL * np.cos(a)]
+    contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
+    problem = contact_problem(bodies, contacts, friction, mu)
+
+    def closed_form() -> Reference:
+        b = problem.b
+        size = float(np.hypot(b[1], b[2]))
+        if size <= mu * b[0]:
+            return Reference(b.copy(), "closed form: sticks")
+        direction = b[1:] / size
+        if friction == "coulomb":
+            n = b[0]
+        else:  # A = 1: the nearest point of the cone to b
+            n = max(0.0, (b[0] + mu * size) / (1.0 + mu * mu))
+        return Reference(np.array([n, *(mu * n * direction)]), "closed form: slides")
+
+    return Draft(problem, "every friction coefficient: stick, slip, none, sand paper", closed_form)
+
+
+@family()
+def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
+    """A cube on four points of a ramp of `angle` [degrees]; tan 26.6 = 0.5 is where it begins to slide."""
+    a = np.deg2rad(angle)
+    bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, BOX)
+    bodies.v_free[0, :3] = [FALL * np.sin(a), 0.0, -FALL * np.cos(a)]
+    problem = contact_problem(bodies, manifold([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu)
+
+    def closed_form() -> Reference:
+        n, t = FALL * np.cos(a), min(FALL * np.sin(a), mu * FALL * np.cos(a))
+        # Friction at the foot tips the cube forwards: the front pair carries t/2 more than half, of lever 1/2.
+        rear, front = 0.25 * n - 0.25 * t, 0.25 * n + 0.25 * t
+        normal = np.array([rear, rear, front, front])
+        along = problem.rows.tangent @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
+        across = np.cross(problem.rows.normal, problem.rows.tangent) @ np.array([1.0, 0.0, 0.0])  # type: ignore[union-attr]
+        share = -t * normal / n
+        return Reference(np.stack([normal, share * along, share * across], 1).ravel(), "closed form", "slack")
+
+    return Draft(
+        problem,
+        "sticks below tan angle = mu, slides above, on a redundant face",
+        closed_form,
+    )
+
+
+@family()
+def threshold(above: float = 0.0) -> Draft:
+    """A point mass pushed with (1 + above) times what friction can hold: between stick and slip."""
+    bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
+    push = (1.0 + above) * 0.5 * FALL
+    bodies.v_free[0, :2] = [0.6 * push, 0.8 * push]
+    contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
+    problem = contact_problem(bodies, contacts, "coulomb", 0.5)
+
+    def closed_form() -> Reference:
+        b = problem.b
+        size = float(np.hypot(b[1], b[2]))
+        scale = min(1.0, 0.5 * b[0] / size)
+        return Reference(np.array([b[0], scale * b[1], scale * b[2]]), "closed form")
+
+    return Draft(
+        problem,
+        "at the edge of the disk, where the projection has a kink",
+        closed_form,
+    )
+
+
+@family()
+def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
+    """One contact with A = diag(1, 1, ratio), mu = 0.5, pushed along (1, 1) with `speed`: sticks at 0.1, slides at 3.
+
+    Sliding, lambda_t = (A_tt + s)^-1 b_t with s >= 0 such that |lambda_t| = mu lambda_n: one unknown. A step 1/A_ii per
+    tangent followed by the radial projection stops at a wrong point; a step 1/min(A_ii) cycles.
+    """
+    positive(ratio=ratio)
+    b = np.array([1.0, speed, speed * ratio**0.5])
+    problem = Problem.contact(np.diag([1.0, 1.0, ratio]), b, [0.5])
+
+    def secular() -> Reference:
+        return Reference(_secular(b, ratio), "secular equation in 60 digits")
+
+    return Draft(
+        problem, "tangents of unequal mass: where the usual disk projections are wrong or cycle", secular
+    )
+
+
+def _secular(b: FloatArray, ratio: float) -> FloatArray:
+    with localcontext() as context:
+        context.prec = 60
+        n, b1, b2, r = (Decimal(float(x)) for x in (*b, ratio))
+        radius = n / 2
+        if b1**2 + (b2 / r) ** 2 <= radius**2:
+            return np.array([float(n), float(b1), float(b2 / r)])
+        low, high = Decimal(0), (b1**2 + b2**2).sqrt() / radius
+        for _ in range(250):  # |lambda_t| decreases in s
+            s = (low + high) / 2
+            if (b1 / (1 + s)) ** 2 + (b2 / (r + s)) ** 2 > radius**2:
+                low = s
+            else:
+                high = s
+        return np.array([float(n), float(b1 / (1 + high)), float(b2 / (r + high))])
+
+
+@family()
+def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
+    """A rod sliding on its tip, mu = 2: A_nn - mu A_nt < 0, so that sliding presses the rod into the ground.
+
+    Length 2, mass 1, inclined by 1.2 rad, one tangent: A = [[1 + 3 c^2, 3 c s], [3 c s, 1 + 3 s^2]], c, s of 1.2.
+    Free it would lift off with `lift` and slide with `slide` [m/s]. Open (lambda = 0) is a solution; so may be
+    stick and slip: `painleve_solutions` finds all of them by trying each.
+    """
+    problem = _painleve(slide, lift)
+
+    def enumerated() -> Reference:
+        states = painleve_solutions(problem)
+        text = ", ".join(states)
+        return Reference(states["open"], f"each state tried in closed form: {text}", "error")
+
+    return Draft(problem, "Painleve: several solutions, all right; which one was found is named", enumerated)
+
+
+def _painleve(slide: float, lift: float) -> Problem:
+    positive(lift=lift)
+    c, s = np.cos(1.2), np.sin(1.2)
+    a = np.array([[1.0 + 3.0 * c * c, 3.0 * c * s], [3.0 * c * s, 1.0 + 3.0 * s * s]])
+    return Problem.contact(a, [-lift, -slide], [2.0])
+
+
+def painleve_solutions(problem: Problem) -> dict[str, FloatArray]:
+    """Every solution of a single contact with one tangent, by state: open, stick, slip +, slip -."""
+    a, b, mu = problem.dense(), problem.b, float(problem.cones.mu[0])
+    found: dict[str, FloatArray] = {}
+    if -b[0] >= 0.0:
+        found["open"] = np.zeros(2)
+    stick = np.linalg.solve(a, b)
+    if stick[0] >= 0.0 and abs(stick[1]) <= mu * stick[0]:
+        found["stick"] = np.asarray(stick, float)
+    for sign, name in ((1.0, "slip +"), (-1.0, "slip -")):  # sign of w_t
+        press = a[0, 0] - sign * mu * a[0, 1]
+        n = b[0] / press if press != 0.0 else -1.0
+        lam = np.array([n, -sign * mu * n])
+        if n > 0.0 and sign * (a[1] @ lam - b[1]) > 0.0:
+            found[name] = lam
+    return found
+
+
+@family()
+def arch(n: int = 9, mu: float = 0.6) -> Draft:
+    """n voussoirs of a half circle (radius 5 m, 1 m thick), four points between neighbours."""
+    at_least(3, n=n)
+    angle = np.pi * np.arange(n + 1) / n
+    middle = 0.5 * (angle[1:] + angle[:-1])
+    position = np.stack([-5.0 * np.cos(middle), 0.0 * middle, 5.0 * np.sin(middle)], 1)
+    bodies = Bodies(position, 1.0, 0.3)
+    k = np.arange(n + 1)
+    pairs = np.stack([np.where(k == 0, -1, k - 1), np.where(k == n, -1, k)], 1)
+    # Joint k looks along the arch; the corner points are at radii 4.5 and 5.5, half a metre either side.
+    radius, side = (g.ravel() for g in np.meshgrid([4.5, 5.5], [-0.5, 0.5], indexing="ij"))
+    point = np.stack([
+        (-np.cos(angle)[:, None] * radius).ravel(), np.tile(side, n + 1), (np.sin(angle)[:, None] * radius).ravel()
+    ], 1)  # fmt: skip
+    normal = np.repeat(np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], 1), 4, axis=0)
+    problem = contact_problem(bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu)
+    return Draft(
+        problem, "held up by friction and thrust alone: errors show as a sag", rest_reference(problem), EXACT
+    )
+
+
+@family()
+def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
+    """A house of cards: leaning pairs, cards across their tops, the next level on those; two points per edge."""
+    at_least(1, levels=levels)
+    lean = np.deg2rad(20.0)
+    d, h = np.sin(lean), np.cos(lean)
+    half = 0.02  # m, between the edges at a top
+    position: list[list[float]] = []
+    contacts: list[tuple[int, int, list[float], list[float]]] = []
+
+    def add(x: float, z: float) -> int:
+        position.append([x, 0.0, z])
+        return len(position) - 1
+
+    def edge(a: int, b: int, x: float, z: float, normal: list[float]) -> None:
+        contacts.extend((a, b, [x, y, z], normal) for y in (-0.4, 0.4))
+
+    up, right = [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]
+    floor: dict[int, int] = {}  # card under the pair
+    spacing = 2.0 * (d + half)
+    for level in range(levels):
+        z = level * h
+        pairs = levels - level
+        cards = []
+        for j in range(pairs):
+            x = spacing * (j + 0.5 * level)
+            left, other = add(x - half - 0.5 * d, z + 0.5 * h), add(x + half + 0.5 * d, z + 0.5 * h)
+            base = floor.get(j, -1)
+            edge(base, left, x - half - d, z, up)
+            edge(base, other, x + half + d, z, up)
+            edge(left, other, x, z + h, right)
+            cards.append((x, left, other))
+        floor = {}
+        for j in range(pairs - 1):
+            (x, _, one), (y, two, _) = cards[j], cards[j + 1]
+            across = add(0.5 * (x + y), z + h)
+            edge(one, across, x + half, z + h, up)
+            edge(two, across, y - half, z + h, up)
+            floor[j] = across
+    bodies = Bodies(position, 1.0, 0.1)
+    a, b, point, normal = zip(*contacts, strict=True)
+    problem = contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
+    return Draft(problem, "stands by friction only, over several levels", rest_reference(problem), EXACT)
+
+
+__all__ = [
+    "anisotropic",
+    "arch",
+    "card_house",
+    "painleve",
+    "painleve_solutions",
+    "ramp",
+    "slider",
+    "threshold",
+]

@@ -1,0 +1,87 @@
+"""lavender.c: the kernels that the functions of lavender.h use, then those functions (front/).
+
+Only the standard library is imported, so that setup.py can run this before anything is built.
+"""
+
+from __future__ import annotations
+
+import re
+import runpy
+import tempfile
+from pathlib import Path
+from typing import Any
+
+__all__ = ["FRONT", "MODULES", "CutFailed", "amalgamate", "source_hash"]
+
+HERE = Path(__file__).resolve().parent
+CUT: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "cut.py"))
+CutFailed: type[Exception] = CUT["CutFailed"]
+#: Modules of lavender_ext that the library reaches into.
+MODULES = (
+    "core.assemble",
+    "core.generalized",
+    "core.order",
+    "core.problem",
+    "judge.measure",
+    "judge.watch",
+    "sweep.pgs",
+    "sweep.serial",
+    "local.gauss_seidel",
+    "accelerate.accelerated",
+    "accelerate.admm",
+    "driver.driver",
+    "pivot.direct",
+    "pivot.lemke",
+    "pivot.principal",
+    "factor.graph",
+    "factor.sparse",
+    "engine.arrays",
+    "engine.substep",
+    "host.memory",
+)
+HEADER = HERE / "c" / "lavender.h"
+FRONT = [
+    HERE / "front" / f"{name}.c"
+    for name in ("front", "problem", "judge", "solve", "methods", "pivots", "full")
+]
+
+
+def source_hash(root: Path) -> str:
+    """Hash of everything that the library is made of."""
+    return str(CUT["source_hash"](root, MODULES, [HEADER, Path(__file__), *FRONT]))
+
+
+def words(header: str) -> str:
+    """`lav_text`, `lav_name` and `lav_outcome`, of the header's enums and what it says behind each error."""
+    errors, methods, outcomes = re.findall(r"enum \{ /\*[^*]*\*/\n(.*?)\n\};", header, re.DOTALL)
+    texts = re.findall(r"(LAV_\w+) = -?\d+,?\s*/\* (.*?) \*/", errors)
+    lists = {"lav_text(int32_t code)": (texts, '"no such code"')}
+    for call, body in (("lav_name(int32_t method)", methods), ("lav_outcome(int32_t outcome)", outcomes)):
+        names = re.findall(r"(LAV_\w+) = ", body)
+        lists[call] = ([(name, name.removeprefix("LAV_").lower()) for name in names], "NULL")
+    out = []
+    for call, (said, otherwise) in lists.items():
+        cases = "".join(f'    case {name}: return "{text}";\n' for name, text in said)
+        out.append(f"\nconst char *{call} {{\n  switch ({call[:-1].split()[-1]}) {{\n{cases}")
+        out.append(f"    default: return {otherwise};\n  }}\n}}\n")
+    return "".join(out)
+
+
+def amalgamate(root: Path, made: Path | None = None) -> str:
+    """lavender.c, from the sources of lavender_ext below `root`; `made`: translations of an ordinary build.
+
+    Raises
+    ------
+    CutFailed
+        The kernels cannot be translated, or need Python.
+    """
+    front = "".join(path.read_text(encoding="utf-8") for path in FRONT)
+    front += words(HEADER.read_text(encoding="utf-8"))
+    version = runpy.run_path(str(HERE.parent / "_version.py"))["__version__"]
+    with tempfile.TemporaryDirectory() as work:
+        kernels = CUT["cut"](CUT["translate"](root, MODULES, Path(work), made), front)
+    return (
+        f"/* liblavender of lavender {version}: the kernels without Python, then the functions of lavender.h.\n"
+        f" * Made, not written: changes belong into the kernels. Sources {source_hash(root)}\n */\n"
+        f'#include "lavender.h"\n\n{kernels}'
+    )

@@ -1,0 +1,39 @@
+"""LavenderSim's state as the bytes that `lav_engine_open` reads, and back from those that `lav_engine_image` writes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lavender.sim.engine.simulation import Simulation
+
+__all__ = ["engine_image"]
+
+MAGIC = b"LAVIMG1\0"
+
+
+def engine_image(simulation: Simulation) -> bytes:
+    """The next substep's state: a magic word, a hash, sizes (10) int32, then reals, int32 padded to 8 bytes, keys.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        Of any scene; its stepper, sweeps and orders go with it.
+
+    Returns
+    -------
+    bytes
+    """
+    state = simulation.snapshot()
+    index = state.index.astype("<i4").tobytes()
+    body = (
+        state.size.astype("<i4").tobytes()
+        + state.real.astype("<f8").tobytes()
+        + index
+        + bytes(-len(index) % 8)
+    )
+    body += state.keys.astype("<u8").tobytes()
+    h, full = 0, 2**64 - 1
+    for word in np.frombuffer(body, "<u8").tolist():
+        h = ((h ^ word) * 0x9E3779B97F4A7C15) & full
+        h ^= h >> 29
+    return MAGIC + (h ^ h >> 32).to_bytes(8, "little") + body

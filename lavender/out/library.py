@@ -1,0 +1,130 @@
+"""The C library as a folder: its one source, its header, and how it is built; the package of npm likewise."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import lavender_ext
+from lavender.base.errors import InputError, LavenderError
+from lavender.io.stored import writable, write_bytes, write_text
+from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
+from lavender.out.header import functions, javascript
+from lavender.sim.web import compile as wasm
+
+__all__ = ["HEADER", "source", "write"]
+
+HERE = Path(__file__).resolve().parent
+ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
+HEADER = HERE / "c" / "lavender.h"
+TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".mjs", ".mts", ".json")
+#: Folders of what can be written, by name.
+KINDS = {"c": "c", "npm": "js"}
+
+
+def source() -> str:
+    """lavender.c: the one that came with the package, or one made of the kernels as they lie here, kept beside it.
+
+    Raises
+    ------
+    LavenderError
+        Neither: the kernels were changed, or come without one, and Cython is not installed.
+    """
+    kept = HERE / "c" / "lavender.c"
+    wanted = source_hash(ROOT)
+    if kept.exists():
+        text = kept.read_text(encoding="utf-8")
+        if wanted in text[:1000]:
+            return text
+    try:
+        text = amalgamate(ROOT, ROOT / "build" / "cython")
+    except CutFailed as error:
+        raise LavenderError(
+            f"lavender.c does not lie in {kept.parent} and cannot be made: {str(error)[-500:]}; "
+            "install a wheel, or Cython"
+        ) from None
+    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
+        write_text(kept, text)
+    return text
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (
+        p for p in sorted(folder.rglob("*")) if p.suffix in TEXTS and p.name != "lavender.c" and p.is_file()
+    )
+
+
+def write(
+    kind: str, out: Path, *, more: Mapping[str, str | bytes] | None = None, replace: bool = False
+) -> list[Path]:
+    """Write a folder: the C library, or the npm package.
+
+    Parameters
+    ----------
+    kind : {"c", "npm"}
+    out : Path
+        A folder; made where it is not there. Files of other names in it stay.
+    more : mapping, optional
+        Further files by name, without a line in SHA256SUMS.
+    replace : bool
+        Replace files of ours that are others than what would be written.
+
+    Returns
+    -------
+    list of Path
+        What was written; SHA256SUMS, the module of npm and `more` last.
+
+    Raises
+    ------
+    InputError
+        A file of that name is there and is another; the folder cannot be written.
+    LavenderError
+        As `source`.
+    """
+    writable(out, folder=True)
+    folder, header = HERE / KINDS[kind], HEADER.read_text(encoding="utf-8")
+    made = {p.relative_to(folder).as_posix(): p.read_text(encoding="utf-8") for p in _files(folder)}
+    if kind == "npm":
+        made["header.mjs"], made["header.d.mts"] = javascript(header)
+    else:
+        made["lavender.c"] = source()
+    sums = "".join(f"{hashlib.sha256(made[name].encode()).hexdigest()}  {name}\n" for name in sorted(made))
+    made["SHA256SUMS"] = sums
+    module = {"liblavender.wasm": _module(header)} if kind == "npm" else {}
+    return _put(out, {**made, **module, **(more or {})}, replace)
+
+
+def _module(header: str) -> bytes:
+    """The library as a WebAssembly module: the one made of this source before, or a new one, kept beside it."""
+    kept, text = HERE / "js" / "liblavender.wasm", source()
+    stamp = wasm.section(wasm.SECTION, hashlib.sha256(text.encode()).hexdigest().encode())
+    if kept.exists() and (made := kept.read_bytes()).endswith(stamp):
+        return made
+    with TemporaryDirectory() as folder:
+        work = Path(folder)
+        (work / "lavender.c").write_text(text, encoding="utf-8")
+        (work / "lavender.h").write_text(header, encoding="utf-8")
+        names = [name for _, name, _ in functions(header)]
+        try:
+            wasm.build_library(work / kept.name, work / "lavender.c", names)
+        except wasm.BuildFailed as error:
+            raise LavenderError(str(error)) from None
+        made = (work / kept.name).read_bytes() + stamp
+    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
+        write_bytes(kept, made)
+    return made
+
+
+def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path]:
+    """Write files by their names below a folder; none where one of them is there and is another."""
+    files = {out / name: x.encode() if isinstance(x, str) else x for name, x in made.items()}
+    for path, data in files.items():
+        if path.exists() and not replace and path.read_bytes() != data:
+            raise InputError(f"{path} is there and is another: give --replace, or another folder")
+    for path, data in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, data)
+    return list(files)

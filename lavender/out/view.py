@@ -1,0 +1,143 @@
+"""A problem of the package as `lav_problem` has it: counts, arrays by name, and settings by number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lavender.base.errors import InputError
+from lavender.out.header import constants, struct_fields
+from lavender.out.library import HEADER
+from lavender.problem import Problem
+from lavender.problem.cones import CONTACT_ROLLING, ROUND, ROW
+from lavender.solvers import registry
+
+__all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "takes", "view"]
+
+_HEADER = HEADER.read_text(encoding="utf-8")
+#: Arrays in the order of the struct, with what they hold.
+ARRAYS: dict[str, Any] = {
+    name: np.dtype({"double": "f8", "int32_t": "i4", "uint64_t": "u8"}[kind.split()[1]])
+    for kind, name in struct_fields(_HEADER, "lav_problem")
+    if "*" in kind
+}
+BODIES = (
+    "inv_mass",
+    "inv_inertia",
+    "joint_body",
+    "jac",
+    "contact_body",
+    "normal",
+    "tangent",
+    "arm_a",
+    "arm_b",
+)
+#: Solvers by their numbers in the library.
+METHODS = {
+    name: constants(_HEADER)[f"LAV_{name.upper()}"]
+    for name, spec in registry.specs().items()
+    if spec.own and not spec.external and not spec.delegates
+}
+#: Those whose factor is another in the package, or which stand for steps of others: other bits, the same judge.
+OTHER_BITS = ("admm", "auto")
+ORDERS = {"given": 0, "symmetric": 1, "random": 2, "reverse": 3}
+SWEEPS = {None: 0, "pgs": 1, "blocks": 2}
+
+
+#: Forms (1 a matrix, 2 bodies, 3 J and M) of those that do not take all of them.
+FORMS = {"sequential_impulses": (2,), "pgs": (1, 3), "direct": (1, 2), "lemke": (1, 2), "admm": (1, 2)}
+FORMS |= dict.fromkeys(("sor", "gauss_seidel", "jacobi"), (1,))
+
+
+class NotTaken(InputError):
+    """The library does not take this; the message says what."""
+
+
+@dataclass(frozen=True)
+class View:
+    """form, law, blocks, rows, entries, bodies, joints, velocities, entries of M; arrays, None for null."""
+
+    counts: tuple[int, ...]
+    arrays: dict[str, Any]
+
+
+def view(problem: Problem) -> View:
+    """The problem in the library's words; its start is a guess that came with it, or none.
+
+    Raises
+    ------
+    NotTaken
+        Ellipses; generalised velocities in an order of lavender's own.
+    """
+    c = problem.cones
+    if max(c.kind, default=0) > CONTACT_ROLLING:
+        raise NotTaken("the library has no ellipses: give it the same in longer rows, `problem.disk`")
+    arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
+    arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
+    arrays |= {"patch_radius": c.patch_radius, "b": problem.b, "impulse": problem.guess, "rolling": c.rolling}
+    form, entries, bodies, joints, velocities, mass = 1, 0, 0, 0, 0, 0
+    if problem.rows is not None:
+        r, form = problem.rows, 2
+        bodies, joints = r.n_bodies, r.n_joints
+        for key in BODIES:
+            arrays[key] = getattr(r, key)
+        arrays |= {"velocity": r.v_free, "compliance": problem.compliance}
+    elif problem.generalized is not None:
+        g, form = problem.generalized, 3
+        if g.order is not None:
+            raise NotTaken(
+                "velocities stand in an order of lavender's own: M's pattern is not that of a tree"
+            )
+        arrays |= zip(("index_ptr", "index", "value"), g.operator.jac, strict=True)
+        arrays |= zip(("mass_ptr", "mass_index", "mass_value"), g.operator.mass, strict=True)
+        arrays |= {"velocity": g.v_free, "compliance": problem.compliance}
+        velocities, mass = g.operator.n, len(g.operator.mass[1])
+    else:
+        a = problem.csr
+        arrays |= {"index_ptr": a.indptr, "index": a.indices, "value": a.data}
+    if arrays["value"] is not None:
+        entries = len(arrays["value"])
+    for key, values in arrays.items():
+        if values is not None:
+            arrays[key] = np.ascontiguousarray(values, ARRAYS[key])
+    law = int(problem.friction == "cone")
+    return View((form, law, problem.n_blocks, problem.m, entries, bodies, joints, velocities, mass), arrays)
+
+
+def takes(problem: Problem, solver: str) -> bool:
+    """Whether the library's method takes a problem that the package's solver takes, as `lav_takes` says it."""
+    form = 2 if problem.rows is not None else 3 if problem.generalized is not None else 1
+    kinds = set(problem.cones.kind.tolist())
+    if form not in FORMS.get(solver, (1, 2, 3)):
+        return False
+    if solver in ("direct", "lemke"):
+        c = problem.cones
+        return not np.any((c.kind != ROW) & (np.diff(c.ptr) > 1))
+    return solver != "newton" or form == 3 or not kinds & {ROUND, CONTACT_ROLLING}
+
+
+def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:
+    """(order, memory, sweep, convex, keeps) and omega of the options of a solver.
+
+    Raises
+    ------
+    NotTaken
+        An option that the library does not have.
+    """
+    left = dict(options)
+    order = left.pop("order", "given")
+    sweep, restart = left.pop("sweep", None), left.pop("restart", "growth")
+    numbers = (
+        left.pop("memory", 10 if solver == "admm" else 5),
+        SWEEPS.get(sweep, -1),
+        left.pop("convex", 0),
+        int(restart == "against"),
+    )
+    omega = left.pop("omega", {"sor": 1.5, "gauss_seidel": 1.0}.get(solver)) or 0.0
+    if left or order not in ORDERS or solver not in METHODS:
+        what = ", ".join(left) or (f"order={order!r}" if order not in ORDERS else solver)
+        raise NotTaken(f"{what}: not in the library")
+    return (ORDERS[order], *numbers), float(omega)

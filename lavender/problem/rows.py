@@ -1,0 +1,292 @@
+"""The factored operator: J and M^-1 of bodies of six velocities, in the layout that sweeps want."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import (
+    FloatArray,
+    IntArray,
+    as_array,
+    check_not_negative,
+    equal,
+    precision_of,
+    read_only,
+    shape_of,
+)
+from lavender.base.errors import InputError
+from lavender.base.later import sparse as sp
+from lavender.problem.cones import Cones
+from lavender_ext.core import checks
+
+__all__ = ["Rows"]
+
+EXACT = 1e-9  # above rounding of what was normalised in float64
+ROUNDED = 1e-5  # above what float32 leaves after some turns, below anything meant otherwise
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Bodies, joints and contacts: J and M^-1 in the layout that sweeps read, without forming A.
+
+    Bodies are numbered 0 to n - 1; -1 stands for the static world. The blocks of the problem are the kj joints,
+    followed by the c contacts. A contact between bodies a and b has the normal n from a to b, the tangents t1 and
+    t2 = n x t1, and arms from the bodies' centres to the contact point. Its rows are
+
+        n.u, t1.u, t2.u             u = v_b + omega_b x arm_b - v_a - omega_a x arm_a     [m/s]
+        n.(omega_b - omega_a)       spin, if declared                                     [rad/s]
+        t.(omega_b - omega_a)       rolling, if declared                                  [rad/s]
+
+    A positive impulse along n pushes b away from a.
+
+    Parameters
+    ----------
+    inv_mass : array-like (n,), 1/kg
+        0: a kinematic body, which moves with `v_free` whatever the impulses.
+    inv_inertia : array-like (n, 3, 3), 1/(kg m^2)
+        In world axes, symmetric, positive semidefinite.
+    v_free : array-like (n, 6), m/s and rad/s
+        v*: linear and angular velocity at the end of the step without constraint impulses, gravity included.
+    jac : array-like (mj, 12), optional
+        Jacobian rows of the joints: linear and angular columns of body a, then of body b.
+    joint_ptr : array-like (kj + 1,) of int, optional
+        First row of each joint, followed by mj.
+    joint_body : array-like (kj, 2) of int, optional
+        Bodies a and b of each joint.
+    normal : array-like (c, 3), optional
+        Unit vectors from a to b.
+    tangent : array-like (c, 3), optional
+        Unit vectors t1, orthogonal to the normal; also needed without friction.
+    arm_a, arm_b : array-like (c, 3), m, optional
+        Contact point minus the centre of a, and of b, in world axes.
+    contact_body : array-like (c, 2) of int, optional
+        Bodies a and b of each contact.
+    copy : bool, default True
+        True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
+        caller and marked read-only, and inertias are not symmetrised.
+
+    float32 arrays are converted to float64. Normals and tangents that differ from orthogonal unit vectors by up to 1e-5
+    are corrected, and so are inertias that are asymmetric by as much. If all arrays of numbers are float32, the
+    `precision` of the rows and of their problems is "float32".
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit; a body that does not exist; a row between a body and itself or between two static ones;
+        a negative inverse mass; an inertia that is not positive semidefinite; a normal or tangent that is not a unit
+        vector, or tangents that are not orthogonal to the normal.
+
+    Examples
+    --------
+    A stack of three boxes of 1 kg and 1 m on the ground, with four contacts under each, in a step of 1/60 s:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> dt = 1 / 60
+    >>> corners = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    >>> rows = lv.Rows(
+    ...     inv_mass=np.ones(3),
+    ...     inv_inertia=np.tile(6.0 * np.eye(3), (3, 1, 1)),  # a cube's moment is m / 6
+    ...     v_free=np.tile([0.0, 0.0, -9.81 * dt, 0.0, 0.0, 0.0], (3, 1)),
+    ...     contact_body=np.repeat([(-1, 0), (0, 1), (1, 2)], 4, axis=0),  # a below, b above; -1 is the ground
+    ...     normal=np.tile([0.0, 0.0, 1.0], (12, 1)),
+    ...     tangent=np.tile([1.0, 0.0, 0.0], (12, 1)),
+    ...     arm_a=np.tile(corners + (0, 0, 0.5), (3, 1)),
+    ...     arm_b=np.tile(corners - (0, 0, 0.5), (3, 1)),
+    ... )
+    >>> problem = lv.Problem.from_rows(rows, mu=0.5)
+    >>> solution = lv.solve(problem, tol=1e-9)
+    >>> force = solution.impulse.reshape(3, 4, 3) / dt  # N: box, corner, (n, t1, t2)
+    >>> force[:, :, 0].sum(axis=1).round(2).tolist()  # the ground carries three boxes, the middle one two
+    [29.43, 19.62, 9.81]
+    >>> bool(abs(problem.velocity(solution.impulse)).max() < 1e-8)  # m/s: all boxes are at rest
+    True
+    """
+
+    inv_mass: FloatArray  # (n,) 1/kg
+    inv_inertia: FloatArray  # (n, 3, 3) 1/(kg m^2), world axes, symmetric
+    v_free: FloatArray  # (n, 6) m/s, rad/s: v*, the velocity without constraint impulses
+    jac: FloatArray = field(
+        default_factory=lambda: np.zeros((0, 12))
+    )  # (mj, 12) linear, angular of a, then of b
+    joint_ptr: IntArray = field(
+        default_factory=lambda: np.zeros(1, np.int32)
+    )  # (kj + 1,) first row of each joint
+    joint_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (kj, 2)
+    normal: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, from a to b
+    tangent: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) unit, orthogonal to normal
+    arm_a: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    arm_b: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))  # (c, 3) m
+    contact_body: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int32))  # (c, 2)
+    copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
+    precision = "float64"  # of the numbers given, no field; an instance of float32 has its own
+
+    def __post_init__(self) -> None:
+        masses, normals = shape_of("inv_mass", self.inv_mass), shape_of("normal", self.normal)
+        n, c = masses[0] if len(masses) == 1 else None, normals[0] if len(normals) == 2 else None
+        ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
+        if not checks.counts_up(ptr):
+            raise InputError(
+                "joint_ptr must start with 0 and increase: the first row of each joint, then the "
+                "number of joint rows"
+            )
+        shapes: dict[str, tuple[int | None, ...]] = {
+            "inv_mass": (n,), "inv_inertia": (n, 3, 3), "v_free": (n, 6), "jac": (int(ptr[-1]), 12),
+            "normal": (c, 3), "tangent": (c, 3), "arm_a": (c, 3), "arm_b": (c, 3),
+        }  # fmt: skip
+        object.__setattr__(self, "joint_ptr", ptr)
+        given = []
+        for name, shape in shapes.items():
+            x = getattr(self, name)
+            object.__setattr__(self, name, as_array(name, x, shape, copy=self.copy))
+            given += [x] if getattr(self, name).size else []
+        if precision_of(*given) == "float32":
+            object.__setattr__(self, "precision", "float32")
+        for name, shape in (("joint_body", (len(ptr) - 1, 2)), ("contact_body", (c, 2))):
+            body = as_array(name, getattr(self, name), shape, dtype=np.int32, copy=self.copy)
+            object.__setattr__(self, name, body)
+            if checks.are_pairs(body, len(self.inv_mass), name == "contact_body"):
+                continue
+            if body.size and (body.min() < -1 or body.max() >= len(self.inv_mass)):
+                stray = body.max() if body.max() >= len(self.inv_mass) else body.min()
+                raise InputError(
+                    f"{name} names body {stray}; there are {len(self.inv_mass)} bodies, and -1 is static"
+                )
+            same = np.flatnonzero((body[:, 0] == body[:, 1]) & (body[:, 0] >= 0))
+            if len(same):
+                raise InputError(f"{name}[{same[0]}] joins body {body[same[0], 0]} to itself")
+            nobody = np.flatnonzero((body < 0).all(axis=1))
+            raise InputError(
+                f"{name}[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
+            )
+        check_not_negative("inv_mass", self.inv_mass)
+        if self.copy:
+            object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
+        if not checks.are_frames(self.normal, self.tangent):
+            self._take_frames()
+        object.__setattr__(self, "copy", True)  # of what was given here
+
+    def _take_frames(self) -> None:
+        # What float32 leaves of unit vectors is made whole; what is meant otherwise is told.
+        n, t = self.normal, self.tangent
+        with np.errstate(over="ignore", invalid="ignore"):
+            along = np.einsum("ij,ij->i", n, t)
+            parts = [np.linalg.norm(n, axis=1) - 1.0, np.linalg.norm(t, axis=1) - 1.0, along]
+            off = np.nan_to_num(
+                np.abs(np.stack(parts)).max(axis=0), nan=np.inf, posinf=np.inf
+            )  # inf - inf is far off, too
+        if off.max() > ROUNDED:
+            i = int(np.argmax(off))
+            raise InputError(
+                f"contact {i}: normal {n[i]} and tangent {t[i]} must be orthogonal unit vectors; they are off by "
+                f"{off[i]:.2g}, and up to {ROUNDED:g} (float32 leaves 1e-7) is made whole: divide each by its length, "
+                "after the part along the normal was taken out of the tangent"
+            )
+        if off.max() <= EXACT:
+            return
+        n = n / np.linalg.norm(n, axis=1)[:, None]
+        t = t - np.einsum("ij,ij->i", n, t)[:, None] * n
+        t /= np.linalg.norm(t, axis=1)[:, None]
+        rough = (off > EXACT)[:, None]
+        object.__setattr__(self, "normal", read_only(np.where(rough, n, self.normal)))
+        object.__setattr__(self, "tangent", read_only(np.where(rough, t, self.tangent)))
+
+    @property
+    def n_bodies(self) -> int:
+        """Number of moving bodies, n."""
+        return len(self.inv_mass)
+
+    @property
+    def n_joints(self) -> int:
+        """Number of joints, kj: the first blocks."""
+        return len(self.joint_body)
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of contacts, c: the blocks after the joints."""
+        return len(self.contact_body)
+
+    @property
+    def block_bodies(self) -> IntArray:
+        """(k, 2) bodies of each block, joints first; -1 is static."""
+        if self.n_joints == 0:
+            return self.contact_body
+        return np.concatenate([self.joint_body, self.contact_body])
+
+    def jacobian(self, cones: Cones) -> sp.csr_array:
+        """J as CSR (m, 6 n); the columns of body i are 6 i .. 6 i + 5, linear then angular."""
+        tangents = cones.n_tangents[self.n_joints :]
+        first = cones.ptr[self.n_joints : -1]
+        m = cones.n_rows
+        dense = np.zeros((m, 12))
+        body = np.empty((m, 2), np.int64)
+        mj = len(self.jac)
+        dense[:mj] = self.jac
+        body[:mj] = np.repeat(self.joint_body, np.diff(self.joint_ptr), axis=0)
+        body[mj:] = np.repeat(self.contact_body, np.diff(cones.ptr[self.n_joints :]), axis=0)
+        t2 = np.cross(self.normal, self.tangent)
+        for axis, row in ((self.normal, 0), (self.tangent, 1), (t2, 2)):
+            has = np.flatnonzero(tangents >= row)
+            with np.errstate(over="ignore", invalid="ignore"):  # arms at the edge of float64
+                turn_a, turn_b = np.cross(self.arm_a[has], axis[has]), np.cross(self.arm_b[has], axis[has])
+            dense[first[has] + row] = np.hstack([-axis[has], -turn_a, axis[has], turn_b])
+        turning, rolling = cones.spin_rows[self.n_joints :], cones.rolling_rows[self.n_joints :]
+        for axis, at in ((self.normal, turning), (self.tangent, rolling), (t2, rolling + (rolling >= 0))):
+            has = np.flatnonzero(at >= 0)
+            dense[at[has]] = 0.0
+            dense[at[has], 3:6], dense[at[has], 9:12] = -axis[has], axis[has]
+        keep = np.repeat(body >= 0, 6, axis=1) & (dense != 0.0)
+        columns = (6 * body[:, [0, 1], None] + np.arange(6)).reshape(m, 12)
+        indptr = np.concatenate([[0], np.cumsum(keep.sum(axis=1))])
+        jac = sp.csr_array((dense[keep], columns[keep], indptr), shape=(m, 6 * self.n_bodies))
+        jac.sort_indices()
+        return jac
+
+    def inverse_mass_matrix(self) -> sp.csr_array:
+        """M^-1 as CSR (6 n, 6 n)."""
+        n = self.n_bodies
+        diagonal = np.repeat(np.arange(n) * 6, 3) + np.tile(np.arange(3), n)
+        block = np.repeat(np.arange(n) * 6 + 3, 9)
+        i = np.concatenate([diagonal, block + np.tile(np.repeat(np.arange(3), 3), n)])
+        j = np.concatenate([diagonal, block + np.tile(np.arange(3), 3 * n)])
+        x = np.concatenate([np.repeat(self.inv_mass, 3), self.inv_inertia.ravel()])
+        return sp.csr_array((x, (i, j)), shape=(6 * n, 6 * n))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Rows):
+            return NotImplemented
+        return all(
+            equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self) if f.name != "copy"
+        )
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Arrays stay read-only in copies and pickles.
+        return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+
+
+def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
+    """Tensors (n, 3, 3) that bodies have, made whole where float32 left symmetry or eigenvalues of 0 a little off."""
+    if checks.are_definite(tensors):
+        return tensors
+    size = np.abs(tensors).max(axis=(1, 2))
+    skew = np.abs(tensors - tensors.transpose(0, 2, 1)).max(axis=(1, 2))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scaled = np.where(size[:, None, None] > 0.0, tensors / size[:, None, None], 0.0)
+    least = np.linalg.eigvalsh(scaled)[:, 0]
+    for wrong, what in ((skew > ROUNDED * size, "symmetric"), (least < -ROUNDED, "positive semidefinite")):
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            raise InputError(
+                f"{name}[{i}] is not {what}: {tensors[i].tolist()}; an inverse inertia, world axes, is needed"
+            )
+    rough = (skew > EXACT * size) | (least < -EXACT)
+    if not rough.any():
+        return tensors
+    value, axes = np.linalg.eigh(0.5 * (scaled + scaled.transpose(0, 2, 1)))
+    whole = size[:, None, None] * ((axes * np.maximum(value, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1))
+    return read_only(np.where(rough[:, None, None], 0.5 * (whole + whole.transpose(0, 2, 1)), tensors))

@@ -1,0 +1,8 @@
+"""LavenderSim (not PyPI's `lavendersim`): the step loop over the compiled substep, and the problems inside it."""
+
+from lavender.sim.engine.film import Film
+from lavender.sim.engine.run import Trace, run, run_scene
+from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.sim.engine.snapshot import Snapshot
+
+__all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run", "run_scene"]

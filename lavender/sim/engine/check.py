@@ -1,0 +1,162 @@
+"""What a snapshot must hold before the kernels may trust it.
+
+The kernels check nothing: an index of one array is used in another as it stands. So every array is one of
+
+    given      by the scene: equal to the simulation's own, bit for bit
+    carried    from one substep to the next: finite, in range, in order
+    judged     the last substep's problem, which `Simulation.residual` reads: whole and in range
+    scratch    written before it is read
+
+and the pair list is made anew.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.errors import InputError
+from lavender.problem.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
+from lavender.sim.engine.layout import HEAD, SETTING, SIZE
+from lavender.sim.engine.state import KEPT, State
+from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
+
+__all__ = ["same_scene", "whole_state"]
+
+CARRIED = (
+    "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
+)  # fmt: skip
+GIVEN = tuple(name for name in KEPT if name not in (*CARRIED, "head", "setting", "ptr"))
+FIXED_HEAD = ("position_iterations", "order", "seed", "stepper", "relaxing", "friction_shape")
+WRITTEN = {"out": 8, "depth": 1, "joint_error": 1}  # entries of `setting` that the engine writes
+UNIT = 1e-9  # -, quaternions are normalised in every substep
+
+
+def same_scene(own: State, size: np.ndarray) -> None:
+    """Raise where sizes other than the capacities differ from the simulation's."""
+    free = (CAP_PAIR, CAP_CONTACT)
+    fixed = [k for k in range(N_SIZES) if k not in free]
+    if not np.array_equal(size[fixed], own.size[fixed]) or size[list(free)].min() < 0:
+        raise _damaged("its sizes are not those of this scene")
+
+
+def whole_state(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
+    """Raise where `new`, of the sizes that `same_scene` has let pass, is no state of the scene of `own`.
+
+    `sweeps`: least and largest budget. `lost`: the state is said to be not finite; numbers may be anything then, for no
+    step follows.
+    """
+    a, b = own.a, new.a
+    for name in GIVEN:
+        if a[name].tobytes() != b[name].tobytes():
+            raise _damaged(f"{name} is not that of this scene")
+    kj = int(own.size[SIZE["joints"]])
+    if not np.array_equal(a["ptr"][: kj + 1], b["ptr"][: kj + 1]):
+        raise _damaged("the rows of the joints are not those of this scene")
+    settings = np.ones(len(own.setting), bool)
+    for name, width in WRITTEN.items():
+        settings[SETTING[name] : SETTING[name] + width] = False
+    if own.setting[settings].tobytes() != new.setting[settings].tobytes():
+        raise _damaged("setting is not that of this scene")
+    _check_head(own, new, sweeps, lost)
+    _check_contacts(new)
+    if not lost:
+        _check_numbers(own, new)
+
+
+def _check_head(own: State, new: State, sweeps: tuple[int, int], lost: bool) -> None:
+    n, top = int(own.size[SIZE["bodies"]]), 2**31 - 1
+    contacts = int(new.size[CAP_CONTACT])
+    per = int(own.size[SIZE["rows_per_contact"]])
+    ranges = {
+        "contacts": (0, contacts),
+        "contact_rows": (0, contacts * per),
+        "pairs": (0, int(new.size[CAP_PAIR])),
+        "pairs_valid": (0, 1),
+        "matches": (0, contacts),
+        "cached": (0, contacts),
+        "iterations": sweeps,
+        "warm_start": (0, 1),
+        "step": (0, top),
+        "need_pairs": (0, top),
+        "need_contacts": (0, top),
+        "rebuilds": (0, top),
+        "projected": (0, top),
+        "lost": (0, n - 1) if lost else (-1, -1),
+        "solved": (0, 1),
+    }
+    for name, (low, high) in ranges.items():
+        if not low <= new.head[HEAD[name]] <= high:
+            raise _damaged(f"{name} is {new.head[HEAD[name]]}, not {low} to {high}")
+    for name in FIXED_HEAD:
+        if new.head[HEAD[name]] != own.head[HEAD[name]]:
+            raise _damaged(f"{name} is not that of this scene")
+
+
+def _check_contacts(new: State) -> None:
+    b, size = new.a, new.size
+    kj, mj = int(size[SIZE["joints"]]), int(size[SIZE["joint_rows"]])
+    c, rows = int(new.head[HEAD["contacts"]]), int(new.head[HEAD["contact_rows"]])
+    per, n = int(size[SIZE["rows_per_contact"]]), int(size[SIZE["bodies"]])
+    cached = b["cache_key"][: new.head[HEAD["cached"]]] >> np.uint64(16)
+    if (cached[1:] < cached[:-1]).any() or (cached >> np.uint64(24) >= n).any():
+        raise _damaged("cache_key is not in order")
+    if not new.head[HEAD["solved"]]:
+        return
+    ptr = b["ptr"][kj : kj + c + 1].astype(np.int64)
+    blocks = np.diff(ptr)
+    friction = b["mu"][kj : kj + c] > 0.0
+    kind = b["kind"][: kj + c]
+    kinds, rolls = kind[kj:], kind[kj:] == CONTACT_ROLLING
+    expected = np.where(friction, 3, 1) + (kinds == CONTACT_SPIN) + rolls * np.where(blocks == 6, 3, 2)
+    if ptr[0] != mj or ptr[-1] != mj + rows or (blocks != expected).any() or blocks.max(initial=1) > per:
+        raise _damaged("the rows of its contacts do not add up")
+    known = (CONTACT, CONTACT_SPIN, CONTACT_BOX, CONTACT_ROLLING)
+    if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, known).all()):
+        raise _damaged("kind holds what is no block")
+    if ((kind[kj:] == CONTACT_BOX) != (friction & bool(new.head[HEAD["friction_shape"]]))).any():
+        raise _damaged("kind holds contacts of another shape")
+    pair = b["contact_pair"][:c]
+    if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
+        raise _damaged("contact_pair names bodies that the scene does not have")
+
+
+def _check_numbers(own: State, new: State) -> None:
+    b, cached = new.a, int(new.head[HEAD["cached"]])
+    for name in ("x", "v", "joint_impulse", "inv_inertia"):
+        if not np.isfinite(b[name]).all():
+            raise _damaged(f"{name} is not finite")
+    for name in ("cache_impulse", "cache_local", "cache_roll"):
+        if not np.isfinite(b[name][:cached]).all():
+            raise _damaged(f"{name} is not finite")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if not (np.abs((b["q"] ** 2).sum(axis=1) - 1.0) <= UNIT).all():
+            raise _damaged("q holds what is no unit quaternion")
+    static = b["dyn"] < 0
+    if b["v"][static].any():
+        raise _damaged("v gives a static body a velocity")
+    even = ~b["uneven"][b["body_of"]].astype(bool)
+    if b["inv_inertia"][even].tobytes() != own.a["inv_inertia"][even].tobytes():
+        raise _damaged("inv_inertia is not that of this scene")
+
+
+def _damaged(what: str) -> InputError:
+    return InputError(f"the snapshot is damaged: {what}")
+
+
+def well_formed(snapshot: Any) -> None:
+    """Raise where the fields of a snapshot are not of their types."""
+    for name in ("steps", "failed"):
+        x = getattr(snapshot, name)
+        if isinstance(x, bool) or not isinstance(x, int) or not 0 <= x < 2**53:
+            raise _damaged(f"{name} is {str(x)[:40]}, not a count")
+    for name in ("fingerprint", "lost"):
+        if not isinstance(getattr(snapshot, name), str):
+            raise _damaged(f"{name} is a {type(getattr(snapshot, name)).__name__}, not text")
+    for name, dtype in (("size", np.int32), ("real", np.float64), ("index", np.int32), ("keys", np.uint64)):
+        x = getattr(snapshot, name)
+        if not isinstance(x, np.ndarray) or x.dtype != dtype or x.ndim != 1:
+            raise _damaged(f"{name} is no vector of {np.dtype(dtype).name}")
+    if len(snapshot.size) != N_SIZES:
+        raise _damaged(f"size has {len(snapshot.size)} entries, not {N_SIZES}")

@@ -1,0 +1,216 @@
+"""Run a scene and keep what it says of its solver: the body of `lavender run`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from time import perf_counter, sleep
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, whole_number
+from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
+from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
+from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.sim.scene import Scene
+from lavender.solvers.registry import get
+
+__all__ = ["Trace", "run", "run_scene"]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """What a run measured, one row for each step."""
+
+    scene: str
+    time: FloatArray  # (steps,) s, simulated
+    solver: FloatArray  # (steps, 8) see SOLVER_FIELDS
+    depth: FloatArray  # (steps,) m, largest depth
+    cost: FloatArray  # (steps,) s, wall time of the step
+    lost_body: str = ""  # name of the body that ended the run, or empty
+    recorded: int = 0  # problems written
+    title: str = ""  # of figures
+    order: str = ""  # in which each sweep visits the contacts
+    method: str = ""  # in words: the solver unless it is the engine's own, the order unless it takes none
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def column(self, name: str) -> FloatArray:
+        """One of `SOLVER_FIELDS` over the steps (steps,)."""
+        return self.solver[:, SOLVER_FIELDS.index(name)]
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write as CSV, one line for each step."""
+        lines = [["step", "time", *SOLVER_FIELDS, "depth", "cost", "order"]]
+        for i in range(len(self)):
+            row = [self.time[i], *self.solver[i], self.depth[i], self.cost[i]]
+            lines.append([str(i + 1), *(repr(float(x)) for x in row), self.order])
+        write_text(path, "".join(",".join(line) + "\r\n" for line in lines))
+
+    def plot(self, path: str | PathLike[str]) -> None:
+        """Residuals, contacts with matches, and depth over time, as a figure."""
+        from matplotlib.figure import Figure
+
+        canvas = Figure(figsize=(8, 7), layout="constrained")
+        top, middle, bottom = canvas.subplots(3, 1, sharex=True)
+        for name, label in (
+            ("residual_initial", "before the\nfirst sweep"),
+            ("residual_final", "after the last"),
+        ):
+            value = self.column(name)
+            top.semilogy(self.time, np.where(value > 0.0, value, np.nan), label=label)
+        top.set(title=f"{self.title}: residual of the normals", ylabel="max $|e_n|$ [N s]")
+        for name, label, width in (("contacts", "contacts", 5.0), ("cache_matches", "matches", 1.5)):
+            middle.plot(
+                self.time, self.column(name), linewidth=width, label=label
+            )  # both seen where they are equal
+        middle.set(title="contacts, and those found in the cache", ylim=(0, None))
+        for axes in (top, middle):
+            axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+        bottom.plot(self.time, 1e3 * self.depth)
+        bottom.set(title="largest depth", xlabel="time [s]", ylabel="[mm]", ylim=(0, None))
+        write_figure(canvas, path)
+
+
+def run(
+    simulation: Simulation,
+    steps: int,
+    *,
+    record: str | PathLike[str] | None = None,
+    skip: int = 0,
+    replace: bool = False,
+    watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
+) -> Trace:
+    """Step a simulation and keep its trace; stops where the state is no longer finite.
+
+    `record`: a folder for the problem of every step after the first `skip`; `replace` takes the problems of another
+    recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
+    """
+    steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
+    recorded = 0
+    solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
+    lost, done = "", 0
+    with nullcontext() if record is None else folder_for_steps(record, replace) as folder:
+        while done < steps and not lost:
+            if folder is not None and done >= skip:
+                recorded += simulation.write_problem(folder, 6) is not None
+            start = perf_counter()
+            observation, _, _, _, info = simulation.step()
+            cost[done] = perf_counter() - start
+            solver[done] = observation["solver"]
+            depth[done] = observation["contacts"]["depth"].max(initial=0.0)
+            time[done] = info["time"]
+            lost = info.get("lost_body", "")
+            done += 1
+            if watch is not None:
+                watch(done, observation, info)
+    scene = simulation.scene
+    spec = get(scene.parameters.solver)
+    order = str(scene.parameters.solver_options.get("order", scene.parameters.order))
+    words = [] if spec.name == "sequential_impulses" else [spec.name]
+    method = ", ".join([*words, f"order {order}"] if spec.order else words)
+    return Trace(
+        scene=repr(scene),
+        time=time[:done],
+        solver=solver[:done],
+        depth=depth[:done],
+        cost=cost[:done],
+        lost_body=lost,
+        recorded=recorded,
+        title=f"{scene.name or 'scene'}, {simulation.solver_iterations} iterations, "
+        f"{'warm' if simulation.warm_start else 'cold'}, {method}",
+        order=order,
+        method=method,
+    )
+
+
+def line(step: int, observation: Mapping[str, Any], info: Mapping[str, Any]) -> str:
+    """One line about a step: time, contacts, matches, residual before and after the solve, depth."""
+    s = observation["solver"]
+    depth = observation["contacts"]["depth"].max(initial=0.0)
+    text = (
+        f"step {step:>6}  t {info['time']:8.3f} s  contacts {int(s[2]):>5}  matches {int(s[3]):>5}  "
+        f"residual {s[4]:.2e} -> {s[5]:.2e} N s  violation {s[7]:.2e} m/s  depth {1e3 * depth:7.3f} mm"
+    )
+    failed = f"  failed solves {info['failed_solves']}" if info["failed_solves"] else ""
+    rest = (
+        f"  relative {info['residual']['relative']:.2e}, worst {info['residual']['worst']}"
+        if "residual" in info
+        else ""
+    )
+    return text + failed + rest
+
+
+def run_scene(
+    name: str,
+    *,
+    steps: int = 240,
+    iterations: int | None = None,
+    warm_start: bool = True,
+    parameters: Mapping[str, Any] | None = None,
+    residual: bool = False,
+    trace: str | PathLike[str] | None = None,
+    plot: str | PathLike[str] | None = None,
+    record: str | PathLike[str] | None = None,
+    skip: int = 0,
+    replace: bool = False,
+    film: str | PathLike[str] | None = None,
+    view: bool = False,
+    every: int = 1,
+    show: Callable[[str], Any] = print,
+) -> Trace:
+    """`lavender run NAME`: a gallery scene, a line of every `every`-th step for `show`, and files on request.
+
+    `film`: `.gif`, `.mp4`, `.png`, `.svg` or `.pdf` are pictures, anything else is for `lavender view`. `view` shows
+    the run in a page, no faster than it would go, and after it until Ctrl-C.
+    """
+    every = whole_number("every", every, 1)
+    for path in (trace, plot, film):
+        if path is not None:
+            writable(path)
+    if plot is not None:
+        check_figure(plot)
+    drawn = film is not None and Path(film).suffix.lower() in PICTURES
+    if film is not None and drawn:
+        picture_suffix(film)
+    given = dict(parameters or {})
+    if iterations is not None:
+        given["solver_iterations"] = iterations
+    simulation = Simulation(Scene(name, **{**given, "warm_start": warm_start}), report_residual=residual)
+
+    viewer = simulation.view() if view else None
+    taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None
+    begun = perf_counter()
+    if viewer is not None:
+        show(f"{viewer.address}   Ctrl-C ends")
+
+    def watch(step: int, observation: dict[str, Any], info: dict[str, Any]) -> None:
+        if step % every == 0 or step == steps or "lost_body" in info:
+            show(line(step, observation, info))
+        if viewer is not None:
+            sleep(max(0.0, info["time"] - (perf_counter() - begun)))
+
+    try:
+        found = run(simulation, steps, record=record, skip=skip, replace=replace, watch=watch)
+        if found.lost_body:
+            show(f"stopped: the state of {found.lost_body!r} is not finite")
+        if trace is not None:
+            found.save(trace)
+        if plot is not None:
+            found.plot(plot)
+        if film is not None and taken is not None:
+            if drawn:
+                save_picture(taken, film)
+            else:
+                taken.save(film)
+        if viewer is not None:
+            viewer.wait()
+    finally:
+        if viewer is not None:
+            viewer.close()
+    return found

@@ -1,0 +1,278 @@
+"""The engine's buffers: made from a scene, grown where they are too small, named by array."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lavender.base.errors import InputError
+from lavender.problem.derived import cached_property
+from lavender.sim.engine.layout import HEAD, JOINT, JOINT_KINDS, ORDER_NUMBER, SETTING, SIZE
+from lavender.sim.scene import Box, Plane, Scene, Sphere, arithmetic
+from lavender.sim.scene.parts import Body, Joint
+from lavender.sim.scene.scene import SCENE_ORDERS, Parameters
+from lavender.sim.scene.steppers import get_stepper
+from lavender_ext.engine import substep
+from lavender_ext.engine.arrays import (
+    BOX,
+    CAP_CONTACT,
+    CAP_PAIR,
+    MOST_PAIRS,
+    N_SIZES,
+    NO_SHAPE,
+    PLANE,
+    SPHERE,
+    TOO_MANY,
+    lengths,
+)
+from lavender_ext.host import memory
+from lavender_ext.warm.substep import Substep
+
+__all__ = ["State"]
+
+Copy = Callable[[], np.ndarray]
+
+assert set(ORDER_NUMBER) == set(SCENE_ORDERS)
+
+BRUTE_FORCE = 32  # bodies up to which testing all pairs is quicker than the grid
+BETA = 0.2  # -, share of the position error removed per substep
+MAX_PUSH = 0.2  # m, largest position error corrected per substep
+MOST_BYTES = 2**32  # of the three buffers
+# What the kernels carry from one substep to the next or a scene gives; the rest is scratch of one substep.
+KEPT = (
+    "setting", "x", "q", "v", "inv_mass_body", "inertia", "inv_inertia_body", "shape", "friction", "restitution",
+    "patch", "fat", "joint", "joint_impulse", "inv_mass", "inv_inertia", "cache_impulse", "cache_local",
+    "cache_roll", "head", "kind_of_shape", "dyn", "uneven", "body_of", "joint_kind", "joint_motor", "joint_bodies",
+    "joint_body", "excluded", "ptr", "cache_key",
+)  # fmt: skip
+
+
+class Seen(NamedTuple):
+    """Copies of what an observation shows, for one number of contacts and of their rows."""
+
+    positions: Copy
+    quaternions: Copy
+    velocities: Copy
+    joint_impulses: Copy
+    solver: Copy
+    pair: Copy
+    point: Copy
+    normal: Copy
+    tangent: Copy
+    gap: np.ndarray  # (c,) m
+    impulses: Copy | None  # None where contacts differ in their number of rows
+    per: int  # rows that a contact of this scene can have
+
+
+class State:
+    """Three buffers with the arrays of `lavender_ext/engine/arrays.pyx` by name, as attributes of `a`."""
+
+    def __init__(self, size: np.ndarray) -> None:
+        self.size = np.ascontiguousarray(size, np.int32)
+        used = lengths(self.size)
+        if min(used) < 0 or 8 * used[0] + 4 * used[1] + 8 * used[2] > MOST_BYTES:
+            raise InputError(
+                f"{self.size[SIZE['bodies']]} bodies with room for {self.size[CAP_PAIR]} pairs and "
+                f"{self.size[CAP_CONTACT]} contacts need more than the {MOST_BYTES >> 30} GiB that a simulation "
+                "may take: move the bodies apart or take fewer"
+            )
+        self.real = np.zeros(used[0])
+        self.index = np.zeros(used[1], np.int32)
+        self.keys = np.zeros(max(used[2], 1), np.uint64)
+        self.kernel = substep.Buffers(self.size, self.real, self.index, self.keys)
+        self.a: dict[str, Any] = self.kernel.arrays()
+        self.head, self.setting = self.a["head"], self.a["setting"]
+        self._seen: tuple[int, int, Seen] | None = None
+
+    @cached_property
+    def warm(self) -> Substep:
+        """The first phase of `newton` on these buffers."""
+        return Substep(self.size, self.real, self.index, self.keys, False)
+
+    def seen(self, contacts: int, rows: int) -> Seen:
+        """What to copy for an observation; kept while the numbers stay."""
+        if self._seen is None or self._seen[:2] != (contacts, rows):
+            a, first = self.a, int(self.size[SIZE["joint_rows"]])
+            per = int(self.size[SIZE["rows_per_contact"]])
+            even = rows == contacts * per
+            block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
+            out = self.setting[SETTING["out"] : SETTING["out"] + 8]
+            seen = Seen(
+                positions=a["x"].copy,
+                quaternions=a["q"].copy,
+                velocities=a["v"].copy,
+                joint_impulses=a["joint_impulse"].copy,
+                solver=out.copy,
+                pair=a["contact_pair"][:contacts].copy,
+                point=a["point"][:contacts].copy,
+                normal=a["normal"][:contacts].copy,
+                tangent=a["tangent"][:contacts].copy,
+                gap=a["gap"][:contacts],
+                impulses=block,
+                per=per,
+            )
+            self._seen = contacts, rows, seen
+        return self._seen[2]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all three buffers."""
+        return int(self.real.nbytes + self.index.nbytes + self.keys.nbytes)
+
+    def copy(self) -> State:
+        """The same, in buffers of its own."""
+        other = State(self.size)
+        other.take(self)
+        return other
+
+    def take(self, other: State) -> None:
+        """Copy the buffers of a state of the same sizes, bit for bit."""
+        self.real[:] = other.real
+        self.index[:] = other.index
+        self.keys[:] = other.keys
+
+    def grown(self) -> State:
+        """A copy with room for what the last substep found missing."""
+        if self.head[HEAD["need_pairs"]] == TOO_MANY:
+            raise InputError(
+                f"more than {MOST_PAIRS} pairs of bodies are close together ({self.size[SIZE['bodies']]} bodies): "
+                "move them apart"
+            )
+        own = (self.size, self.real, self.index, self.keys)
+        other = State(memory.more_room(*own))
+        memory.move(*own, other.size, other.real, other.index, other.keys)
+        return other
+
+    @classmethod
+    def of_scene(cls, scene: Scene) -> State:
+        """The start state of a scene."""
+        p, bodies, joints = scene.parameters, scene.bodies, scene.joints
+        n = len(bodies)
+        uneven = [not b.is_static and not _is_even(b.inertia) for b in bodies]
+        frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
+        mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
+        patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
+        restitution = np.array([p.restitution if b.restitution is None else b.restitution for b in bodies])
+        shaped = np.array([b.shape is not None for b in bodies], bool)
+        rough = bool((mu[shaped] > 0.0).any())
+        spin, rolling = rough and bool((patch[shaped] > 0.0).any()), rough and p.rolling_radius > 0.0
+        per = 1 + 2 * rough + spin + 2 * rolling
+        if p.friction_shape == "box" and (spin or rolling):
+            raise InputError(
+                "friction_shape is 'box' and patch_radius or rolling_radius > 0: a box has no spin friction, and none "
+                "against rolling; leave one of the two out"
+            )
+        excluded = sorted({tuple(sorted((j.a, j.b))) for j in joints if not j.collide and min(j.a, j.b) >= 0})
+        n_shapes = int(shaped.sum())
+        size = np.zeros(N_SIZES, np.int32)
+        size[SIZE["bodies"]] = n
+        size[SIZE["dynamic"]] = sum(not b.is_static for b in bodies)
+        size[SIZE["joints"]] = len(joints)
+        size[SIZE["joint_rows"]] = sum(j.n_rows for j in joints)
+        size[SIZE["excluded"]] = len(excluded)
+        size[SIZE["buckets"]] = 0 if n_shapes <= BRUTE_FORCE else 1 << int(np.ceil(np.log2(2 * n_shapes)))
+        size[SIZE["frames"]] = n if frames else 0
+        size[SIZE["rows_per_contact"]] = per
+        size[CAP_PAIR] = 4 * n_shapes if n_shapes > 1 else 0
+        size[CAP_CONTACT] = 4 * n_shapes if n_shapes > 1 else 0
+        state = cls(size)
+        get_stepper(p.stepper).check(spin, bool((restitution > 0.0).any()), rolling)
+        _put_parameters(state, p)
+        a: dict[str, Any] = state.a
+        _put_bodies(a, bodies, uneven)
+        a["restitution"][:], a["friction"][:], a["patch"][:] = restitution, mu, patch
+        _put_joints(a, joints)
+        if excluded:
+            a["excluded"][:] = excluded
+        return state
+
+
+def _put_parameters(state: State, p: Parameters) -> None:
+    head, setting = state.head, state.setting
+    setting[SETTING["h"]] = p.dt / p.substeps
+    setting[SETTING["gravity"] : SETTING["gravity"] + 3] = p.gravity
+    setting[SETTING["slop"]] = p.slop
+    setting[SETTING["margin"]] = p.margin
+    setting[SETTING["skin"]] = 5.0 * p.margin
+    setting[SETTING["beta"]] = BETA
+    setting[SETTING["max_push"]] = MAX_PUSH
+    setting[SETTING["bounce"]] = p.restitution_threshold
+    setting[SETTING["match"]] = 5.0 * p.margin
+    setting[SETTING["rolling"]] = p.rolling_radius
+    head[HEAD["iterations"]] = p.solver_iterations
+    head[HEAD["warm_start"]] = p.warm_start
+    head[HEAD["position_iterations"]] = p.position_iterations
+    head[HEAD["order"]] = ORDER_NUMBER[p.order]
+    head[HEAD["seed"]] = p.seed
+    head[HEAD["friction_shape"]] = p.friction_shape == "box"
+    head[HEAD["lost"]] = -1
+    stepper = get_stepper(p.stepper)
+    head[HEAD["stepper"]] = stepper.number
+    for name, value in p.stepper_options.items():
+        option = stepper.options[name]
+        if option.is_whole:
+            head[HEAD[option.place]] = value
+        else:
+            setting[SETTING[option.place]] = value
+    setting[SETTING["out"] : SETTING["out"] + 2] = p.solver_iterations, p.warm_start
+
+
+def _put_bodies(a: dict[str, Any], bodies: Sequence[Body], uneven: Sequence[bool]) -> None:
+    dynamic = 0
+    for i, b in enumerate(bodies):
+        a["x"][i], a["q"][i] = b.position, b.quaternion
+        a["v"][i, :3], a["v"][i, 3:] = b.velocity, b.angular_velocity
+        a["dyn"][i] = -1
+        if not b.is_static:
+            inverse = arithmetic.inverse(b.inertia)
+            a["dyn"][i] = dynamic
+            a["body_of"][dynamic] = i
+            a["inv_mass_body"][i] = a["inv_mass"][dynamic] = 1.0 / b.mass
+            a["inertia"][i] = b.inertia
+            a["inv_inertia_body"][i] = a["inv_inertia"][dynamic] = inverse
+            a["uneven"][i] = uneven[i]
+            dynamic += 1
+        a["kind_of_shape"][i], a["shape"][i] = _shape(b.shape)
+
+
+def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
+    row = 0
+    for i, j in enumerate(joints):
+        values = a["joint"][i]
+        for name, x in (
+            ("anchor_a", j.anchor_a),
+            ("anchor_b", j.anchor_b),
+            ("axis_a", j.axis_a),
+            ("axis_b", j.axis_b),
+        ):
+            values[JOINT[name] : JOINT[name] + 3] = x
+        side = np.cross(j.axis_a, np.eye(3)[np.argmin(np.abs(j.axis_a))])
+        values[JOINT["side_a"] : JOINT["side_a"] + 3] = side / arithmetic.norm(side)
+        values[JOINT["length"]], values[JOINT["hertz"]], values[JOINT["damping"]] = (
+            j.length,
+            j.hertz,
+            j.damping,
+        )
+        values[JOINT["speed"]], values[JOINT["torque"]] = j.motor_speed or 0.0, j.motor_torque
+        a["joint_kind"][i], a["joint_motor"][i] = JOINT_KINDS[j.kind], j.motor_speed is not None
+        a["joint_bodies"][i] = j.a, j.b
+        a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
+        row += j.n_rows
+        a["ptr"][i + 1] = row
+
+
+def _is_even(inertia: np.ndarray) -> bool:
+    # the same about every axis, to the bit: then R I R^T is I whatever R
+    return bool(np.array_equal(inertia, np.eye(3) * inertia[0, 0]))
+
+
+def _shape(shape: Any) -> tuple[int, list[float]]:
+    if isinstance(shape, Plane):
+        return PLANE, [*shape.normal, shape.offset]
+    if isinstance(shape, Sphere):
+        return SPHERE, [shape.radius, shape.radius, shape.radius, 0.0]
+    if isinstance(shape, Box):
+        return BOX, [*(0.5 * np.array(shape.size)), 0.0]
+    return NO_SHAPE, [0.0, 0.0, 0.0, 0.0]

@@ -1,0 +1,18 @@
+"""Scenes: bodies, shapes and joints, by hand or from the gallery."""
+
+from lavender.sim.scene.gallery import SCENES
+from lavender.sim.scene.parts import Body, Box, Joint, Plane, Sphere
+from lavender.sim.scene.scene import ON_FAILURE, Parameters, Scene, named_scene
+
+__all__ = [
+    "ON_FAILURE",
+    "SCENES",
+    "Body",
+    "Box",
+    "Joint",
+    "Parameters",
+    "Plane",
+    "Scene",
+    "Sphere",
+    "named_scene",
+]

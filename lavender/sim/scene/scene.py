@@ -1,0 +1,564 @@
+"""A scene: bodies, shapes, joints, and how they are to be stepped."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, flag, number, shape_of, whole_number
+from lavender.base.errors import InputError, UnknownName
+from lavender.problem.cones import check_shape
+from lavender.problem.ordering import ENGINE_ORDERS
+from lavender.sim.scene import arithmetic
+from lavender.sim.scene.parts import (
+    BALL,
+    DISTANCE,
+    HINGE,
+    Body,
+    Box,
+    Joint,
+    Plane,
+    Sphere,
+    inertia_of,
+    normalised,
+    numbers,
+    unit,
+)
+from lavender.sim.scene.steppers import StepperSpec, get_stepper
+from lavender.solvers.registry import SolverSpec, get
+
+__all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
+
+SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
+ON_FAILURE = ("use", "keep", "damp", "raise")
+RANGES: dict[str, dict[str, float]] = {  # of plain numbers
+    "dt": {"above": 0.0},
+    "friction": {"low": 0.0, "high": 1e100},  # the product of two coefficients of friction is finite
+    "restitution": {"low": 0.0, "high": 1.0},
+    **{
+        key: {"low": 0.0}
+        for key in ("patch_radius", "rolling_radius", "slop", "restitution_threshold", "margin")
+    },
+}
+MOST_SUBSTEPS = 10_000  # of a step where their number is not given; more are asked for by name
+MAX_SUBSTEP = 1.0 / 240.0  # s, within which four warm sweeps hold a stack
+MAX_BODIES = 2**24 - 1  # a contact's key has 24 bits for each body
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters that every scene has."""
+
+    dt: float = 1.0 / 120.0  # s, of one step
+    # None: as few as keep each at most max_substep long
+    substeps: int = None  # type: ignore[assignment]
+    # s; None: 1/240 for sequential impulses, dt for other solvers
+    max_substep: float = None  # type: ignore[assignment]
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)  # m/s^2
+    solver: str = "sequential_impulses"
+    solver_options: Mapping[str, Any] = field(default_factory=dict)
+    solver_iterations: int | None = None  # None: 16 sweeps, or the solver's own default
+    warm_start: bool = True
+    stepper: str = "impulses"  # of lavender.sim.scene.steppers
+    stepper_options: Mapping[str, Any] = field(default_factory=dict)  # its own numbers; here all of them
+    # None: the stepper's for sequential impulses (alternating for "impulses"), given for other solvers
+    order: str = None  # type: ignore[assignment]
+    friction: float = 0.5  # -, of bodies that say nothing else
+    restitution: float = 0.0  # -, of bodies that say nothing else
+    patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
+    rolling_radius: float = (
+        0.0  # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
+    )
+    # "box": each tangent is bounded by itself, as in most engines; it then has no spin friction
+    friction_shape: str = "disk"
+    # None: 2 for "impulses", 0 for the others, which have no position projection
+    position_iterations: int = None  # type: ignore[assignment]
+    seed: int = 0
+    on_failure: str = "use"
+    slop: float = 1e-3  # m, depth left alone
+    margin: float = 1e-2  # m, gap below which contacts are made
+    restitution_threshold: float = 0.5  # m/s, slower closing speeds do not bounce
+
+    def __post_init__(self) -> None:
+        put = object.__setattr__
+        for name, allowed in RANGES.items():
+            put(self, name, number(name, getattr(self, name), **allowed))
+        gravity: Any = self.gravity
+        if shape_of("gravity", gravity) == ():
+            gravity = (0.0, 0.0, -number("gravity", gravity))
+        put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
+        for name in ("solver_options", "stepper_options"):
+            options = getattr(self, name)
+            if not isinstance(options, Mapping):
+                raise InputError(f"{name} is {options!r}; a mapping is needed")
+        put(self, "solver_options", dict(self.solver_options))
+        own, stepper = self.solver == "sequential_impulses", get_stepper(self.stepper)
+        put(self, "solver_iterations", self._sweeps(get(self.solver), stepper))
+        put(self, "stepper_options", stepper.values(self.stepper_options))
+        longest: Any = self.max_substep
+        if longest is None:
+            longest = MAX_SUBSTEP if own else self.dt
+        put(self, "max_substep", number("max_substep", longest, above=0.0))
+        put(self, "substeps", self._count_of_substeps())
+        put(self, "warm_start", flag("warm_start", self.warm_start))
+        order: Any = self.order
+        if order is None:
+            put(self, "order", stepper.order if own else "given")
+        if self.order not in SCENE_ORDERS:
+            raise UnknownName("order", self.order, SCENE_ORDERS)
+        if self.order != "given" and not own:
+            raise InputError(
+                f"order={self.order!r} is for sequential_impulses; give {self.solver} its own in solver_options"
+            )
+        if check_shape("friction_shape", self.friction_shape) == "box" and not stepper.boxes:
+            raise InputError(
+                f"stepper {stepper.name!r} bounds friction by a disk: leave friction_shape out, or take 'impulses'"
+            )
+        projections: Any = self.position_iterations
+        if projections is None:
+            projections = stepper.position_iterations
+        put(self, "position_iterations", whole_number("position_iterations", projections, 0, 1000))
+        if self.position_iterations and not stepper.position_iterations:
+            raise InputError(
+                f"position_iterations is {projections}; stepper {stepper.name!r} has no position projection"
+            )
+        put(self, "seed", whole_number("seed", self.seed))
+        if self.on_failure not in ON_FAILURE:
+            raise UnknownName("on_failure", self.on_failure, ON_FAILURE)
+
+    def _sweeps(self, spec: SolverSpec, stepper: StepperSpec) -> int:
+        given = self.solver_iterations
+        if self.solver != "sequential_impulses":
+            if not stepper.solvers:
+                raise InputError(
+                    f"stepper {stepper.name!r} takes no solver {self.solver!r}; leave solver= out, or take 'impulses'"
+                )
+            return whole_number("solver_iterations", spec.max_iter if given is None else given, 1)
+        if self.solver_options:
+            raise InputError(
+                f"solver_options {sorted(self.solver_options)} are for other solvers; sequential_impulses "
+                "takes order= and seed= of the scene"
+            )
+        return 16 if given is None else whole_number("solver_iterations", given, *stepper.sweeps)
+
+    def _count_of_substeps(self) -> int:
+        given: Any = self.substeps
+        if given is None:
+            ratio = self.dt / self.max_substep - 1e-9  # whole steps whatever their rounding
+            if ratio > MOST_SUBSTEPS:
+                raise InputError(
+                    f"dt is {self.dt:g} s, more than {MOST_SUBSTEPS} substeps of max_substep = {self.max_substep:g} s; "
+                    "give a shorter dt, a longer max_substep, or substeps= if that many are meant"
+                )
+            given = max(1, math.ceil(ratio))
+        return whole_number("substeps", given, 1)
+
+
+COMMON = tuple(f.name for f in fields(Parameters))
+
+Builder = Callable[..., None]
+SCENES: dict[str, Builder] = {}  # named scenes; the builders of the gallery stand here once it is imported
+DEFAULTS: dict[str, dict[str, Any]] = {}  # of a named scene, where they are not those of Parameters
+
+
+def named_scene(**defaults: Any) -> Callable[[Builder], Builder]:
+    """Register the decorated builder as a scene of its name.
+
+    Parameters
+    ----------
+    **defaults
+        Its values of the parameters that every scene has (see `Parameters`), where they are others.
+
+    Returns
+    -------
+    callable
+        Decorator of a function (scene, ...) that adds bodies and joints to the scene. Its further parameters are the
+        scene's own and need defaults.
+
+    Raises
+    ------
+    InputError
+        The name is taken, a parameter is one that every scene has or lacks a default.
+    UnknownName
+        A default of no parameter.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> @lv.scene.named_scene(friction=0.2)
+    ... def slab(scene, size=2.0):
+    ...     scene.add_plane()
+    ...     scene.add_box((size, size, 0.1), position=(0, 0, 0.05))
+    >>> lv.Scene("slab", size=3.0).n_bodies
+    2
+    """
+    for key in defaults:
+        if key not in COMMON:
+            raise UnknownName("scene parameter", key, COMMON)
+
+    def enter(build: Builder) -> Builder:
+        name = build.__name__
+        first, *own = inspect.signature(build).parameters.values()
+        if name in SCENES:
+            raise InputError(f"a scene {name!r} is registered already; give the builder another name")
+        for p in own:
+            if p.name in COMMON or p.default is p.empty or p.kind is p.VAR_KEYWORD:
+                raise InputError(
+                    f"parameter {p.name!r} of the scene {name!r}: a name that no other scene parameter has, with a "
+                    f"default, is needed after {first.name!r}"
+                )
+        SCENES[name], DEFAULTS[name] = build, defaults
+        return build
+
+    return enter
+
+
+class Scene:
+    """Bodies, joints and parameters of a simulation: a named scene of the gallery, or an empty one to fill.
+
+    Parameters
+    ----------
+    name : str, optional
+        A scene of the gallery, or one registered by `named_scene`. None: an empty scene.
+    **parameters
+        The fields of `Parameters`, and the named scene's own (sizes, numbers, angles; see its docstring).
+
+    Raises
+    ------
+    UnknownName
+        No such scene or parameter; the message suggests the nearest name.
+    InputError
+        A value that is not valid.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> scene = lv.Scene(dt=0.01)
+    >>> ground = scene.add_plane()
+    >>> box = scene.add_box((1, 1, 1), mass=2.0, position=(0, 0, 0.5))
+    >>> scene.n_bodies
+    2
+    """
+
+    def __init__(self, name: str | None = None, **parameters: Any) -> None:
+        if name is not None and name not in SCENES:
+            raise UnknownName("scene", name, SCENES)
+        own = list(inspect.signature(SCENES[name]).parameters)[1:] if name is not None else []
+        for key in parameters:
+            if key not in COMMON and key not in own:
+                what = f"parameter of scene {name!r}" if name else "scene parameter"
+                raise UnknownName(what, key, [*COMMON, *own])
+        self.name = name or ""
+        common = {k: v for k, v in parameters.items() if k in COMMON}
+        if name is not None:
+            common = {**DEFAULTS[name], **common}
+        self.parameters = Parameters(**common)
+        self._given = common
+        self.own = {k: v for k, v in parameters.items() if k in own}
+        self.bodies: list[Body] = []
+        self.joints: list[Joint] = []
+        if name is not None:
+            SCENES[name](self, **self.own)
+        self._built = self.n_bodies, self.n_joints  # by the gallery; what follows was added by hand
+
+    @property
+    def n_bodies(self) -> int:
+        """Bodies, static ones included."""
+        return len(self.bodies)
+
+    @property
+    def n_joints(self) -> int:
+        """Joints."""
+        return len(self.joints)
+
+    def with_parameters(self, **changes: Any) -> Scene:
+        """The same scene with other parameters; one of the gallery is built anew, and what was added to it added again.
+
+        What was left to its default follows the others: `substeps` the new `dt`, `order` the new `solver`.
+
+        Raises
+        ------
+        UnknownName
+            No such parameter; of a scene built by hand only those of `Parameters` can change.
+        InputError
+            The gallery's own part would have another number of bodies, and joints were added by their numbers.
+        """
+        scene = Scene(self.name or None, **{**self._given, **self.own, **changes})
+        bodies, joints = self._built
+        if scene._built != self._built and self.n_joints > joints:
+            raise InputError(
+                f"scene {self.name!r} would have {scene.n_bodies} bodies for {bodies}, and the joints added to it name "
+                "bodies by number; build it with these parameters, then add"
+            )
+        scene.bodies += self.bodies[bodies:]
+        scene.joints += self.joints[joints:]
+        return scene
+
+    def __copy__(self) -> Scene:
+        """One with lists of its own."""
+        twin = object.__new__(Scene)
+        vars(twin).update(vars(self), bodies=list(self.bodies), joints=list(self.joints))
+        return twin
+
+    # -- bodies ---------------------------------------------------------------------------------
+
+    def add_body(
+        self,
+        mass: float = 1.0,
+        inertia: Any = None,
+        *,
+        position: Any = (0.0, 0.0, 0.0),
+        quaternion: Any = (1.0, 0.0, 0.0, 0.0),
+        velocity: Any = (0.0, 0.0, 0.0),
+        angular_velocity: Any = (0.0, 0.0, 0.0),
+        static: bool = False,
+        name: str | None = None,
+        friction: float | None = None,
+        restitution: float | None = None,
+        patch_radius: float | None = None,
+        shape: Plane | Sphere | Box | None = None,
+    ) -> int:
+        """Add a body; returns its number.
+
+        Parameters
+        ----------
+        mass : float, kg
+            Positive; not read for a static body.
+        inertia : (3,) or (3, 3) kg m^2, optional
+            Principal moments or the tensor in the body's axes, positive definite. Default: that of the
+            solid shape; of a ball of radius 0.1 m where there is none.
+        position : (3,) m
+        quaternion : (4,) w x y z
+            Body to world; normalised here.
+        velocity, angular_velocity : (3,) m/s, rad/s
+        static : bool
+            Never moves. 0 is no mass: a body that should stand still says so here.
+        friction, restitution, patch_radius : float, optional
+            Default: the scene's.
+        shape : Plane, Sphere or Box, optional
+            None: a body that touches nothing.
+
+        Raises
+        ------
+        InputError
+            Nothing is added.
+        """
+        number_ = len(self.bodies)
+        label = name or f"{type(shape).__name__.lower() if shape is not None else 'body'} {number_}"
+        if number_ >= MAX_BODIES:
+            raise InputError(f"a scene has at most {MAX_BODIES} bodies")
+        if not isinstance(label, str):
+            raise InputError(f"name is {name!r}; a string is needed")
+        if shape is not None and not isinstance(shape, (Plane, Sphere, Box)):
+            raise InputError(f"shape of {label} is {shape!r}; a Plane, Sphere or Box is needed")
+        static = flag(f"static of {label}", static) or isinstance(shape, Plane)
+        mass = 0.0 if static else number(f"mass of {label} [kg]", mass)
+        if mass < 0.0 or (mass == 0.0 and not static):
+            raise InputError(f"mass of {label} is {mass:g} kg; a positive mass is needed, or static=True")
+        q = numbers(f"quaternion of {label}", quaternion, 4)
+        unit_q = normalised(q, 1e-12)
+        if unit_q is None:
+            raise InputError(f"quaternion of {label} is {q.tolist()}; one that is not zero is needed")
+        v = numbers(f"velocity of {label} [m/s]", velocity, 3)
+        omega = numbers(f"angular_velocity of {label} [rad/s]", angular_velocity, 3)
+        if static and (v.any() or omega.any()):
+            raise InputError(f"{label} is static; it has no velocity")
+        body = Body(
+            name=label,
+            shape=shape,
+            mass=mass,
+            inertia=np.zeros((3, 3)) if static else inertia_of(label, inertia, shape, mass),
+            position=numbers(f"position of {label} [m]", position, 3),
+            quaternion=unit_q,
+            velocity=v,
+            angular_velocity=omega,
+            friction=_given(f"friction of {label}", friction, **RANGES["friction"]),
+            restitution=_given(f"restitution of {label}", restitution, **RANGES["restitution"]),
+            patch_radius=_given(f"patch_radius of {label} [m]", patch_radius, low=0.0),
+        )
+        self.bodies.append(body)
+        return number_
+
+    def add_box(self, size: Any = (1.0, 1.0, 1.0), mass: float = 1.0, **more: Any) -> int:
+        """Add a box of whole edges `size` (3,) [m]; `more` as in `add_body`. Returns its number."""
+        return self.add_body(mass, shape=Box(size), **more)
+
+    def add_sphere(self, radius: float = 0.5, mass: float = 1.0, **more: Any) -> int:
+        """Add a sphere of `radius` [m]; `more` as in `add_body`. Returns its number."""
+        return self.add_body(mass, shape=Sphere(radius), **more)
+
+    def add_plane(self, normal: Any = (0.0, 0.0, 1.0), offset: float = 0.0, **more: Any) -> int:
+        """Add a static half-space normal.x <= offset [m]; `more`: name, friction, restitution, patch_radius."""
+        plane = Plane(normal, offset)
+        for key in ("position", "quaternion", "velocity", "angular_velocity", "inertia", "mass"):
+            if key in more:
+                raise InputError(f"a plane is static and has no {key}; give normal and offset")
+        place = plane.offset * np.array(plane.normal)
+        return self.add_body(0.0, static=True, shape=plane, position=place, **more)
+
+    # -- joints ---------------------------------------------------------------------------------
+
+    def add_joint(
+        self,
+        kind: str,
+        a: int,
+        b: int,
+        *,
+        anchor: Any = None,
+        anchor_a: Any = None,
+        anchor_b: Any = None,
+        axis: Any = None,
+        length: float | None = None,
+        hertz: float = 0.0,
+        damping: float = 1.0,
+        motor_speed: float | None = None,
+        motor_torque: float | None = None,
+        collide: bool = False,
+        name: str | None = None,
+    ) -> int:
+        """Add a joint between bodies a and b as they stand; returns its number.
+
+        Parameters
+        ----------
+        kind : {"distance", "ball", "hinge"}
+        a, b : int
+            Body numbers; -1 is the world.
+        anchor : (3,) m, world
+            Common point of a ball or hinge.
+        anchor_a, anchor_b : (3,) m, world
+            Ends of a distance joint; default: the bodies' centres.
+        axis : (3,), world
+            Of a hinge.
+        length : float, m
+            Of a distance joint; default: as the anchors stand.
+        hertz, damping : float, 1/s and -
+            A soft joint of that frequency and damping ratio; 0 Hz is rigid.
+        motor_speed, motor_torque : float, rad/s and N m
+            A hinge's motor: speed of b against a round the axis, and the largest torque.
+        collide : bool
+            Whether the two bodies may touch; by default they do not.
+
+        Raises
+        ------
+        InputError
+            A missing body, no dynamic body, an anchor or axis too few or too many. Nothing is added.
+        """
+        if kind not in (DISTANCE, BALL, HINGE):
+            raise UnknownName("joint", kind, (DISTANCE, BALL, HINGE))
+        label = name or f"{kind} {len(self.joints)}"
+        a, b = self._joined(label, a, b)
+        ends = (anchor, anchor_a, anchor_b, length)
+        pa, pb, length = (
+            self._distance_ends(label, (a, b), *ends, axis)
+            if kind == DISTANCE
+            else _common_point(label, *ends)
+        )
+        if (axis is None) == (kind == HINGE):
+            raise InputError(f"{label}: axis= goes with a hinge, and a hinge needs one")
+        world_axis = unit(f"axis of {label}", axis) if kind == HINGE else np.array([0.0, 0.0, 1.0])
+        if (motor_speed is not None or motor_torque is not None) and kind != HINGE:
+            raise InputError(f"{label}: only a hinge has a motor")
+        if (motor_speed is None) != (motor_torque is None):
+            raise InputError(f"{label}: a motor needs both motor_speed and motor_torque")
+        joint = Joint(
+            kind=kind,
+            name=label,
+            a=a,
+            b=b,
+            anchor_a=self._local(label, a, pa),
+            anchor_b=self._local(label, b, pb),
+            axis_a=world_axis if a < 0 else self.bodies[a].direction_to_local(world_axis),
+            axis_b=world_axis if b < 0 else self.bodies[b].direction_to_local(world_axis),
+            length=length,
+            hertz=number(f"hertz of {label}", hertz, low=0.0),
+            damping=number(f"damping of {label}", damping, low=0.0),
+            motor_speed=_given(f"motor_speed of {label} [rad/s]", motor_speed),
+            motor_torque=_given(f"motor_torque of {label} [N m]", motor_torque, low=0.0) or 0.0,
+            collide=flag(f"collide of {label}", collide),
+        )
+        self.joints.append(joint)
+        return len(self.joints) - 1
+
+    def _joined(self, label: str, a: Any, b: Any) -> tuple[int, int]:
+        """The numbers of two bodies that a joint may have."""
+        for body in (a, b):
+            whole = isinstance(body, (int, np.integer)) and not isinstance(body, bool)
+            if not whole or not -1 <= body < self.n_bodies:
+                raise InputError(
+                    f"{label} names body {body!r}; there are bodies 0 to {self.n_bodies - 1}, and -1 is the world"
+                )
+        if a == b or all(i < 0 or self.bodies[i].is_static for i in (a, b)):
+            raise InputError(
+                f"{label} joins {a} and {b}; two bodies are needed, at least one of them dynamic"
+            )
+        return int(a), int(b)
+
+    def _distance_ends(
+        self, label: str, bodies: tuple[int, int], anchor: Any, a: Any, b: Any, length: Any, axis: Any
+    ) -> tuple[FloatArray, FloatArray, float]:
+        if anchor is not None or axis is not None:
+            raise InputError(f"{label} takes anchor_a and anchor_b, no anchor or axis")
+        pa, pb = (self._anchor(label, *given) for given in zip("ab", bodies, (a, b), strict=True))
+        with np.errstate(over="ignore"):
+            far = arithmetic.norm(pb - pa)
+        length = number(f"length of {label} [m]", far if length is None else length, low=0.0)
+        if length == 0.0:
+            raise InputError(f"{label} has length 0; use a ball joint")
+        return pa, pb, length
+
+    def _anchor(self, label: str, side: str, body: int, point: Any) -> FloatArray:
+        if point is not None:
+            return numbers(f"anchor_{side} of {label} [m]", point, 3)
+        if body < 0:
+            raise InputError(f"{label}: the world has no centre; give the anchor at its side")
+        return self.bodies[body].position
+
+    def _local(self, label: str, body: int, point: FloatArray) -> FloatArray:
+        if body < 0:
+            return point
+        with np.errstate(over="ignore", invalid="ignore"):
+            return numbers(f"anchor of {label}, seen from its body [m]", self.bodies[body].to_local(point), 3)
+
+    # -- identity -------------------------------------------------------------------------------
+
+    def fingerprint(self) -> str:
+        """Hash of what cannot change while the scene runs: bodies, joints and parameters, without the start state
+        and without the sweep budget and warm-start mode.
+        """
+        free: tuple[str, ...] = ("solver_iterations", "warm_start")
+        if self.parameters.stepper == "impulses":
+            free += ("stepper", "stepper_options")  # as it was before there were others: old snapshots fit
+        head = {f.name: getattr(self.parameters, f.name) for f in fields(Parameters) if f.name not in free}
+        parts: list[Any] = [head]
+        for b in self.bodies:
+            shape = None if b.shape is None else [type(b.shape).__name__, repr(b.shape)]
+            parts.append(
+                [b.name, shape, b.mass, b.inertia.tolist(), b.friction, b.restitution, b.patch_radius]
+            )
+        for j in self.joints:
+            parts.append([getattr(j, f.name) for f in fields(Joint)])
+        text = json.dumps(parts, default=lambda x: x.tolist() if isinstance(x, np.ndarray) else repr(x))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        return f"<Scene {self.name or 'by hand'!r}: {self.n_bodies} bodies, {self.n_joints} joints>"
+
+
+def _given(what: str, value: Any, **allowed: float) -> float | None:
+    return None if value is None else number(what, value, **allowed)
+
+
+def _common_point(
+    label: str, anchor: Any, a: Any, b: Any, length: Any
+) -> tuple[FloatArray, FloatArray, float]:
+    if anchor is None or a is not None or b is not None or length is not None:
+        raise InputError(f"{label} takes anchor=, one world point, and no length")
+    point = numbers(f"anchor of {label} [m]", anchor, 3)
+    return point, point, 0.0

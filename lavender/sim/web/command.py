@@ -1,0 +1,101 @@
+"""The command `lavender web`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["view", "web"]
+
+PORT = click.option(
+    "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
+)
+NO_BROWSER = click.option("--no-browser", is_flag=True, help="Only say where the page is.")
+
+
+@click.group(invoke_without_command=True)
+@PORT
+@NO_BROWSER
+@click.pass_context
+def web(context: click.Context, port: int, no_browser: bool) -> None:
+    """Open a page that runs the kernels (WebAssembly) in a browser, or build the module or the page."""
+    if context.invoked_subcommand is None:
+        _show(port, no_browser)
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _show(port: int, no_browser: bool) -> None:
+    import webbrowser
+    from tempfile import TemporaryDirectory
+
+    from lavender.sim.web import pages
+
+    with TemporaryDirectory(prefix="lavender-web-") as folder:
+        pages.write_page(Path(folder), _say)
+        with pages.server(Path(folder), port) as server:
+            address = f"http://127.0.0.1:{server.server_address[1]}/"
+            click.echo(f"{address}   Ctrl-C ends")
+            if not no_browser:
+                webbrowser.open(address)
+            try:
+                server.serve_forever()
+            except KeyboardInterrupt:
+                click.echo()
+
+
+@web.command()
+@click.argument("out", type=click.Path(dir_okay=False, path_type=Path), metavar="OUT.wasm")
+@click.option(
+    "--part",
+    type=click.Choice(["lavender", "newton"]),
+    default="lavender",
+    show_default=True,
+    help="lavender: the module that works alone; newton: the one for exact solves, loaded beside it.",
+)
+def build(out: Path, part: str) -> None:
+    """Compile the kernels to one WebAssembly module; needs the extra `wasm`, or a compiler named in
+    LAVENDER_WASM_CC and LAVENDER_WASM_LD.
+    """
+    from lavender.sim.web import pages
+
+    built = pages.build_module(out, part)
+    click.echo(f"{out}: {built.size} bytes, {len(built.functions)} functions ({built.compiler})")
+
+
+@web.command()
+@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+def page(folder: Path) -> None:
+    """Write the page into FOLDER, for any file server; nothing in it needs Python or a network."""
+    from lavender.sim.web import pages
+
+    click.echo(str(pages.write_page(folder, _say)))
+
+
+@web.command()
+def check() -> None:
+    """Hold both WebAssembly modules to the bits of the native kernels under Node; builds what is missing.
+
+    Needs a checkout of the project, whose tests/sim/web it runs, and Node 18 or newer. Exit code 1: a bit differs.
+    """
+    from lavender.sim.web import pages
+
+    if not pages.check(_say):
+        raise click.exceptions.Exit(1)
+
+
+@click.command()
+@click.argument("film", type=click.Path(path_type=Path), metavar="FILM")
+@PORT
+@NO_BROWSER
+def view(film: Path, port: int, no_browser: bool) -> None:
+    """Show a film that `lavender run NAME --film FILM` has written, in a page on this machine."""
+    from lavender.sim.engine import Film
+    from lavender.sim.web.view import Viewer
+
+    with Viewer(Film.load(film), port=port, browser=not no_browser) as viewer:
+        click.echo(f"{viewer.address}   Ctrl-C ends")
+        viewer.wait()

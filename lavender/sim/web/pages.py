@@ -1,0 +1,152 @@
+"""The page: its folder, its modules, and a server on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from http import HTTPStatus
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import lavender_ext
+from lavender.base.errors import InputError, LavenderError
+from lavender.io.stored import writable, write_bytes, write_text
+from lavender.sim.web import compile as wasm
+from lavender.sim.web.scenes import page_scenes
+
+__all__ = ["build_module", "check", "module", "server", "write_page"]
+
+HERE = Path(__file__).resolve().parent
+ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
+SHIPPED = HERE  # the folder of the modules that come with the package
+
+
+def build_module(out: Path, name: str = "lavender") -> wasm.Built:
+    """Compile the kernels to a WebAssembly module: "lavender", which stands alone, or "newton" beside it."""
+    writable(out)
+    part = wasm.PARTS[name]
+    try:
+        return wasm.build(out, ROOT, part.modules, beside=part.beside)
+    except wasm.BuildFailed as error:
+        raise LavenderError(str(error)) from None
+
+
+def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender") -> bytes:
+    """A module of the kernels as they are: the one that lies in the package, or a new one, kept there.
+
+    `say` is told when something takes time.
+    """
+    shipped = SHIPPED / f"{name}.wasm"
+    if wasm.is_current(shipped, ROOT, wasm.PARTS[name]):
+        return shipped.read_bytes()
+    reason = wasm.why_not()
+    if reason:
+        state = "is of other kernels" if shipped.exists() else "is not in this installation"
+        raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
+    say(f"building the WebAssembly module {name} (some 10 s, kept for the next time)")
+    try:
+        build_module(shipped, name)
+        return shipped.read_bytes()
+    except LavenderError as error:
+        if not str(error).startswith("cannot write"):
+            raise
+    with TemporaryDirectory() as folder:  # the package is read-only
+        out = Path(folder, shipped.name)
+        build_module(out, name)
+        return out.read_bytes()
+
+
+def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
+    """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
+    writable(folder, folder=True)
+    modules = {name: module(say, name) for name in wasm.PARTS}
+    try:
+        shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
+        for name, data in modules.items():
+            write_bytes(folder / f"{name}.wasm", data)
+        text = json.dumps(page_scenes(), allow_nan=False, separators=(",", ":"))
+        write_text(folder / "scenes.json", text)
+    except (OSError, shutil.Error) as error:
+        raise InputError(f"cannot write the page into {folder}: {error}") from None
+    return folder / "index.html"
+
+
+def check(say: Callable[[str], Any] = lambda text: None) -> bool:
+    """Whether the modules repeat under Node what the native kernels do, bit by bit; what it finds is printed.
+
+    Raises
+    ------
+    LavenderError
+        No checkout, no Node, or a module that is missing and cannot be built.
+    """
+    script = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
+    if not script.is_file():
+        raise LavenderError(
+            f"{script.name} is in tests/sim/web of a checkout of the project, and not in this installation: clone the "
+            "project and install it from there with pip install -e '.[wasm]'"
+        )
+    node = shutil.which("node")
+    if node is None:
+        raise LavenderError(
+            "node is not there, which runs the check: install Node 18 or newer (nodejs.org, or apt)"
+        )
+    modules = {name: module(say, name) for name in wasm.PARTS}
+    with TemporaryDirectory(prefix="lavender-web-") as folder:
+        for name, data in modules.items():
+            Path(folder, f"{name}.wasm").write_bytes(data)
+        command = [node, str(script), str(Path(folder, "lavender.wasm"))]
+        env = {**os.environ, "PYTHON": sys.executable}
+        return subprocess.run(command, env=env, check=False).returncode == 0
+
+
+def _copy(source: str, target: str) -> None:
+    write_bytes(target, Path(source).read_bytes())
+
+
+class Handler(SimpleHTTPRequestHandler):
+    # Types are said here, since a machine's own table may lack or miscall them.
+    extensions_map = {  # noqa: RUF012 - as the base class has it
+        "": "application/octet-stream",
+        ".css": "text/css",
+        ".html": "text/html; charset=utf-8",
+        ".js": "text/javascript; charset=utf-8",
+        ".json": "application/json",
+        ".txt": "text/plain; charset=utf-8",
+        ".wasm": "application/wasm",
+    }
+
+    def end_headers(self) -> None:
+        self.send_header("Cache-Control", "no-cache")
+        super().end_headers()
+
+    def send_head(self) -> Any:
+        """What is no path of a file, such as one with a NUL character, is not found."""
+        try:
+            return super().send_head()
+        except (OSError, ValueError):
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return None
+
+    def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the base class names it so
+        """Say nothing about single requests."""
+
+
+def server(folder: Path, port: int = 0) -> ThreadingHTTPServer:
+    """A server of `folder` on the loopback address, not yet running; port 0 takes a free one."""
+    return bound(partial(Handler, directory=str(folder)), port)
+
+
+def bound(handler: Callable[..., Any], port: int) -> ThreadingHTTPServer:
+    """A server on the loopback address that answers by `handler`."""
+    try:
+        return ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"port {port} cannot be used ({reason}); give another") from None

@@ -1,0 +1,383 @@
+"""Solvers by name. Each has a `SolverSpec`, which lists its capabilities as data; the tests check every one of them.
+
+A solver is an object that holds only its options. `SolverSpec.factory(**options)` makes it. Its methods:
+
+    prepare(problem) -> state         factor, colour, allocate
+    update(state, problem) -> state   for a problem of the same structure with new numbers; a fresh start
+    run(state, impulse, max_iter, tol, time_limit) -> Claim
+        do `max_iter` more iterations on `impulse` (m,) in place, fewer only if its own convergence test is met. If
+        `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None
+
+Third parties register through the entry point group "lavender.solvers" (an object that is a
+`SolverSpec`, or a function that returns one) or with `register`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any, Protocol
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError, SolverUnavailable, UnknownName
+from lavender.judge.solution import Claim, Status
+from lavender.problem import LAWS, OPERATORS, Problem, check_problem
+from lavender.problem.derived import cached_property
+
+__all__ = ["Solver", "SolverSpec", "State", "available", "get", "known", "register"]
+
+
+# Modules whose SPECS are registered first, by name: they import this one.
+SMALL_ROWS = 64  # rows up to which Python's share decides what a solve costs: a spec's `small` is tried first
+TABLES = ("lavender.solvers", "lavender.external")
+
+
+class SmallCall(Protocol):
+    """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
+
+    @property
+    def limits(self) -> Any:
+        """What it may cost over generalised velocities."""
+
+    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...) -> Any:
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
+
+    def claim(
+        self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
+    ) -> Claim:
+        """What counts come to, from a start (m,) or from none to the residual `after`, with its turns."""
+
+
+class State(Protocol):
+    """What `prepare` returns: any object. `lavender.solve` reads these attributes of a resumable solver, if present."""
+
+    @property
+    def best(self) -> tuple[float, FloatArray | None]:
+        """(relative residual, impulse (m,)) of the best iterate that the solver has checked; (inf, None) before.
+
+        Optional, for solvers whose residual may rise: this is the result if the last iterate is worse.
+        """
+
+    @property
+    def sweeps_per_decade(self) -> float:
+        """Iterations in which the relative residual falls tenfold, by the last checks; NaN if it does not fall.
+
+        Optional, for solvers whose iterations cost the same.
+        """
+
+
+class Solver(Protocol):
+    """What a factory returns; see the module.
+
+    Under a time limit `setup_time(problem)` is asked, if there is one: what `prepare` takes [s], counted from the size
+    of the problem. If that does not fit in the time left, nothing is begun. A resumable solver with long single steps
+    (factorisations) may also have `until(state, deadline)`. It is called before `run` if there is a time limit, with
+    the `lavender.base.deadline.Deadline` after which no such step should end.
+    """
+
+    def prepare(self, problem: Problem) -> Any:
+        """Factor, colour, allocate."""
+
+    def update(self, state: Any, problem: Problem) -> Any:
+        """The same structure with new numbers, and a fresh start."""
+
+    def run(
+        self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
+    ) -> Claim:
+        """`max_iter` more iterations on `impulse` (m,) in place."""
+
+
+@dataclass(frozen=True)
+class SolverSpec:
+    """One solver: its name, where its code is, and what it can do.
+
+    Raises
+    ------
+    InputError
+        A law or operator that does not exist, an empty name.
+    """
+
+    name: str
+    factory: str | Callable[..., Solver]  # "module:attribute" is imported at first use
+    laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
+    summary: str
+    reference: str = ""  # paper or manual
+    # Forms of A (of OPERATORS) that it reads as given; with "matrix", A is formed from any other form.
+    operators: frozenset[str] = frozenset({"rows", "matrix"})
+    exact: bool = False  # ends after finitely many steps or at rounding accuracy, not at tol
+    resumable: bool = True
+    impulse: bool = True  # uses a warm start
+    order: bool = False  # takes order= and ground=
+    seed: bool = False  # takes seed=
+    threads: bool = False  # takes threads=
+    callback: bool = True  # takes callback=; needs resumable
+    history: bool = True  # records history; needs resumable
+    delegates: bool = False  # calls other solvers: only "auto"
+    round_cones: bool = False  # takes contacts of more than two tangents in one cone
+    # Of "coulomb" and "cone", the laws under which it takes boxes: contacts whose tangents are bounded each by
+    # itself. A law that is not in `laws` is taken only without disks (by our own solvers as bounded rows:
+    # solvers/polyhedral.py).
+    boxes: frozenset[str] = frozenset()
+    rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
+    external: bool = False  # another project's code solves; its claims are its own
+    max_iter: int = 1000  # default budget
+    options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
+    requires: tuple[str, ...] = ()  # modules that must be importable
+    install: str = ""  # what to install where they are not
+    bounded: str = ""  # of a solver for free rows: what to use for bounded rows
+    with_bounds: str = ""  # the solver that is this very method with bounds, for `standing_in`
+    refusal: Callable[[Problem], str | None] | None = None  # more reasons against a problem
+    small: SmallCall | None = (
+        None  # problems of few rows with default options, in one compiled call; asked of our own alone
+    )
+    own = False  # of this package; other solvers get copies, and what they return is checked (`external/foreign.py`)
+
+    def __post_init__(self) -> None:
+        if (
+            not self.name
+            or not set(self.laws) <= set(LAWS)
+            or not self.laws
+            or not set(self.operators) <= set(OPERATORS)
+            or not set(self.boxes) <= {"coulomb", "cone"}
+            or not self.operators
+        ):
+            raise InputError(
+                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operators "
+                f"{self.operators!r} a set of {OPERATORS}, boxes {sorted(self.boxes)} of coulomb and cone"
+            )
+        object.__setattr__(self, "laws", frozenset(self.laws))
+        object.__setattr__(self, "operators", frozenset(self.operators))
+        object.__setattr__(self, "boxes", frozenset(self.boxes))
+        if not self.resumable:
+            object.__setattr__(self, "callback", False)
+            object.__setattr__(self, "history", False)
+
+    @property
+    def accepts(self) -> frozenset[str]:
+        """Options beyond those of the front door."""
+        shared = {"order": ("order", "ground"), "seed": ("seed",), "threads": ("threads",)}
+        return frozenset(self.options) | {
+            o for flag, names in shared.items() if getattr(self, flag) for o in names
+        }
+
+    def missing(self) -> str | None:
+        """None when the solver can run here, else what to install."""
+        if not self.requires:
+            return None
+        absent = [m for m in self.requires if not _importable(m)]
+        if not absent:
+            return None
+        return f"needs {', '.join(absent)}: pip install {self.install or ' '.join(absent)}"
+
+    @cached_property
+    def takes_all(self) -> bool:
+        """No problem is refused."""
+        kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.rolling
+        return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
+
+    def refuses(self, problem: Problem) -> str | None:
+        """None when the solver takes this problem, else the reason."""
+        if self.takes_all:
+            return None
+        asked, problem = problem, problem.disk
+        law = problem.law
+        if law in self.laws and law not in ("linear", "lcp", *self.boxes) and problem.cones.has_box:
+            return (
+                "takes no boxes, contacts that bound each tangent by itself: use one of those that do, "
+                "lavender.available(problem) lists them, or give the problem cones.shaped('disk')"
+            )
+        if law not in self.laws and not (law in self.boxes and problem.cones.is_polyhedral):
+            takes = ", ".join(law for law in LAWS if law in self.laws)
+            way = _way_round(law, self.laws)
+            if law == "coulomb" and "cone" in self.boxes and problem.cones.is_polyhedral:
+                way = ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
+            return f"takes laws {takes}, not {law!r}{self.bounded or way}"
+        if "matrix" not in self.operators and problem.operator not in self.operators:
+            makers = {"rows": "Problem.from_rows", "generalized": "Problem.from_jacobian"}
+            needs = " or ".join(f"{o} ({makers[o]})" for o in OPERATORS if o in self.operators)
+            given = "as a matrix" if problem.operator == "matrix" else f"by its {problem.operator} form"
+            if asked.operator != problem.operator:
+                given = f"by its {asked.operator} form with ellipses, which becomes a matrix (problem.disk)"
+            return f"needs a problem with {needs}; this one was given {given}"
+        if problem.cones.has_round and not self.round_cones:
+            return (
+                "takes no round cones (more than two tangents in one): use one of those that do, "
+                "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
+            )
+        if problem.cones.has_rolling and not self.rolling:
+            return (
+                "takes no contacts that resist rolling: use one of those that do, lavender.available(problem) lists "
+                "them, or leave the rows that roll out"
+            )
+        return self.refusal(problem) if self.refusal is not None else None
+
+    def standing_in(self, problem: Problem) -> SolverSpec | None:
+        """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
+        other = specs().get(self.with_bounds)
+        bounds = other is not None and problem.law not in self.laws and other.refuses(problem) is None
+        return other if bounds else None
+
+    def load(self) -> Callable[..., Solver]:
+        """The factory, imported now if it was not before."""
+        if not isinstance(self.factory, str):
+            return self.factory
+        module, _, attribute = self.factory.partition(":")
+        return getattr(importlib.import_module(module), attribute)
+
+
+def _way_round(law: str, laws: frozenset[str]) -> str:
+    if law == "coulomb" and "cone" in laws:
+        return ": pass problem.relaxed('cone'), or use a solver for Coulomb friction"
+    if law in ("coulomb", "cone") and "lcp" in laws:
+        return ": pass problem.boxed(normal_impulse), or use a solver for friction"
+    if law == "cone" and "coulomb" in laws:
+        return ": pass problem.relaxed('coulomb')"
+    return ""
+
+
+@cache
+def _importable(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):
+        return False
+
+
+registered: dict[str, SolverSpec] = {}
+
+
+def load_table(table: str) -> None:
+    """Fill `registered` with the SPECS of a module."""
+    for spec in importlib.import_module(table).SPECS:
+        registered.pop(spec.name, None)  # those that were asked for by name go to their places, too
+        _add_own(spec)
+
+
+def _add_own(spec: SolverSpec) -> None:
+    object.__setattr__(spec, "own", True)
+    registered[spec.name] = spec
+
+
+@cache
+def load() -> None:
+    """Fill `registered` once, with the built-in solvers and those of plug-ins."""
+    from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
+
+    for table in TABLES:
+        load_table(table)
+    for entry in entry_points(group="lavender.solvers"):
+        try:
+            spec = entry.load()
+            spec = spec if isinstance(spec, SolverSpec) else spec()
+            _add(spec, replace=False)
+        except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
+            warnings.warn(
+                f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3
+            )
+
+
+def register(spec: SolverSpec, *, replace: bool = False) -> None:
+    """Add a solver; `replace=True` to put it in the place of one of the same name.
+
+    Raises
+    ------
+    InputError
+        Not a SolverSpec, or the name is taken.
+    """
+    load()
+    _add(spec, replace)
+
+
+def _add(spec: SolverSpec, replace: bool) -> None:
+    if not isinstance(spec, SolverSpec):
+        raise InputError(f"register needs a SolverSpec, not a {type(spec).__name__}")
+    if spec.name in registered and not replace:
+        raise InputError(
+            f"a solver named {spec.name!r} is registered already; pass replace=True to take its place"
+        )
+    registered[spec.name] = spec
+
+
+def specs() -> dict[str, SolverSpec]:
+    """Every registered solver by name, installed or not."""
+    load()
+    return dict(registered)
+
+
+def get(name: str) -> SolverSpec:
+    """The solver of that name, ready to run.
+
+    Raises
+    ------
+    UnknownName
+        No such solver; the nearest names are listed.
+    SolverUnavailable
+        Its package is not installed; the message says what to install.
+    """
+    spec = registered.get(name) if isinstance(name, str) else None
+    if spec is None and isinstance(name, str):
+        spec = _found(name)
+    if spec is None:
+        raise UnknownName("solver", name, specs())
+    reason = spec.missing()
+    if reason:
+        raise SolverUnavailable(f"solver {name!r} {reason}")
+    return spec
+
+
+def _found(name: str) -> SolverSpec | None:
+    """One that is not registered yet: of ours its file alone is imported, for which a time limit has room."""
+    own: SolverSpec | None = importlib.import_module(TABLES[0]).spec_of(name)
+    if own is not None:
+        _add_own(own)
+        return own
+    load()
+    return registered.get(name)
+
+
+def known(problem: Problem | None = None) -> dict[str, str | None]:
+    """Each solver's name with None if it is installed (and accepts `problem`), otherwise with the reason why not."""
+    if problem is not None:
+        check_problem(problem)
+    return {
+        name: spec.missing() or (spec.refuses(problem) if problem is not None else None)
+        for name, spec in sorted(specs().items())
+    }
+
+
+def available(problem: Problem | None = None, *, law: str | None = None, **capabilities: bool) -> list[str]:
+    """Names of the installed solvers that accept `problem`, accept the law, and have the capabilities.
+
+    >>> from lavender.solvers.registry import available
+    >>> "pgs" in available(law="lcp", order=True)
+    True
+
+    Raises
+    ------
+    InputError
+        A capability that no spec has.
+    """
+    flags = {n for n, f in SolverSpec.__dataclass_fields__.items() if f.type == "bool"}
+    for name in capabilities:
+        if name not in flags:
+            raise InputError(f"unknown capability {name!r}; known: {', '.join(sorted(flags))}")
+    if law is not None and law not in LAWS:
+        raise UnknownName("law", law, LAWS)
+    table = specs()
+    return [
+        name
+        for name, reason in known(problem).items()
+        if reason is None
+        and (law is None or law in table[name].laws)
+        and all(bool(getattr(table[name], c)) == bool(v) for c, v in capabilities.items())
+    ]
+
+
+def in_one_call(problem: Problem) -> list[str]:
+    """Names of this project's solvers that take `problem` and do not go on iteration by iteration to a budget."""
+    kind = (s for s in specs().values() if not (s.resumable or s.external))
+    return [s.name for s in kind if not s.missing() and not s.refuses(problem)]

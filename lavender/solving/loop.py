@@ -1,0 +1,186 @@
+"""Chunks, clock, history and Ctrl-C around one solver's `run`, and the best of what came of it.
+
+A chunk lasts about 10 ms. Chunks do not change the result, because every solver checks convergence at fixed numbers
+of iterations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
+from lavender.base.errors import BREAKDOWN, last_words
+from lavender.judge.residuals import Residual, judged, known, remember, remembered, residual
+from lavender.judge.solution import Claim, History, Status
+from lavender.problem import Problem
+from lavender.solvers.registry import State
+from lavender.solving.outcome import MAX_ITERATIONS, NUMERICAL_ERROR, STALLED, TIME_LIMIT
+from lavender_ext.judge.measure import all_finite
+
+__all__ = ["INTERRUPTED", "LEAST", "Callback", "Loop", "Record", "best_of"]
+
+LEAST = 1e-6  # s, what is left of a limit for a solver that is called at all
+SHARE = 0.7  # of what is left, for a chunk at the pace of the last
+FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
+Callback = Callable[[int, FloatArray, Residual], Any]
+Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
+NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
+INTERRUPTED = Status.INTERRUPTED
+
+
+@dataclass
+class Loop:
+    """Chunks, clock, history and Ctrl-C around one solver's `run`."""
+
+    problem: Problem
+    solver: Any
+    state: Any
+    impulse: FloatArray  # (m,) N s, in place
+    tol: float
+    deadline: Deadline
+    callback: Callback | None
+    records: list[Record] | None
+    time: float = 0.0  # s, of the solver alone
+    done: int = 0  # iterations
+    work: dict[str, int] = field(default_factory=dict)
+    broken: bool = False  # the solver did not return
+    next_record: int = 0  # iterations
+
+    def run_once(self, max_iter: int) -> Claim:
+        """In one call, of a solver that cannot be continued."""
+        start_point = self.impulse.copy()
+        watch = Stopwatch()
+        try:
+            try:
+                claim = self.call(max_iter, self.deadline.left(LEAST))
+            finally:
+                self.time = watch.seconds
+            if not self.broken:
+                tell = getattr(self.solver, "tell", None)  # judges, and finds words
+                return claim if tell is None else tell(self.state, self.impulse, claim)
+        except KeyboardInterrupt:
+            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
+        if not all_finite(self.impulse) or (self.broken and self._is_worse_than(start_point)):
+            self.impulse[:] = start_point
+        return claim
+
+    def _is_worse_than(self, impulse: FloatArray) -> bool:
+        last, other = (judged(self.problem, x.copy()) for x in (self.impulse, impulse))
+        return last.relative > other.relative
+
+    def call(self, max_iter: int, time_limit: float | None) -> Claim:
+        """Run at most so many iterations of the solver; an arithmetic breakdown becomes a claim."""
+        try:
+            return self.solver.run(self.state, self.impulse, max_iter, self.tol, time_limit)
+        except BREAKDOWN as error:
+            self.broken = True
+            return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
+
+    def run(self, max_iter: int) -> Claim:
+        """In chunks."""
+        # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
+        chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
+        records = self.records is not None or self.callback is not None
+        claim = NOTHING_DONE
+        if self.deadline.is_set:
+            chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
+            if hasattr(self.solver, "until"):
+                # For work that cannot be cut into chunks: a factorisation that would end too late is not begun.
+                self.solver.until(self.state, self.deadline)
+        try:
+            if records and self._record():
+                return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
+            while self.done < max_iter:
+                n = min(chunk, max_iter - self.done)
+                if records:
+                    n = min(n, self.next_record - self.done)
+                watch = Stopwatch()
+                claim = self.call(n, None)
+                elapsed = watch.seconds
+                self.time += elapsed
+                self.done += claim.iterations
+                for kind, count in claim.work.items():
+                    self.work[kind] = self.work.get(kind, 0) + count
+                stopped = records and self.done == self.next_record and self._record()
+                if claim.status is not MAX_ITERATIONS:
+                    break
+                if claim.iterations < 1:
+                    claim = Claim(STALLED, 0, {}, f"did none of the {n} iterations that it was asked for")
+                    break
+                if stopped:
+                    claim = Claim(INTERRUPTED, 0, {}, "stopped by the callback")
+                    break
+                # What is more than half over is not begun.
+                if self.deadline.passed(0.5 * elapsed / claim.iterations):
+                    claim = Claim(TIME_LIMIT, 0, {}, claim.message)
+                    break
+                if self.done < max_iter:
+                    chunk = self._next_chunk(n, elapsed)
+        except KeyboardInterrupt:
+            claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
+        self._keep_best()
+        return self._total(claim)
+
+    def _next_chunk(self, n: int, elapsed: float) -> int:
+        left = self.deadline.left()
+        aim = CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
+        return max(1, min(8 * n, int(n * aim / max(elapsed, 1e-7))))
+
+    def not_worse(self, start: FloatArray) -> None:
+        """The best of what was found, where it began, and doing nothing."""
+        problem = self.problem
+        found = remembered(problem, self.impulse) or judged(problem, self.impulse.copy())
+        if found.relative > self.tol:
+            found = best_of(problem, found, start)
+        remember(problem, found)
+        self.impulse[:] = found.impulse
+
+    def _keep_best(self) -> None:
+        # A solver whose residual may rise keeps its best checked iterate; a budget (tol = 0) means the last one.
+        if self.tol == 0.0:
+            return
+        state: State = self.state
+        best = getattr(state, "best", None)
+        if best is None or best[1] is None:
+            return
+        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse.copy())
+        if last.relative <= best[0]:
+            remember(self.problem, last)  # for the result
+        else:
+            self.impulse[:] = best[1]
+
+    def _record(self) -> bool:
+        r = residual(self.problem, self.impulse, "float64")
+        if self.records is not None:
+            self.records.append((self.done, self.time, r.relative, r.energy, r.velocity))
+        self.next_record = self.done + max(1, self.done >> 3)  # 1, 2, ... 16, then an eighth more each time
+        return bool(self.callback(self.done, self.impulse.copy(), r)) if self.callback is not None else False
+
+    def _total(self, claim: Claim) -> Claim:
+        if claim.iterations == self.done and claim.work == self.work:
+            return claim  # of a single chunk
+        return replace(claim, iterations=self.done, work=self.work)
+
+    def recorded(self) -> History | None:
+        """The history, where one was asked for."""
+        if self.records is None:
+            return None
+        if not self.records or self.records[-1][0] != self.done:
+            self._record()
+        columns = list(zip(*self.records, strict=True))
+        return History(np.array(columns[0], np.int64), *(np.array(c, float) for c in columns[1:]))
+
+
+def best_of(problem: Problem, found: Any, start: FloatArray | None) -> Any:
+    """What the judge found, or what he finds of where it began (m,), or of doing nothing, if that is better."""
+    for other in (problem._start if start is None else start, problem._start):
+        relative = known(problem, other)
+        if relative is None or relative < found.relative:
+            last = judged(problem, other.copy())
+            found = last if last.relative < found.relative else found
+    return found

@@ -1,0 +1,168 @@
+"""The outcome of a solve: compares the solver's claim with the judge's residual and makes the `Solution`."""
+
+from __future__ import annotations
+
+import math
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import InputError
+from lavender.judge.certificates import prove, rounded_down
+from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
+from lavender.judge.solution import Claim, History, Solution, SolverRun, Status
+from lavender.problem import Problem
+from lavender.problem.cones import ROW
+from lavender.solvers.registry import SolverSpec, in_one_call
+from lavender_ext.judge.measure import Judged, all_finite
+
+# Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
+CONVERGED = Status.CONVERGED
+DIVERGED = Status.DIVERGED
+FLOOR = Status.FLOOR
+INFEASIBLE = Status.INFEASIBLE
+MAX_ITERATIONS = Status.MAX_ITERATIONS
+NUMERICAL_ERROR = Status.NUMERICAL_ERROR
+STALLED = Status.STALLED
+TIME_LIMIT = Status.TIME_LIMIT
+
+
+def finish(
+    problem: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: FloatArray,
+    claim: Claim,
+    tol: float,
+    setup_time: float,
+    solve_time: float,
+    history: History | None,
+    sweeps_per_decade: float = math.nan,
+) -> Solution:
+    """The solution: the judge's residual, the status that it supports, the reason if it contradicts the claim."""
+    judged = residual(problem, impulse, "float64")  # in which solvers work, whatever the data were
+    status, message = claim.status, claim.message
+    relative = judged.relative
+    if status is not NUMERICAL_ERROR and not all_finite(impulse):
+        status = DIVERGED
+    elif (
+        status is CONVERGED
+        and tol < relative == judged.floor
+        and relative_of(problem.metric, judged.energy, judged.velocity) <= tol
+    ):
+        status = DIVERGED
+        message = _joined(message, "beside such impulses float64 loses b")
+    elif tol > 0.0 and relative <= tol and status in (MAX_ITERATIONS, TIME_LIMIT, STALLED):
+        status = CONVERGED
+    elif (
+        problem.operator not in spec.operators
+        and ((status is CONVERGED and relative > tol) or (status is FLOOR and not judged.at_floor))
+        and _holds_as_formed(problem, impulse, tol)
+    ):
+        status = STALLED
+        message = _joined(message, "its test was met only on A as it was formed, not on the given data")
+    if status in (CONVERGED, STALLED) and tol < relative and judged.at_floor:
+        status = FLOOR
+    certificate, bound, contradicted = claim.certificate, None, ""
+    if status is INFEASIBLE and relative <= tol:
+        # What meets tol is a solution to tol, whatever can be said of an exact one.
+        status = CONVERGED
+        message = _joined(message, "the impulse meets tol nevertheless")
+    elif status is INFEASIBLE and certificate is None:
+        contradicted = "says INFEASIBLE, no certificate was given"
+    elif status in (INFEASIBLE, STALLED) and certificate is not None:
+        proof = prove(problem, certificate, tol)
+        certificate, bound = proof.y, proof.impulse_bound or None
+        if status is INFEASIBLE and not proof.reason:
+            message = _joined(message, proof.words)
+        elif bound == math.inf:
+            status, message = STALLED, _joined(message, proof.reason)
+        elif status is INFEASIBLE:
+            contradicted = f"says INFEASIBLE, {proof.reason}"
+        elif bound is not None and bound > np.abs(impulse).sum():
+            message = _joined(message, f"every solution has an impulse of at least {rounded_down(bound)} N s")
+    if status is CONVERGED and not relative <= tol:
+        contradicted = f"says CONVERGED, relative residual {relative:.2e} is above tol {tol:.1e}"
+    elif status is FLOOR and not judged.at_floor:
+        least = min(2.0 * judged.floor, FLOOR_MOST)
+        contradicted = f"says FLOOR, relative residual {relative:.2e} is above {least:.2e}"
+    if status is MAX_ITERATIONS:
+        way = _way_left(problem, relative, tol, claim.iterations, sweeps_per_decade)
+        message = _joined(message, way)
+    impulse.setflags(write=False)
+    return Solution.of(
+        {
+            "impulse": impulse,
+            "residual": judged,
+            "status": status,
+            "tol": tol,
+            "iterations": claim.iterations,
+            "work": MappingProxyType(dict(claim.work)),
+            "setup_time": setup_time,
+            "solve_time": solve_time,
+            "solver": SolverRun(spec.name, options, claim.form),
+            "message": message,
+            "history": history,
+            "dual": claim.dual,
+            "certificate": certificate if status is INFEASIBLE else None,
+            "impulse_bound": bound,
+            "contradicted": contradicted,
+            "sweeps_per_decade": sweeps_per_decade,
+            "turns": claim.turns,
+        }
+    )
+
+
+def _joined(message: str, more: str) -> str:
+    """Both, where the message does not say so already: a record's was told by the solution that it was made of."""
+    return message if more in message else f"{message}; {more}".removeprefix("; ")
+
+
+def _holds_as_formed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
+    """Within tol or at the floor of A as it was formed: what the given data add is rounding in its forming."""
+    try:
+        formed = problem.csr_data
+    except InputError:  # too large to be formed: no solver has
+        return False
+    formed.set_start(*reference(problem))
+    found = Judged(formed, impulse)
+    return found.relative <= tol or at_floor(found.relative, found.floor)
+
+
+def _way_left(problem: Problem, relative: float, tol: float, done: int, per_decade: float) -> str:
+    """Message for a used-up budget if reaching tol needs more iterations than were done."""
+    left = per_decade * math.log10(relative / tol) if tol > 0.0 and 0.0 < relative < math.inf else math.nan
+    if not done < left < math.inf:
+        return ""
+    return (
+        f"the residual falls tenfold in {per_decade:.3g} iterations, so tol needs about {left:.2g} more; "
+        f"solvers of another kind may be faster: {', '.join(in_one_call(problem))}"
+    )
+
+
+def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
+    """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
+    cones, worst, empty = problem.cones, -1, problem.metric.empty
+    if not len(empty):
+        return None
+    for i in np.setdiff1d(empty, problem.vanished_rows).tolist():
+        block = problem.block_of(i)
+        if cones.kind[block] != ROW and i != cones.ptr[block]:
+            continue  # tangents and spin: bounded by mu lambda_n
+        b = problem.b[i]
+        bound = cones.upper[i] if b > 0.0 else cones.lower[i]
+        if b == 0.0:
+            continue
+        if np.isfinite(bound):
+            impulse[i] = bound
+        elif worst < 0 or abs(b) > abs(problem.b[worst]):
+            worst = i
+    if worst < 0:
+        return None
+    y, b = np.zeros(problem.m), problem.b[worst]
+    y[worst] = math.copysign(1.0, b)
+    if prove(problem, y, tol).reason:
+        return None  # b is dust
+    return f"{problem.row_name(worst)}: its row of A is zero, so nothing can meet b = {b:.3g} m/s", y

@@ -1,0 +1,95 @@
+"""The way of `auto` through its tree with a problem, and the counted costs that decide it; nothing is run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from itertools import islice
+from typing import Any
+
+from lavender.base.arrays import number
+from lavender.base.errors import CapabilityError, InputError
+from lavender.judge.residuals import reference
+from lavender.problem import Problem
+from lavender.solvers.auto import Stage, Tree, words
+from lavender.solvers.registry import get
+from lavender.solvers.small import who
+
+__all__ = ["Plan", "explain"]
+
+LINES = 6  # of the tree, that are told: then the work is doubled
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What `auto` would do with a problem: `str()` is one screen, `data()` are plain numbers and words."""
+
+    rows: int
+    law: str
+    operator: str  # rows, matrix or generalized
+    tol: float  # - relative residual
+    small: str  # who solves it in one compiled call; "" where it is not small
+    newton: float  # ns, Newton's method as counted; inf where it does not take the problem
+    sweep: float  # ns, one sweep
+    stages: tuple[Stage, ...]  # the first lines, each taken where those before it did not solve the problem
+
+    def data(self) -> Mapping[str, Any]:
+        """As JSON has it; costs in nanoseconds, None where a number has no bound."""
+        made = asdict(self) | {"stages": [asdict(stage) for stage in self.stages]}
+        return {name: _plain(value) for name, value in made.items()}
+
+    def __str__(self) -> str:
+        lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
+        if self.small:
+            lines.append(f"first one compiled call: {self.small}")
+        lines.append(f"newton is counted to take {words(self.newton)}, a sweep {words(self.sweep)}")
+        for stage in self.stages:
+            most = f"up to {stage.iterations:.3g} iterations" if stage.iterations < 1e9 else "to its end"
+            lines.append(f"  {stage.solver:<18}{most:<26}{stage.why}")
+        lines.append("then these in turn with doubled work, and a certificate that there is no solution")
+        return "\n".join(lines)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, dict):
+        return {name: _plain(entry) for name, entry in value.items()}
+    return None if value == float("inf") else value
+
+
+def explain(problem: Problem, tol: float = 1e-6) -> Plan:
+    """The way of `auto` through its tree: who runs, for how many iterations, and why. Nothing is solved.
+
+    Parameters
+    ----------
+    problem : Problem
+    tol : float, default 1e-6
+        The relative residual that a solve would ask for.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        `problem` is not a Problem or has no rows, or `tol` is not above 0.
+    CapabilityError
+        `auto` does not take the problem.
+    """
+    if not isinstance(problem, Problem):
+        raise InputError(f"problem is a {type(problem).__name__}; a lavender.Problem is needed")
+    tol = number("tol", tol, above=0.0)
+    if problem.m == 0:
+        raise InputError("the problem has no rows: there is nothing to plan")
+    reason = get("auto").refuses(problem)
+    if reason is not None:
+        raise CapabilityError(f"solver 'auto' {reason}")
+    problem = problem.disk  # where it has ellipses
+    reference(problem)
+    tree = Tree(problem)
+    return Plan(
+        rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=who(problem), newton=tree.newton,
+        sweep=tree.sweep, stages=tuple(islice(tree, LINES)),
+    )  # fmt: skip

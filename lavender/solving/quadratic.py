@@ -1,0 +1,129 @@
+"""`solve_qp`: quadratic programs through `solve`, and the proximal point method where P is singular.
+
+    x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
+
+Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
+program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import number
+from lavender.base.errors import InputError
+from lavender.judge.solution import Status
+from lavender.problem import Problem, QPSolution
+from lavender.solving.solve import seconds_of, solve
+
+__all__ = ["solve_qp"]
+
+STEPS = 50  # proximal steps
+SLOW = 0.1  # where a step leaves more than this of the error, the next has
+SOFTER = 0.1  # this share of D, as long as
+ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, the next step has more of D
+SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
+IDLE = 10  # steps in a row without a smaller error, after which no other is made
+TIGHTEST = 1e-15  # tol of a step
+TINY = 1e-300
+ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
+# Nothing better comes of the same problem; of another centre something may.
+ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
+UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
+
+
+def solve_qp(
+    problem: Problem,
+    solver: str = "auto",
+    *,
+    tol: float = 1e-9,
+    time_limit: float | None = None,
+    **options: Any,
+) -> QPSolution:
+    """Solve a quadratic program made by `Problem.from_qp`.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        As in `lavender.solve`.
+    tol : float
+        `QPSolution.error` to reach.
+    time_limit : float, optional, s
+    **options
+        Of the solver; impulse= starts from the impulses of a program before (`answer.solution.impulse`).
+
+    Returns
+    -------
+    QPSolution
+        x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
+        constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it. An unbounded program has a
+        `ray`.
+
+    Raises
+    ------
+    InputError
+        A problem that was made otherwise.
+
+    Examples
+    --------
+    A linear program, P = 0:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> problem = lv.Problem.from_qp(np.zeros((2, 2)), [-1.0, -2.0], G=[[1.0, 1.0]], h=[1.0], lb=[0.0, 0.0])
+    >>> (lv.solve_qp(problem).x.round(9) + 0.0).tolist()
+    [0.0, 1.0]
+    """
+    qp = getattr(problem, "qp", None)
+    if qp is None:
+        raise InputError(
+            "problem is not a quadratic program: make it with Problem.from_qp; what updated() or a file gives "
+            "knows the constraint problem alone"
+        )
+    tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
+    start = options.pop("impulse", None)
+    solution = solve(problem, solver, tol=tol, time_limit=time_limit, impulse=start, **options)
+    answer = best = qp.solution(solution, tol=tol)
+    centre, tightest, before, idle = None, tol, np.inf, 0
+    if answer.error <= tol and qp.proximal is None:
+        return answer
+    for _ in range(STEPS):
+        ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
+        if ray is not None:
+            return replace(answer, ray=ray)
+        if solution.status in ENDS:
+            return answer
+        left = end - perf_counter()
+        if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH[qp.proximal is not None]:
+            break
+        if qp.proximal is not None:
+            slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
+            rough = ROUNDING * _distance(answer) > answer.error
+            soft = slow and qp.proximal.max() > SOFTEST * np.abs(qp.generalized.operator.mass[2]).max()
+            qp = qp.around(centre, 1.0 / SOFTER if rough else SOFTER if soft else 1.0)
+            general = qp.generalized
+            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
+        # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
+        far = max(1.0, _distance(answer))
+        inner = max(tol / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
+        if qp.proximal is None and inner >= tightest:
+            break
+        tightest, limit = inner, None if time_limit is None else left
+        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
+        answer = qp.solution(solution, tol=tol)
+        idle = 0 if answer.error < best.error else idle + 1
+        best = min(best, answer, key=lambda one: one.error)
+        if idle == IDLE:
+            break
+    return best
+
+
+def _distance(answer: QPSolution) -> float:
+    """|v*| over |x|."""
+    x, free = answer.x, answer.qp.generalized.v_free
+    return float(np.sqrt(free @ free) / max(np.sqrt(x @ x), TINY))

@@ -1,0 +1,548 @@
+"""`solve` and `prepare`: check the arguments, set up the solver, run it (`loop.py`), judge the result."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from threading import Lock
+from time import perf_counter
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
+from lavender.base.deadline import NEVER, Deadline, Stopwatch
+from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
+from lavender.external.foreign import Foreign
+from lavender.judge.residuals import (
+    Residual,
+    judging_time,
+    reference,
+    setup_time,
+    told,
+    unstretched,
+)
+from lavender.judge.solution import Claim, Solution, SolverRun, Status
+from lavender.problem import Problem, check_problem
+from lavender.solvers.registry import SMALL_ROWS, SolverSpec, get
+from lavender.solving.loop import LEAST, Callback, Loop, Record, best_of
+from lavender.solving.outcome import (
+    CONVERGED,
+    INFEASIBLE,
+    NUMERICAL_ERROR,
+    TIME_LIMIT,
+    decide_empty_rows,
+    finish,
+)
+from lavender_ext.judge.measure import all_finite
+
+__all__ = ["Prepared", "prepare", "solve"]
+
+LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
+         "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
+COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
+JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
+FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
+
+
+def solve(
+    problem: Problem,
+    solver: str = "auto",
+    *,
+    impulse: ArrayLike | None = None,
+    tol: float = 1e-6,
+    max_iter: int | None = None,
+    time_limit: float | None = None,
+    history: bool = False,
+    callback: Callback | None = None,
+    **options: Any,
+) -> Solution:
+    """Solve a constraint problem with the named solver; the default `auto` chooses and combines solvers.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        A registered name; `available(problem)` lists the installed solvers that accept the problem.
+    impulse : (m,) N s, optional
+        Warm start. Default: `problem.guess`, otherwise zero clipped to the bounds.
+    tol : float, default 1e-6
+        Relative residual to reach: 0 is a solution, 1 is zero impulses (see `judge.residuals`). `tol=0` runs exactly
+        `max_iter` iterations; `auto` and solvers that factor end earlier where nothing is left to gain.
+    max_iter : int, optional
+        The most iterations, in the solver's own unit (sweeps, steps, pivots). Default: that of the solver's spec.
+    time_limit : float, optional, s
+        Limit of the whole call on the wall clock: set-up, iterations and the judge. What cannot be stopped, such as a
+        set-up or a factorisation, is begun only if its counted time fits in what is left. The result is no worse than
+        the start. Solvers of other packages run in a separate process, which is started before the clock of the first
+        limit, kept for later solves, and killed at the limit (at twice the limit if the package has a time limit of its
+        own); `isolate=False` runs them in this process.
+    history : bool
+        Record iterations, time and residual at fixed numbers of iterations.
+    callback : callable (iterations, impulse, residual), optional
+        Called whenever history would be recorded; the solve stops if it returns a true value.
+    **options
+        `order`, `ground`, `seed`, `threads` and the solver's own options, as listed by its spec.
+
+    Returns
+    -------
+    Solution
+        Also if the solver did not converge: then it holds the last iterate. See `Solution.status` and `.success`.
+
+    Raises
+    ------
+    UnknownName
+        No such solver or option.
+    SolverUnavailable
+        The solver's package is not installed.
+    CapabilityError
+        The solver does not accept this problem or option; the message says why.
+    InputError
+        `impulse`, `tol`, `max_iter` or `time_limit` is not valid.
+    """
+    begun = 0.0 if time_limit is None else perf_counter()
+    check_problem(problem)  # first, for those who pass A and b
+    spec = get(solver)
+    limit = math.inf if time_limit is None else seconds_of(time_limit)
+    if max_iter is None and callback is None and history is False and not options:
+        made = solve_small(problem, spec, impulse, tol, limit)
+        if made is not None:
+            return made
+    deadline = NEVER if limit == math.inf else Deadline(limit, begun)
+    return Prepared(problem, spec, options, False)._solve(
+        None, impulse, tol, max_iter, deadline, history, callback
+    )
+
+
+def prepare(problem: Problem, solver: str = "auto", **options: Any) -> Prepared:
+    """Do once the part of a solve that many solves can share: factorisation, colouring, allocation.
+
+    Parameters
+    ----------
+    problem : Problem
+    solver : str
+        Name, as in `solve`.
+    **options
+        Options of the solver. `tol`, `max_iter`, `impulse` and `time_limit` are arguments of `Prepared.solve`.
+
+    Returns
+    -------
+    Prepared
+        `prepared.solve(impulse=..., tol=...)` solves this problem; `prepared.solve(problem2, ...)` solves another. If
+        that has the same structure (blocks, sparsity pattern of A or J), the preparation is reused. Both may be called
+        any number of times. `setup_time` [s] is the time that preparing took.
+
+    Examples
+    --------
+    Ten steps of one structure, each started from the impulses (m,) [N s] of the step before:
+
+    >>> import numpy as np
+    >>> import lavender as lv
+    >>> A = np.array([[2.0, 1.0], [1.0, 2.0]])  # 1/kg
+    >>> prepared = lv.prepare(lv.Problem.lcp(A, [1.0, 0.5]), "pgs")
+    >>> impulse = None
+    >>> for step in range(10):
+    ...     problem = lv.Problem.lcp(A, [1.0 + 0.01 * step, 0.5])  # m/s
+    ...     solution = prepared.solve(problem, impulse=impulse, tol=1e-9)
+    ...     impulse = solution.impulse
+    >>> solution.success
+    True
+    """
+    return Prepared(problem, get(solver), options)
+
+
+class Prepared:
+    """A solver prepared for a problem; `solve(problem2)` reuses the preparation if the structure is the same.
+
+    It runs one solve at a time: calling `solve` during another `solve`, from another thread or from its callback,
+    raises `InUse`. Threads may share a `Problem`, but each needs a `Prepared` of its own.
+    """
+
+    def __init__(
+        self, problem: Problem, spec: SolverSpec, options: dict[str, Any], begin: bool = True
+    ) -> None:
+        watch = Stopwatch()  # a check may form A, which is set-up
+        check_taken(problem, spec)
+        for name in options:
+            if name not in spec.accepts:
+                if name in FRONT_DOOR:
+                    raise CapabilityError(
+                        f"prepare does not take {name}=: give it to the solve of what it returns"
+                    )
+                if name in ("order", "ground", "seed", "threads"):
+                    raise CapabilityError(
+                        f"solver {spec.name!r} does not take {name}=; it takes: "
+                        f"{', '.join(sorted(spec.accepts)) or 'no options'}"
+                    )
+                raise UnknownName(f"option of solver {spec.name!r}", name, {*spec.accepts, *FRONT_DOOR})
+        self.spec = spec
+        self.options = options
+        self._given, self.problem = problem, problem.disk
+        self._lock = Lock()
+        # `auto` prepares nothing before its compiled call for small problems was made.
+        if begin and (options or not spec.delegates):
+            self._begin(NEVER)
+        self.setup_time = watch.seconds
+
+    solver: Any = None  # made when it is first needed
+    setup_time = 0.0  # s
+    _fresh = True  # nothing was solved with what was set up
+    _broken = ""  # why there is no state
+    _late = False  # there is none, as it would have taken longer than the time limit
+
+    def _begin(self, deadline: Deadline) -> None:
+        watch = Stopwatch()
+        self.solver = _make(self.spec, self.options)
+        try:
+            self._set_up(self.problem, True, deadline)
+        except BaseException:
+            self.solver = None  # the next call begins again
+            raise
+        self._fresh = True
+        self.setup_time += watch.seconds
+
+    def _replace(self, problem: Problem) -> None:
+        """Another problem in the place of the prepared one; nothing is set up for it yet."""
+        self._given, self.problem, self.solver = problem, problem.disk, None
+
+    def solve(
+        self,
+        problem: Problem | None = None,
+        *,
+        impulse: ArrayLike | None = None,
+        tol: float = 1e-6,
+        max_iter: int | None = None,
+        time_limit: float | None = None,
+        history: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """As `lavender.solve`; `problem`, if given, replaces the prepared one.
+
+        Raises
+        ------
+        InUse
+            Another call of this object's `solve` has not returned yet.
+        """
+        limit = seconds_of(time_limit)
+        deadline = NEVER if limit == math.inf else Deadline(limit)
+        return self._solve(problem, impulse, tol, max_iter, deadline, history, callback)
+
+    def _solve(
+        self,
+        problem: Problem | None,
+        impulse: ArrayLike | None,
+        tol: float,
+        max_iter: int | None,
+        deadline: Deadline,
+        history: bool,
+        callback: Callback | None,
+    ) -> Solution:
+        if not self._lock.acquire(False):
+            raise InUse(
+                f"this prepared {self.spec.name!r} is already solving, and it can run one solve at a time: "
+                "make one for each thread (lavender.prepare)"
+            )
+        try:
+            plain = max_iter is None and callback is None and history is False
+            if plain and self.spec.delegates and not self.options:
+                asked = self._given if problem is None else problem
+                made = solve_small(asked, self.spec, impulse, tol, deadline.left(LEAST) or math.inf)
+                if made is not None:
+                    if problem is not None and problem is not self._given:
+                        self._replace(problem)
+                    return made
+            tol, max_iter = check_budget(self.spec, tol, max_iter)
+            _check_records(self.spec, history, callback)
+            if deadline.is_set:
+                asked = self.problem if problem is None else problem.disk
+                # Of what was found, and of where it began.
+                passes = 2 if impulse is not None or asked.guess is not None else 1
+                last = passes * judging_time(asked)
+                if deadline.passed(setup_time(asked) + last) and not self.spec.external:
+                    return unjudged(problem or self._given, self.spec, self.options, impulse, tol, JUDGE_LATE)
+                deadline.keep(last)
+            if self.solver is None:
+                if problem is not None and problem is not self._given:
+                    check_taken(problem, self.spec)
+                    self._replace(problem)
+                self._begin(deadline)
+            self._refresh(problem, deadline)
+            loop = self._loop(impulse, tol, deadline, history, callback)
+            return self._run(loop, max_iter)
+        finally:
+            if self._late:
+                self.solver, self._late = None, False  # the next call begins again
+            self._lock.release()
+
+    def _loop(
+        self, impulse: Any, tol: float, deadline: Deadline, history: bool, callback: Callback | None
+    ) -> Loop:
+        problem, given = self.problem, self._given
+        if given is not problem and callback is not None:
+            callback = _in_rows_of(given, given.cones.stretch, callback)
+        if impulse is not None:
+            lam = given.on_disk(problem.impulse_array(impulse))
+        else:
+            lam = problem.start() if problem.guess is None else problem.guess.copy()
+        left = deadline.left()
+        if left is not None and not self._late and hasattr(self.solver, "ready"):
+            watch = Stopwatch()
+            self.solver.ready(self.state, left)
+            deadline.keep(-watch.seconds)
+            self.setup_time += watch.seconds
+        records: list[Record] | None = [] if history else None
+        return Loop(
+            problem=problem, solver=self.solver, state=self.state, impulse=lam, tol=tol, deadline=deadline,
+            callback=callback, records=records,
+        )  # fmt: skip
+
+    def _run(self, loop: Loop, max_iter: int) -> Solution:
+        spec, problem = self.spec, self.problem
+        setup_time, self.setup_time = self.setup_time, 0.0
+        proof = decide_empty_rows(problem, loop.impulse, loop.tol)
+        if proof is not None:
+            claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
+        elif self._broken:
+            claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
+        elif self._late:
+            claim = Claim(TIME_LIMIT, 0, {}, "what has to be set up first takes longer than the time limit")
+            loop.not_worse(loop.impulse)
+        else:
+            start = loop.impulse.copy() if loop.deadline.is_set else loop.impulse
+            claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
+            if claim.status is TIME_LIMIT:
+                loop.not_worse(start)
+        solution = finish(
+            problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
+            float(getattr(self.state, "sweeps_per_decade", math.nan)),
+        )  # fmt: skip
+        return solution if self._given is problem else solution.unstretched(self._given)
+
+    def _refresh(self, problem: Problem | None, deadline: Deadline) -> None:
+        if problem is None or problem is self._given:
+            if not self._fresh:
+                self._set_up(self.problem, False, deadline)
+        else:
+            watch = Stopwatch()
+            check_taken(problem, self.spec)
+            given, problem = problem, problem.disk
+            self._set_up(problem, not same_structure(self.problem, problem), deadline)
+            self.setup_time = watch.seconds
+            self._given, self.problem = given, problem  # not before: what cannot be set up is refused again
+        self._fresh = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is prepared anew: a state is for one solve at a time."""
+        return partial(prepare, **self.options), (self._given, self.spec.name)
+
+    def _set_up(self, problem: Problem, anew: bool, deadline: Deadline) -> None:
+        """Prepare, or update the state of a problem of the same structure, if that is counted to end in time."""
+        if problem.metric.start_energy < 0.0:
+            reference(problem)  # of the judge, before any solver has the problem in its hands
+        anew, self._broken = anew or bool(self._broken), ""
+        if deadline.is_set and hasattr(self.solver, "setup_time"):
+            self._late = deadline.passed(self.solver.setup_time(problem))
+            if self._late:
+                self.state = None
+                return
+        try:
+            if anew:
+                self.state = self.solver.prepare(problem)
+            else:
+                self.state = self.solver.update(self.state, problem)
+        except InputError:
+            raise  # before the start
+        except BREAKDOWN as error:
+            self.state, self._broken = None, last_words(error)
+
+
+def unjudged(
+    given: Problem, spec: SolverSpec, options: dict[str, Any], impulse: Any, tol: float, words: str
+) -> Solution:
+    """The start as it is, where even the judge would be late; he measures it for the first who asks."""
+    problem = given.disk
+    start = problem._start if problem.guess is None else problem.guess
+    if impulse is not None:
+        start = given.on_disk(problem.impulse_array(impulse))
+    answer = start if given is problem else given.cones.stretch * start
+    late = judged_later, (given, problem, spec, options, start.copy(), Claim(TIME_LIMIT, 0, {}, words), tol)
+    return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late)
+
+
+def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:
+    """A callback of a problem with ellipses, for what is solved in its place."""
+
+    def call(done: int, impulse: FloatArray, found: Residual) -> Any:
+        return callback(done, stretch * impulse, unstretched(given, found))
+
+    return call
+
+
+def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
+    factory = spec.load()
+    try:
+        made = factory(**options)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"solver {spec.name!r} cannot take the options {options}: {error}") from error
+    if not spec.own:
+        return Foreign(spec.name, made)
+    if spec.boxes <= spec.laws:
+        return made
+    from lavender.solvers.polyhedral import (
+        ThroughRows,  # with the table of solvers, which is imported by then
+    )
+
+    return ThroughRows(made)
+
+
+def same_structure(p: Problem, q: Problem) -> bool:
+    """Same blocks, same kind of operator, same bodies or same pattern of J and M or of A."""
+    if not (equal(p.cones.ptr, q.cones.ptr) and equal(p.cones.kind, q.cones.kind)) or p.law != q.law:
+        return False
+    if p.rows is not None and q.rows is not None:
+        return (
+            p.rows.n_bodies == q.rows.n_bodies
+            and equal(p.rows.joint_body, q.rows.joint_body)
+            and equal(p.rows.contact_body, q.rows.contact_body)
+        )
+    if p.operator != q.operator:
+        return False
+    if p.generalized is not None and q.generalized is not None:
+        return all(
+            equal(x, y)
+            for of in ("jac", "mass")
+            for x, y in zip(
+                getattr(p.generalized.operator, of)[:2], getattr(q.generalized.operator, of)[:2], strict=True
+            )
+        )
+    return equal(p.csr.indptr, q.csr.indptr) and equal(p.csr.indices, q.csr.indices)
+
+
+def judged_later(given: Problem, problem: Problem, *more: Any) -> dict[str, Any]:
+    """The fields that `Prepared._unjudged` leaves for later."""
+    spec, options, impulse, claim, tol = more
+    made = finish(problem, spec, options, impulse, claim, tol, 0.0, 0.0, None)
+    made = made if given is problem else made.unstretched(given)
+    return {name: getattr(made, name) for name in ("residual", *LATER)}
+
+
+def solve_small(
+    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, limit: float = math.inf
+) -> Solution | None:
+    """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
+
+    If its counted cost is more than the limit [s], the result is the best of what was found by then and of the start.
+    The fields of claim, counts and residual are made when they are first read.
+    """
+    small = spec.small
+    if small is None or not spec.own or type(problem) is not Problem or not isinstance(tol, float):
+        return None
+    if not 0.0 < tol < math.inf:
+        return None
+    if problem.cones.has_ellipse or (
+        problem.m > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
+    ):
+        return None  # islands may take long: they are solved where Ctrl-C and the clock are heard
+    start = perf_counter()
+    if impulse is None:
+        given = problem.guess
+    elif (
+        type(impulse) is np.ndarray and impulse.dtype is problem.b.dtype and impulse.shape == problem.b.shape
+        and impulse.flags.c_contiguous and all_finite(impulse)
+    ):  # fmt: skip
+        given = impulse
+    else:
+        given = problem.impulse_array(impulse)
+    if limit == math.inf:
+        found = small.solve(problem, given, tol)
+    else:
+        found = small.solve(problem, given, tol, COUNTED * limit)
+    if found is None:
+        return None
+    judged, counts = found
+    status = CONVERGED
+    if judged.relative > tol:
+        status, judged = TIME_LIMIT, best_of(problem, judged, given)
+    kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
+    judged.impulse.setflags(write=False)
+    return Solution.late(
+        judged.impulse,
+        status,
+        tol,
+        perf_counter() - start,
+        (rest_of, (problem, spec, judged, counts, kept, status)),
+    )
+
+
+def rest_of(
+    problem: Problem,
+    spec: SolverSpec,
+    judged: Any,
+    counts: Any,
+    given: FloatArray | None,
+    status: Status = CONVERGED,
+) -> dict[str, Any]:
+    """The fields of a solution of a compiled call that `Solution.late` leaves for later."""
+    assert spec.small is not None
+    claim = spec.small.claim(problem, counts, given, judged.relative, status)
+    return {
+        "residual": told(problem, judged),
+        "iterations": claim.iterations,
+        "work": MappingProxyType(dict(claim.work)),
+        "solver": SolverRun(spec.name, {}, claim.form),
+        "message": claim.message,
+        "history": None,
+        "dual": None,
+        "certificate": None,
+        "impulse_bound": None,
+        "contradicted": "",
+        "sweeps_per_decade": math.nan,
+        "turns": claim.turns,
+    }
+
+
+def check_taken(problem: Problem, spec: SolverSpec) -> None:
+    """Raise where it is no problem, or the solver refuses it."""
+    check_problem(problem)
+    reason = spec.refuses(problem)
+    if reason:
+        raise CapabilityError(f"solver {spec.name!r} {reason}")
+
+
+def seconds_of(time_limit: Any) -> float:
+    """A time limit as a number, inf where it is None.
+
+    Raises
+    ------
+    InputError
+        No positive number.
+    """
+    if type(time_limit) is float and time_limit > 0.0:
+        return time_limit
+    if time_limit is None or (isinstance(time_limit, np.floating) and time_limit == np.inf):
+        return math.inf
+    return number("time_limit", time_limit, above=0.0)
+
+
+def check_budget(spec: SolverSpec, tol: float, max_iter: int | None) -> tuple[float, int]:
+    """Both as numbers, `max_iter` the spec's where it is None.
+
+    Raises
+    ------
+    InputError
+        A wrong one.
+    """
+    tol = number("tol", tol, low=0.0)
+    return tol, whole_number("max_iter", spec.max_iter if max_iter is None else max_iter)
+
+
+def _check_records(spec: SolverSpec, history: bool, callback: Callback | None) -> None:
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback is {callback!r}; a function of (iterations, impulse, residual) is needed")
+    if (callback is not None and not spec.callback) or (flag("history", history) and not spec.history):
+        raise CapabilityError(
+            f"solver {spec.name!r} runs in one call; it takes no callback and records no history"
+        )

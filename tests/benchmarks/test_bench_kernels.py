@@ -1,0 +1,112 @@
+"""Kernels and steps timed: bare loops do the same work, figures are consistent, commands print and write them."""
+
+import json
+import shutil
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import lavender as lv
+from benchmarks import engine, made
+from benchmarks.clock import least
+from benchmarks.kernels import command, microbenchmarks, problems
+from benchmarks.kernels.cases import job, run
+from benchmarks.kernels.command import table
+from benchmarks.kernels.instructions import COUNTED, instructions
+
+
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_the_bare_contact_sweep_is_sequential_impulses(shuffle):
+    problem = made.lattice_pile(200, shuffle=shuffle)
+    contacts, bodies = problems.bare_contacts(problem)
+    microbenchmarks.contact(contacts.view(np.uint8).reshape(-1), bodies.view(np.uint8).reshape(-1), 20)
+    impulse = lv.solve(problem, "sequential_impulses", tol=0.0, max_iter=20).impulse
+    # The same sweep with I^-1 applied on the way: rounding of 20 sweeps.
+    np.testing.assert_allclose(contacts["lam"].ravel(), impulse, rtol=0, atol=1e-12 * np.abs(impulse).max())
+    slip = np.hypot(impulse[1::3], impulse[2::3]) > 0.499 * impulse[::3]
+    assert slip.any() and not slip.all()  # both branches of the disk were taken
+    velocity = problem.velocity(impulse) - problem.rows.v_free
+    np.testing.assert_allclose(bodies["v"][1:], velocity, rtol=0, atol=1e-12 * np.abs(velocity).max())
+    assert not bodies["v"][0].any()
+
+
+def test_the_bare_row_sweep_is_pgs():
+    problem = problems.tridiagonal(50)
+    a, lam = problem.csr, problem.start()
+    microbenchmarks.csr(a.indptr, a.indices, a.data, problem.b, problem.data.step.copy(), lam, 30)
+    impulse = lv.solve(problem, "pgs", tol=0.0, max_iter=30).impulse
+    np.testing.assert_allclose(lam, impulse, rtol=0, atol=1e-13 * np.abs(impulse).max())
+
+
+def test_the_pile_stands_where_it_says():
+    for contacts in (1, 50, 3_000):
+        problem = made.lattice_pile(contacts)
+        assert 0.5 * contacts <= problem.n_blocks <= 1.5 * contacts + 3
+        assert (problem.rows.contact_body < 0).any()
+    given, shuffled = made.lattice_pile(300), made.lattice_pile(300, shuffle=True)
+    assert given.n_blocks == shuffled.n_blocks
+    assert not np.array_equal(given.rows.contact_body, shuffled.rows.contact_body)
+    with pytest.raises(lv.InputError, match="at least 1"):
+        made.lattice_pile(0)
+
+
+def test_least_is_the_least_of_many():
+    clock = iter([0, 5_000, 0, 3_000, 0, 9_000])  # ns; a call of 2 ms is a batch of its own
+    found = least(lambda: time.sleep(0.002), seconds=0.0, clock=lambda: next(clock))
+    assert found == [pytest.approx(3e-6)]
+
+
+@pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "jacobi", "block", "solve-1", "engine-box"])
+def test_cases_give_time_work_and_residual(case):
+    rows = list(run([case], seconds=0.01))
+    for row in rows:
+        assert row.seconds > 0.0 and row.work > 0
+        assert row.per_unit == pytest.approx(1e9 * row.seconds / row.work)
+    assert any(np.isfinite(r.residual) for r in rows)
+    text = table(rows)
+    assert all(r.case in text for r in rows)
+
+
+def test_a_wrong_case_is_named():
+    with pytest.raises(lv.InputError, match="'nosuch'"):
+        list(run(["nosuch"]))
+
+
+def test_command_prints_and_writes(tmp_path):
+    out = tmp_path / "kernels.json"
+    done = CliRunner().invoke(command, ["solve-1", "--seconds", "0.01", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "lv.solve" in done.output and "kernel alone" in done.output
+    record = json.loads(out.read_text())
+    assert record["lines"][0]["ns_per_unit"] > 0.0
+    assert record["lines"][0]["share"] < 1.0  # a whole call takes longer than its kernel
+
+
+def test_counting_says_what_is_missing(monkeypatch):
+    with pytest.raises(lv.InputError, match="not counted"):
+        instructions("build")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(lv.SolverUnavailable, match="valgrind"):
+        instructions("pgs")
+
+
+@pytest.mark.parametrize("name", COUNTED)
+def test_what_is_counted_runs(name):
+    made = job(name)
+    made.call()
+    assert made.work >= 1.0
+
+
+def test_steps_by_what_a_scene_declares():
+    levels = [line.split("|") for line in engine.detail(steps=5).splitlines()[2:]]
+    assert [int(cells[2]) for cells in levels] == [1, 3, 4, 1, 3, 4]  # rows of a contact
+    text = engine.models(("tower of 6", "chain of 6"), steps=5, seconds=0.0)
+    assert len(text.splitlines()) == 2 + 2 * 3
+    assert all(
+        float(cell.split()[0]) > 0.0
+        for line in text.splitlines()[2:]
+        for cell in line.split("|")[3:4]
+        if cell.strip()
+    )

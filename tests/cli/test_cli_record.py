@@ -1,0 +1,95 @@
+"""`lavender record` and the report of what it wrote."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from mujoco_scene import mj, scene
+
+import lavender as lv
+from lavender.cli import cli
+
+PGS = 1e-6  # as in test_io_mujoco.py
+
+
+def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(tmp_path):
+    """All but exact answers are above the floor of float64, which rounding alone sets."""
+    model = mj.MjModel.from_xml_string(scene(solver="PGS").replace('"1e-15"', '"1e-12"'))
+    found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)
+    assert found.above_floor > 10
+    assert found.stopped == 0
+    assert str(found).endswith(f"{found.above_floor} above their floor, 0 more than 1e-06 m/s off")
+    strict = lv.io.record(model, mj.MjData(model), tmp_path / "b", 30, threshold=0.0)
+    assert (strict.above_floor, strict.stopped) == (found.above_floor, found.above_floor)
+    lines = [json.loads(line) for line in (tmp_path / "a" / "engine.jsonl").read_text().splitlines()]
+    at = next(line for line in lines if line["verdict"] == "close enough")
+    stored = lv.io.read(tmp_path / "a" / at["file"])
+    for threshold, said in (
+        (at["velocity"], "close enough"),
+        (0.99 * at["velocity"], "stopped early"),
+        (0.0, "stopped early"),
+    ):
+        judged = lv.residual(stored.problem, stored.impulse, threshold=threshold)
+        assert (judged.verdict, judged.relative) == (said, at["relative"])
+    for wrong in (-1.0, np.nan, "near"):
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.residual(stored.problem, stored.impulse, threshold=wrong)
+        with pytest.raises(lv.InputError, match="threshold"):
+            lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
+    words = ["check", str(tmp_path / "a" / at["file"]), "--solvers", "auto", "--threshold"]
+    near, strict = (CliRunner().invoke(cli, [*words, x]) for x in ("1e-6", "0"))
+    assert (near.exit_code, strict.exit_code) == (0, 1)
+    assert "1 of 1 above their floor, 0 also more than 1e-06 m/s off" in near.output
+    assert "1 of 1 above their floor, 1 also more than 0 m/s off" in strict.output
+
+
+def test_record_and_report_take_the_same_options_with_the_same_defaults():
+    names = ("steps", "every", "control", "seed", "threshold")
+    both = [{p.name: p for p in cli.get_command(None, name).params} for name in ("record", "report")]
+    for name in names:
+        one, two = (options[name] for options in both)
+        assert (one.opts, one.default, one.type) == (two.opts, two.default, two.type)
+
+
+def test_record_then_report_from_the_command_line(tmp_path):
+    model = tmp_path / "scene.xml"
+    model.write_text(scene())
+    out = tmp_path / "steps"
+    done = CliRunner().invoke(
+        cli, ["record", str(model), "--steps", "30", "--every", "15", "--out", str(out)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "2 problems" in done.output
+    assert len(list(out.glob("*.npz"))) == 2
+    wrong = CliRunner().invoke(
+        cli, ["record", str(model), "--controls", "no.npy", "--out", str(tmp_path / "o")]
+    )
+    page = tmp_path / "report"
+    words = [
+        "report",
+        str(model),
+        "--steps",
+        "30",
+        "--every",
+        "10",
+        "--controls",
+        "zero",
+        "--solvers",
+        "auto,newton",
+    ]
+    for again in range(2):  # the second time nothing is recorded anew
+        shown = CliRunner().invoke(cli, [*words, "--no-figures", "--tables", "--out", str(page)])
+        assert shown.exit_code == 0, shown.output
+        assert ("3 problems" in shown.output) == (again == 0)
+        assert "Newton (inside the engine)" in shown.output
+    (own,) = (page / "recorded").glob("*-scene/engine.jsonl")
+    lines = [json.loads(line) for line in own.read_text().splitlines()]
+    assert len(lines) == 3
+    for text in ((page / "index.html").read_text(), (page / "summary.md").read_text()):
+        row = text[text.index("Newton (inside the engine)") :][:400]
+        assert "auto" in row or "newton" in row
+    assert f"{max(line['relative'] for line in lines):.1e}" in (page / "summary.md").read_text()
+    missing = CliRunner().invoke(cli, ["report", str(tmp_path / "none.xml"), "--out", str(page)])
+    assert isinstance(missing.exception, lv.errors.InputError)
+    assert wrong.exit_code != 0

@@ -1,0 +1,205 @@
+"""`lavender run` and `web`: what steps an engine from the command line."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lavender.base.errors import LavenderError
+from lavender.cli import cli
+from lavender.sim.engine import Film
+from lavender.sim.web import compile as wasm
+from lavender.sim.web import pages
+
+
+def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsys):
+    from lavender.cli import main
+    from lavender.io import load
+
+    paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
+    words = [
+        "run",
+        "stack",
+        "--iterations",
+        "8",
+        "--no-warm-start",
+        "--steps",
+        "12",
+        "--set",
+        "n=2",
+        "--order",
+        "top_down",
+        "--residual",
+    ]
+    files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
+    with pytest.raises(SystemExit) as code:
+        main([*words, *map(str, files)])
+    assert not code.value.code
+    printed = capsys.readouterr().out
+    assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
+    assert "order top_down" in printed.splitlines()[-1]
+    table = np.genfromtxt(paths[0], delimiter=",", names=True, dtype=None, encoding="utf-8")
+    assert table.shape == (12,) and np.all(table["iterations"] == 8) and np.all(table["contacts"] == 8)
+    assert table["residual_final"].max() < table["residual_initial"].max()
+    assert set(table["order"]) == {"top_down"}
+    assert paths[1].read_text().lstrip().startswith("<?xml") and "order top_down" in paths[1].read_text()
+    assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == [8, 8, 8]
+
+
+@pytest.mark.parametrize(
+    ("words", "last"),
+    [
+        (["--solver", "newton"], "newton, "),
+        (["--solver", "pgs", "--order", "bottom_up"], "pgs, order bottom_up, "),
+        (["--stepper", "xpbd", "--order", "reverse"], "order reverse, "),
+    ],
+)
+def test_the_last_line_says_solver_and_order(words, last, capsys):
+    from lavender.cli import main
+
+    with pytest.raises(SystemExit) as code:
+        main(["run", "stack", "--set", "n=2", "--steps", "3", *words])
+    assert not code.value.code
+    assert f" s, {last}" in capsys.readouterr().out.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["run", "stac"],
+        ["run", "stack", "--set", "n"],
+        ["run", "stack", "--set", "mu=1"],
+        ["run", "stack", "--iterations", "3"],
+        ["run", "stack", "--solver", "newtn"],
+        ["run", "stack", "--order", "up"],
+        ["run", "stack", "--solver", "newton", "--order", "bottom_up"],
+        ["run", "stack", "--order", "given", "--set", "order=reverse"],
+        ["run", "stack", "--stepper", "xpbd", "--solver", "newton"],
+    ],
+)
+def test_lavender_run_refuses_what_it_cannot_do(words, capsys):
+    from lavender.cli import main
+
+    with pytest.raises(SystemExit) as code:
+        main(words)
+    assert code.value.code == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def run(sim, steps):
+    return [sim.step()[0] for _ in range(steps)]
+
+
+def test_lavender_run_writes_films_and_pictures(tmp_path, capsys):
+    from lavender.cli import main
+
+    for name in ("a.film", "a.gif"):
+        with pytest.raises(SystemExit) as code:
+            main(["run", "spinner", "--steps", "5", "--film", str(tmp_path / name)])
+        assert not code.value.code
+        assert name in capsys.readouterr().out
+    assert len(Film.load(tmp_path / "a.film")) == 6
+    with pytest.raises(SystemExit) as code:
+        main(["view", str(tmp_path / "a.gif")])
+    assert code.value.code == 2
+    assert "no film" in capsys.readouterr().err
+
+
+def test_lavender_run_shows_itself_until_ctrl_c(monkeypatch, capsys):
+    from lavender.cli import main
+    from lavender.sim.web import view
+
+    opened, waited = [], []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.setattr(view.Viewer, "wait", lambda self: waited.append(len(self.film)))
+    with pytest.raises(SystemExit) as code:
+        main(["run", "spinner", "--steps", "4", "--view"])
+    assert not code.value.code
+    assert waited == [5]
+    assert opened[0] in capsys.readouterr().out
+
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+
+
+CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
+
+
+@pytest.fixture(scope="session")
+def module():
+    """The module of these sources, as bytes; built once for each state of the sources."""
+    try:
+        return pages.module()
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
+    monkeypatch.setattr(pages, "module", lambda say, name: name.encode())
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    with pytest.raises(LavenderError, match="in tests/sim/web of a checkout"):
+        pages.check()
+    script = tmp_path / CHECK.relative_to(ROOT)
+    script.parent.mkdir(parents=True)
+    script.write_text("""
+import { readFileSync } from "node:fs";
+import { dirname, join } from "node:path";
+const newton = readFileSync(join(dirname(process.argv[2]), "newton.wasm"), "utf8");
+process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === "newton" && process.env.PYTHON ? 0 : 1);
+""")
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    with pytest.raises(LavenderError, match=r"node is not there.*install Node 18"):
+        pages.check()
+    monkeypatch.undo()
+    if shutil.which("node") is None:
+        pytest.skip("needs Node")
+    monkeypatch.setattr(pages, "ROOT", tmp_path)
+    for data, code in ((str.encode, 0), (lambda name: b"other", 1)):
+        monkeypatch.setattr(pages, "module", lambda say, name, data=data: data(name))
+        assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
+
+
+def node(*arguments):
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+
+
+def command(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
+        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
+    )  # fmt: skip
+
+
+def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
+    done = command("page", tmp_path / "site")
+    assert done.returncode == 0, done.stderr
+    files = {
+        path.relative_to(tmp_path / "site").as_posix()
+        for path in (tmp_path / "site").rglob("*")
+        if path.is_file()
+    }
+    assert {"index.html", "lavender.js", "scenes.json", "vendor/uPlot-LICENSE.txt"} <= files
+    assert {"lavender.wasm", "newton.wasm"} <= files
+    assert (tmp_path / "site" / "lavender.wasm").read_bytes() == module
+    for name in sorted(files):
+        if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
+            text = (tmp_path / "site" / name).read_text(encoding="utf-8")
+            assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
+
+
+@needs_compiler
+def test_command_says_why_it_cannot_build(tmp_path):
+    done = command("build", tmp_path / "none" / "a.wasm")
+    assert done.returncode == 2
+    assert "is not there; make it first" in done.stderr

@@ -1,0 +1,75 @@
+"""`lavender doctor`: everything a report of a bug needs, and a self-test that can fail."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lavender.cli.entry import cli
+from lavender.lab.bench import doctor, machine
+
+NEEDED = {
+    "lavender",
+    "python",
+    "platform",
+    "cpu",
+    "cores",
+    "versions",
+    "build",
+    "backends",
+    "self_test",
+    "same_bits",
+}
+
+
+def test_it_says_what_a_report_of_a_bug_needs_and_finds_every_bit():
+    done = CliRunner().invoke(cli, ["doctor", "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.output)
+    assert set(found) >= NEEDED
+    assert found["self_test"] == dict.fromkeys(doctor.HASHES, "same")
+    assert found["versions"]["numpy"] == np.__version__
+    assert found["backends"]["osqp"] == f"osqp {found['versions']['osqp']}"
+    facts = machine.describe({}).build
+    assert {"kernels", "compiler", "python_flags", "blas"} <= set(facts)
+    assert {k: found["build"][k] for k in facts if k != "clock"} == {
+        k: facts[k] for k in facts if k != "clock"
+    }
+
+
+def test_another_bit_is_told_and_is_status_1(monkeypatch):
+    name = next(iter(doctor.HASHES))
+    monkeypatch.setitem(doctor.HASHES, name, "0" * 16)
+    done = CliRunner().invoke(cli, ["doctor"])
+    assert done.exit_code == 1
+    assert f"{name}: {'0' * 16} expected" in done.output
+    assert f"{len(doctor.HASHES) - 1} of {len(doctor.HASHES)} give their bits" in done.output
+
+
+def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
+    before = doctor.self_test()
+    assert before == doctor.self_test() == doctor.HASHES
+    assert len(set(before.values())) == len(before)
+    monkeypatch.setattr(
+        doctor, "solve", lambda *given, solve=doctor.solve, **more: solve(*given, **{**more, "max_iter": 11})
+    )
+    after = doctor.self_test()
+    same = {name for name in before if before[name] == after[name]}
+    assert same == {"stack, 60 steps", "gallery, 5 steps"}
+    monkeypatch.setattr(doctor, "steps_of", lambda name, n, steps=doctor.steps_of: steps(name, n - 1))
+    after = doctor.self_test()
+    assert all(before[name] != after[name] for name in before)
+
+
+@pytest.mark.parametrize(
+    ("library", "found"),
+    [
+        (b"..\0GCC: (Debian 12.2.0-14) 12.2.0\0..", {"compiler": "GCC: (Debian 12.2.0-14) 12.2.0"}),
+        (b"__pyx_cython_3_3_1\0", {"cython": "3.3.1"}),
+        (b"clang version 19.1.0\0", {"compiler": "clang version 19.1.0"}),
+        (b"nothing", {}),
+    ],
+)  # fmt: skip
+def test_the_compiler_is_read_from_the_module(library, found):
+    assert machine.build_of(library) == found

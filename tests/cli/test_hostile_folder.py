@@ -1,0 +1,358 @@
+"""A report survives what it finds: names, records and other reports that mean it harm."""
+
+import contextlib
+import dataclasses
+import io as text_io
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from stacks import stack
+
+import lavender as lv
+from lavender import bench, cli, io, report
+from lavender.lab.bench import machine
+from lavender.lab.bench.line import code_of
+from lavender.lab.bench.lock import Lock
+from lavender.lab.bench.record import KINDS, file_name, printable, to_json
+from lavender.lab.report.findings import Report
+from lavender.lab.report.terminal import print_report
+
+POSIX = pytest.mark.skipif(os.name != "posix", reason="processes and file names of POSIX")
+QUICK = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--repeats", "1", "--orders", "reverse")
+
+
+@pytest.fixture
+def lavender(capsys, tmp_path, monkeypatch):
+    """`lavender ARGS` in an empty folder: (exit status, standard output, standard error)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        with pytest.raises(SystemExit) as exit_:
+            cli.main(list(map(str, words)))
+        out, err = capsys.readouterr()
+        return exit_.value.code, out, err
+
+    return run
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+NAMES = {
+    "markup of a terminal": b"[x][bold]{y}[.npz",
+    "not UTF-8": b"caf\xe9\xff.npz",
+    "a superscript": "²1.npz".encode(),
+    "a formula": rb"a$\frac$b.npz",
+    "an open formula": b"a$b.npz",
+    "a hidden label": b"_hidden.npz",
+    "HTML": b"<img src=x onerror=alert(1)>.npz",
+    "lines": b"two\nlines\r\x1b[31m.npz",
+    "turned round": "\u202egnp.npz".encode(),
+    "Markdown": b"a|b`c`[d](e)*f*.npz",
+    "long": b"n" * 200 + b".npz",
+}
+
+
+@POSIX
+def test_files_of_any_name_are_reported(lavender, tmp_path):
+    folder = tmp_path / "problems"
+    folder.mkdir()
+    for name in NAMES.values():
+        io.save(stack(names=[f"[/row]{i}" for i in range(6)]), tmp_path / "plain.npz")
+        with contextlib.suppress(OSError):  # a file system that takes no such name has none to report
+            os.rename(tmp_path / "plain.npz", os.path.join(os.fsencode(folder), name))
+    assert os.listdir(folder)
+    for more in ((), ("--no-figures",)):  # measured and drawn, and read again
+        code, out, err = lavender("report", folder, "--out", "out", *QUICK, *more)
+        assert (code, err.strip()) == (0, "")
+        assert "Traceback" not in out
+        out.encode("utf-8")
+        assert "\x1b" not in out
+        assert len(list((tmp_path / "out" / "figures").glob("work-precision*.png"))) == len(
+            os.listdir(folder)
+        )
+        page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+        assert "<img src" not in page
+        summary = (tmp_path / "out" / "summary.md").read_text(encoding="utf-8")
+        assert "<img" not in summary
+        rows = [line for line in summary.splitlines() if "| pgs |" in line]
+        assert len(rows) >= len(os.listdir(folder))
+        for row in rows:
+            assert len([c for i, c in enumerate(row) if c == "|" and row[i - 1] != "\\"]) == 7, row
+    code, out, err = lavender("report", "--campaign", folder, "--out", "many", *QUICK[:6], "--workers", 1)
+    assert (code, err.strip()) == (0, "")
+
+
+def test_an_archive_with_members_of_any_name_is_named(lavender, tmp_path):
+    (tmp_path / "problems").mkdir()
+    for i, member in enumerate(("[/x]", "a\nb", "\x1b[31m")):
+        np.savez(tmp_path / "problems" / f"odd{i}.npz", **{member: np.ones(2)})
+    io.save(stack(), tmp_path / "problems" / "good.npz")
+    for _ in range(2):
+        code, out, _ = lavender("report", "problems", *QUICK)
+        assert code in (0, 1)
+        assert "[/x]" in out
+        assert "\x1b" not in out
+
+
+@pytest.mark.parametrize("name", ["half \ud800 of a pair", "[/x]", "a$\\frac$b", "\x1b]0;title\x07"])
+def test_names_within_a_file_are_shown_and_change_nothing(lavender, tmp_path, name):
+    problem = stack(name=name, names=[f"{name} {i}" for i in range(6)])
+    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(4,), repeats=1))
+    report.write(records, tmp_path / "out")
+    shown = text_io.StringIO()
+    from rich.console import Console
+
+    print_report(Report(records), Console(file=shown, width=140), whole=True)
+    assert printable(name)[:20] in shown.getvalue()
+
+
+def test_what_cannot_be_shown_is_written_as_its_code():
+    assert printable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
+    assert printable("a\nb\r", lines=True) == "a\nb\\r"
+
+
+def test_long_names_that_differ_at_the_end_keep_files_of_their_own():
+    names = ["n" * 300 + str(i) for i in range(3)]
+    assert len({file_name(name) for name in names}) == 3
+    items = bench.resolve([stack(name=n) for n in [*names, names[0], "x", "x", "x #2"]])
+    assert len({file_name(item.name).lower() for item in items}) == len(items)
+
+
+def test_what_a_reader_raises_costs_its_own_case(lavender, tmp_path, monkeypatch):
+    for name in ("bad", "good"):
+        io.save(stack(), tmp_path / f"{name}.npz")
+    load = io.load
+
+    def broken(path, **more):
+        if "bad" in str(path):
+            raise RecursionError("[/x]")
+        return load(path, **more)
+
+    monkeypatch.setattr(io, "load", broken)
+    records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
+    assert {r.case for r in records} == {"good"}
+    assert ["RecursionError: [/x]" in s.reason for s in records.skips] == [True]
+
+
+@POSIX
+def test_a_pipe_among_the_problems_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.npz")
+    io.save(stack(), tmp_path / "good.npz")
+    records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
+    assert {r.case for r in records} == {"good"}
+    assert ["is no file" in s.reason for s in records.skips] == [True]
+    os.mkfifo(tmp_path / "records.jsonl")
+    with pytest.raises(lv.InputError, match="is no file"):
+        bench.read(tmp_path)
+
+
+def test_a_campaign_takes_files_and_folders(lavender, tmp_path):
+    (tmp_path / "problems").mkdir()
+    for name in ("x", "y"):
+        io.save(stack(), tmp_path / "problems" / f"{name}.npz")
+    io.save(stack(), tmp_path / "z.npz")
+    more = (*QUICK[:6], "--workers", 1, "--seeds", "2")
+    code, _, err = lavender("report", "--campaign", "problems/", "z.npz", "./z.npz", "random_spd(n=4)", *more)
+    assert (code, err.strip()) == (0, "")
+    cases = {r.case for r in bench.read("lavender-report")}
+    assert cases == {"x", "y", "z", "z #2", "random_spd(n=4, seed=0)", "random_spd(n=4, seed=1)"}
+    code, _, err = lavender("report", "--campaign", "nothing.npz", *more)
+    assert code == 2
+    assert "no such file" in err
+
+
+# -- records --------------------------------------------------------------------------------------
+
+HOSTILE = [
+    None, True, -1, 2**70, 1e400, -1e300, float("nan"), "", "x", "inf", "[/x]", "\ud800", "a$\\frac$b", "<b>",
+    [], [1], [[]], ["a", 2], ["\x1b"], {}, {"levels": 3}, {"levels": [0]}, {"levels": ["x"]}, {"a": {"b": 1}},
+    {"x": 1.5},
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def lines():
+    """The entries of a small report with a sequence, a skip and a campaign's mark."""
+    plan = bench.Plan(levels=(1e-3,), budgets=(2, 4), repeats=1, orders=("reverse",))
+    cases = [stack(name="one"), *bench.sequence([stack(), stack()], "walk")]
+    records = bench.run(cases, ["pgs", "direct", "gauss_seidel"], plan)
+    entries = [*records.runs.values(), *records.cases.values(), *records.skips, *records.records]
+    done = bench.record.Done("r", "one", "pgs")
+    return [to_json(e) for e in [*entries, done]]
+
+
+def show_all(records, figure=True):
+    """Everything that is made of records but the files of figures, in memory; `figure`: one by matplotlib, too."""
+    from rich.console import Console
+
+    from lavender.lab.report.curves import figures
+    from lavender.lab.report.draw import matplotlib_figure
+    from lavender.lab.report.markdown import summary
+    from lavender.lab.report.page import page
+    from lavender.lab.report.style import looks
+
+    print_report(Report(records, records), Console(file=text_io.StringIO(), width=140))
+    shown = records.latest()
+    for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
+        assert code_of(record)
+    drawn = figures(shown)
+    page(Report(shown, shown), drawn).encode("utf-8")
+    summary(Report(shown)).encode("utf-8")
+    drawn = list(drawn) if figure else []
+    return matplotlib_figure(drawn[0], looks({r.solver for r in records})) if drawn else None
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_records_of_any_content_are_shown_or_refused(tmp_path, lines, kind):
+    """What a field takes is shown with what all others take at once: a page takes longer than a look at a file."""
+    path, place = tmp_path / "records.jsonl", next(i for i, e in enumerate(lines) if e["kind"] == kind)
+
+    def read(changes):
+        changed = [{**e, **changes} if i == place else e for i, e in enumerate(lines)]
+        path.write_text("".join(json.dumps(e) + "\n" for e in changed))
+        try:
+            return bench.read(path)
+        except lv.InputError:
+            return None
+
+    names = [f.name for f in dataclasses.fields(KINDS[kind])]
+    taken = {name: [value for value in HOSTILE if read({name: value}) is not None] for name in names}
+    assert any(len(values) < len(HOSTILE) for values in taken.values())
+    shown = 0
+    for turn in range(max(map(len, taken.values()))):
+        some = {name: values[turn % len(values)] for name, values in taken.items() if values}
+        records = read(some)
+        if records is not None:
+            show_all(records, figure=shown % 8 == 0)
+            shown += 1
+    assert shown > 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000 + "\n",
+        '{"kind": ' * 5000 + "\n",
+        "1" * 5000 + "\n",
+        '{"kind": ["run"]}\n',
+        '{"kind": {}}\n',
+        "null\n",
+        '"run"\n',
+        "\x00\x00\n",
+        "\ufffe\n",
+        '{"kind": "case"}\n',
+        '{"kind": "done", "run": 1, "case": [], "solver": {}}\n',
+    ],
+)
+def test_a_file_of_anything_is_an_input_error(tmp_path, text):
+    (tmp_path / "records.jsonl").write_text(text)
+    with pytest.raises(lv.InputError, match="line 1"):
+        bench.read(tmp_path)
+
+
+def test_a_record_of_a_case_that_nobody_described_is_refused(tmp_path, lines):
+    kept = [e for e in lines if e["kind"] != "case"]
+    (tmp_path / "records.jsonl").write_text("".join(json.dumps(e) + "\n" for e in kept))
+    with pytest.raises(lv.InputError, match="record of a case that no line before it describes"):
+        bench.read(tmp_path)
+
+
+def test_the_newest_run_shows_its_own_cases_and_only_as_they_are_now(tmp_path, monkeypatch):
+    plan = bench.Plan(levels=(1e-3,), budgets=(), repeats=1)
+    path = tmp_path / "records.jsonl"
+    bench.run([stack(name="a"), stack(name="b")], ["pgs"], plan, path)
+    monkeypatch.setattr(machine, "cpu_name", lambda: "another")
+    bench.run([stack(name="a")], ["pgs"], plan, path)
+    monkeypatch.undo()
+    bench.run([stack(8, name="b")], ["pgs"], plan, path)  # the first run again; b has changed
+    newest = bench.read(path).latest()
+    assert sorted((r.case, newest.cases[r.case].rows) for r in newest) == [("a", 6), ("b", 8)]
+    show_all(newest)
+
+
+# -- two reports in one folder --------------------------------------------------------------------
+
+HOLD = """
+import sys, time
+from lavender import bench
+store = bench.Store(sys.argv[1])
+print("held", flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that writes the records of a folder."""
+    path = tmp_path / "out" / "records.jsonl"
+    process = subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "held\n"
+    yield process, path
+    process.kill()
+    process.wait()
+    process.stdout.close()
+
+
+def test_a_second_report_in_a_folder_is_refused_and_names_the_first(lavender, tmp_path, holder):
+    process, path = holder
+    io.save(stack(), tmp_path / "a.npz")
+    code, _, err = lavender("report", "a.npz", "--out", "out", *QUICK)
+    assert code == 2
+    assert f"process {process.pid} on {socket.gethostname()}" in err
+    assert path.read_text() == ""
+    process.kill()
+    process.wait()
+    code, _, err = lavender("report", "a.npz", "--out", "out", *QUICK)  # a dead holder holds nothing
+    assert (code, err.strip()) == (0, "")
+    assert not path.with_name("records.jsonl.lock").exists()
+
+
+def test_a_lock_of_another_host_is_believed_and_one_process_locks_against_itself(tmp_path):
+    path = tmp_path / "records.jsonl"
+    lock = Lock(path)
+    with pytest.raises(lv.InputError, match=f"process {os.getpid()} on"):
+        bench.Store(path)
+    with pytest.raises(lv.InputError):  # and the refusal took nothing away
+        bench.Store(path)
+    text = lock.path.read_bytes()
+    lock.release()
+    lock.release()
+    lock.path.write_bytes(text.replace(socket.gethostname().encode(), b"elsewhere"))
+    with pytest.raises(lv.InputError, match=f"process {os.getpid()} on elsewhere.*remove"):
+        bench.Store(path)
+    lock.path.write_bytes(b"torn")
+    bench.Store(path).close()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"file": "../../x.npz", "left_out": "\\u202e<i>why"}',
+        '{"file": "a\\u0000b", "left_out": ["why"]}',
+        '{"file": ["x"], "left_out": null}',
+        '{"file": "", "left_out": "why"}',
+        pytest.param(None, marks=POSIX, id="a pipe"),
+    ],
+)
+def test_what_an_engine_said_of_a_folder_harms_nothing(lavender, tmp_path, text):
+    """Its file may be of anybody: at most it names steps that are not there."""
+    folder = tmp_path / "steps"
+    folder.mkdir()
+    io.save(stack(4), folder / "step_1.npz")
+    if text is None:
+        os.mkfifo(folder / "engine.jsonl")
+    else:
+        (folder / "engine.jsonl").write_text(text)
+    items = bench.resolve(folder)
+    assert items[0].problem.m == 4 and len(items) <= 2
+    assert all(item.name.isprintable() for item in items)
+    code = lavender("report", folder, *QUICK, "--no-figures")[0]
+    assert code == (cli.EXIT_UNMET if len(items) == 2 else 0)
+    assert "<i>" not in (tmp_path / "lavender-report" / "index.html").read_text()

@@ -1,0 +1,377 @@
+"""What every QP backend owes its user: its own name, its own words, silence, and never an exception."""
+
+import itertools
+
+import numpy as np
+import pytest
+from random_problems import random_contact_problem, spd, touching
+
+import lavender as lv
+from lavender import registry
+from lavender.external import backends, qp_solver
+from lavender.external.running import Answer
+from lavender.judge.certificates import check_certificate
+from lavender.judge.measures import qp_residual
+
+BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
+DEFINITE = {"quadprog", "ecos", "pyqpmad"}
+PROVE_INFEASIBLE = {"osqp", "clarabel", "clarabel_cone", "piqp", "qpalm", "daqp", "scs"}
+
+
+def installed(*names):
+    """Backends by name, skipped where they are not."""
+    absent = pytest.mark.skipif(True, reason="not installed")
+    return [name if name in BACKENDS else pytest.param(name, marks=absent) for name in names]
+
+
+def replaced(register, name, call):
+    """The backend `name` with its call replaced, its spec otherwise as it is."""
+    from dataclasses import replace
+    from functools import partial
+
+    backend = next(b for b in backends.BACKENDS if b.name == name)
+    register(replace(registry.get(name), factory=partial(qp_solver.QPSolver, replace(backend, call=call))))
+
+
+# -- listing ----------------------------------------------------------------------------------------
+
+
+def test_every_backend_of_qpsolvers_is_known():
+    qpsolvers = pytest.importorskip("qpsolvers")
+    assert set(qpsolvers.available_solvers) <= set(BACKENDS)
+
+
+def test_an_absent_backend_says_what_to_install():
+    reasons = lv.known()
+    absent = [b for b in backends.BACKENDS if reasons[b.name] is not None]
+    assert absent, "no machine has all of them"
+    for backend in absent:
+        assert f"pip install {backend.install}" in reasons[backend.name]
+
+
+# -- what a problem may be ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_asymmetric_and_negative_diagonals_are_refused_with_the_reason(name):
+    a, b = spd(4)
+    a[0, 1] += 1e-3
+    with pytest.raises(lv.CapabilityError, match="needs a symmetric A"):
+        lv.solve(lv.Problem.lcp(a, b), name)
+    with pytest.raises(lv.CapabilityError, match=r"positive semidefinite A; A\[1, 1\] = -1"):
+        lv.solve(lv.Problem.lcp(np.diag([1.0, -1.0]), [1.0, 1.0]), name)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_indefinite_is_a_result_and_never_an_unmarked_wrong_claim(name):
+    # Eigenvalues 3 and -1; a backend may hit one of the LCP's solutions or fail, but not be believed wrongly.
+    solution = lv.solve(lv.Problem.lcp([[1.0, 2.0], [2.0, 1.0]], [-1.0, 2.0]), name)
+    if solution.status is lv.Status.CONVERGED:
+        assert solution.success or solution.contradicted
+    else:
+        assert solution.message
+    assert np.isfinite(solution.impulse).all()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("linear", [True, False])
+def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
+    a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
+    problem = lv.Problem.linear(a, b) if linear else lv.Problem.lcp(a, b)
+    if registry.get(name).refuses(problem):
+        pytest.skip(f"{name} takes no linear problems")
+    solution = lv.solve(problem, name, max_iter=500)
+    assert not solution.success
+    if name in PROVE_INFEASIBLE:
+        assert solution.status is lv.Status.INFEASIBLE, str(solution)
+        assert check_certificate(problem, solution.certificate) is None
+        assert solution.contradicted == ""
+    if solution.status in (lv.Status.CONVERGED, lv.Status.INFEASIBLE) and solution.certificate is None:
+        assert solution.contradicted
+
+
+@pytest.mark.parametrize("name", installed("osqp", "clarabel", "qpalm"))
+def test_contradicting_rows_are_proved_in_the_velocity_form(name):
+    rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0, 1], [0, 0, -1.0]]))
+    problem = lv.Problem.from_rows(rows, [1.0, 1.0])  # up and down at 1 m/s
+    solution = lv.solve(problem, name, form="velocity")
+    assert solution.status is lv.Status.INFEASIBLE, str(solution)
+    assert check_certificate(problem, solution.certificate) is None
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_nothing_to_solve(name):
+    empty = lv.Problem.lcp(np.zeros((0, 0)), [])  # no row is bounded: its law is linear
+    if registry.get(name).refuses(empty) is None:
+        assert lv.solve(empty, name).success
+    fixed = lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0], lower=[0.5, 2.0], upper=[0.5, 2.0]), name)
+    assert fixed.success
+    assert fixed.impulse.tolist() == [0.5, 2.0]
+    assert fixed.work == {"backend_calls": 0}
+    assert "decided by its bounds" in fixed.message
+
+
+# -- what ran -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_linear_problems_never_go_to_lsqr(name, monkeypatch):
+    import importlib
+
+    import scipy.sparse.linalg
+
+    def trap(*_, **__):
+        raise AssertionError("LSQR was called in place of the backend")
+
+    monkeypatch.setattr(scipy.sparse.linalg, "lsqr", trap)
+    for module in (
+        "qpsolvers.solve_unconstrained",
+        *(f"qpsolvers.solvers.{n}_" for n in ("clarabel", "scs")),
+    ):
+        try:
+            loaded = importlib.import_module(module)
+        except ImportError:
+            continue
+        for attribute in ("lsqr", "solve_unconstrained"):
+            if hasattr(loaded, attribute):
+                monkeypatch.setattr(loaded, attribute, trap)
+    problem = lv.Problem.linear(*spd(12))
+    if registry.get(name).refuses(problem):
+        pytest.skip(f"{name} takes no problem without inequalities, and says so")
+    solution = lv.solve(problem, name, tol=1e-8)
+    assert solution.success, str(solution)
+    assert solution.work["backend_calls"] >= 1
+    assert "LSQR" not in solution.message
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("form", ["impulse", "velocity"])
+def test_dual_holds_the_backends_own_multipliers(name, form):
+    problem = random_contact_problem(34, tangents=0, spin=False)
+    problem = lv.Problem(problem.b, problem.cones, rows=problem.rows, compliance=problem.compliance + 0.3)
+    if form == "velocity" and name in DEFINITE:
+        # Rows with two finite bounds add unknowns without a cost of their own: P is then only semidefinite.
+        assert lv.solve(problem, name, form=form).status is lv.Status.NUMERICAL_ERROR
+        form = "auto"
+    solution = lv.solve(problem, name, form=form, tol=1e-8)
+    assert solution.success, str(solution)
+    assert solution.dual.shape == (problem.m,)
+    q = qp_residual(problem, solution.impulse, solution.dual)
+    speed = np.abs(problem.b).max()
+    # 1e-8 relative, times the condition number of this problem (below 100).
+    assert q.dual <= 1e-6 * speed
+    assert q.sign <= 1e-6 * speed
+    assert q.gap <= 1e-6 * speed * np.abs(solution.impulse).sum()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_warm_start_is_used_where_the_spec_says_so(name):
+    problem = lv.Problem.lcp(*spd(40, seed=5))
+    cold = lv.solve(problem, name, tol=1e-6)
+    warm = lv.solve(problem, name, tol=1e-6, impulse=lv.solve(problem, "direct").impulse)
+    if registry.get(name).impulse:
+        assert warm.work["iterations"] <= cold.work["iterations"]
+        assert warm.impulse.tobytes() != cold.impulse.tobytes() or warm.work != cold.work
+    else:
+        assert warm.impulse.tobytes() == cold.impulse.tobytes()
+        assert warm.work == cold.work
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_no_time_limit_is_said(name):
+    backend = next((b for b in backends.BACKENDS if b.name == name), None)
+    solution = lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=600.0)
+    stoppable = backend is None or backend.stoppable
+    assert ("takes no time limit" in solution.message) == (not stoppable)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("limit", [1e10, np.inf])
+def test_a_limit_that_no_clock_holds_is_one_that_never_comes(name, limit):
+    assert lv.solve(lv.Problem.lcp(*spd(5)), name, time_limit=limit).success
+
+
+APART = [b.name for b in backends.BACKENDS if not b.stoppable and b.name in BACKENDS]
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_under_a_time_limit_a_backend_runs_in_a_process_of_its_own(name, monkeypatch):
+    from lavender.external import apart
+
+    problem = lv.Problem.lcp(*spd(12, seed=3))
+    plain = lv.solve(problem, name)
+    calls, call = [], apart.call
+    monkeypatch.setattr(apart, "call", lambda *a: calls.append(call(*a)) or calls[-1])
+    apart = lv.solve(problem, name, time_limit=600.0)
+    assert calls and all(answer is not None for answer in calls)
+    calls.clear()
+    here = lv.solve(problem, name, time_limit=600.0, isolate=False)
+    assert not calls
+    if name in APART:
+        assert "ran in a process of its own" in apart.message and "ran to its end" in here.message
+    assert plain.success and "time limit" not in plain.message
+    for other in (apart, here):
+        assert other.status is plain.status
+        assert other.work == plain.work
+        assert other.impulse.tobytes() == plain.impulse.tobytes()
+
+
+def test_a_backend_that_does_not_end_is_ended_and_the_next_call_finds_another():
+    if "quadprog" not in BACKENDS:
+        pytest.skip("quadprog is not installed")
+    # A thousand rows: to send them takes longer than this limit.
+    problem = lv.Problem.lcp(*spd(1000, seed=3))
+    prepared = lv.prepare(problem, "quadprog")
+    late = prepared.solve(time_limit=1e-6)
+    assert late.status is lv.Status.TIME_LIMIT
+    assert "ended at the time limit" in late.message
+    assert late.impulse.tobytes() == problem.start().tobytes()
+    small = lv.Problem.lcp(*spd(5))
+    after = lv.solve(small, "quadprog", time_limit=600.0)
+    assert after.success and "ran in a process of its own" in after.message
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_the_process_is_kept_and_its_death_costs_one_call_at_most():
+    from lavender.external import apart
+
+    problem = lv.Problem.lcp(*spd(5))
+    lv.solve(problem, APART[0], time_limit=600.0)
+    kept = list(apart.idle)
+    assert len(kept) == 1
+    lv.solve(problem, APART[0], time_limit=600.0)
+    assert apart.idle == kept
+    kept[0].popen.kill()
+    kept[0].popen.wait()
+    assert lv.solve(problem, APART[0], time_limit=600.0).success
+    assert apart.idle != kept
+
+
+@pytest.mark.skipif(not APART, reason="no backend without a time limit is installed")
+def test_errors_of_a_process_of_its_own_are_told():
+    problem = lv.Problem.lcp(*spd(5))
+    with pytest.raises(lv.InputError, match="isolate"):
+        lv.solve(problem, APART[0], isolate="yes")
+    with pytest.raises(lv.InputError, match="isolate=False"):
+        lv.solve(problem, APART[0], time_limit=600.0, settings={"verbose": lambda: None})
+    wrong = {"settings": {"bogus": 1}}
+    here = lv.solve(problem, APART[0], time_limit=600.0, isolate=False, **wrong)
+    apart = lv.solve(problem, APART[0], time_limit=600.0, **wrong)
+    assert apart.status is here.status
+    assert apart.message.split(";")[0] == here.message.split(";")[0]
+
+
+# -- options ------------------------------------------------------------------------------------------
+
+
+def test_settings_reach_the_backend():
+    problem = lv.Problem.lcp(*spd(20))
+    one = lv.solve(problem, "osqp", settings={"max_iter": 25, "polishing": False, "rho": 1e-6})
+    assert one.work["iterations"] == 25
+    assert one.status is lv.Status.MAX_ITERATIONS
+    assert "polish" not in one.message
+
+
+@pytest.mark.parametrize("name", installed("osqp", "clarabel", "qpalm", "highs"))
+def test_an_unknown_setting_is_an_input_error(name):
+    with pytest.raises(lv.InputError, match="bogus"):
+        lv.solve(lv.Problem.lcp(*spd(3)), name, settings={"bogus": 1})
+
+
+@pytest.mark.parametrize("name", ["osqp", "clarabel_cone"])
+def test_settings_must_be_a_mapping(name):
+    with pytest.raises(lv.InputError, match="mapping"):
+        lv.solve(lv.Problem.lcp(*spd(3)), name, settings=[1])
+
+
+# -- failures of a backend ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (ValueError("it broke"), lv.Status.NUMERICAL_ERROR),
+        (MemoryError("it broke"), lv.Status.NUMERICAL_ERROR),
+        (type("Panic", (BaseException,), {})("it broke"), lv.Status.NUMERICAL_ERROR),
+        (KeyboardInterrupt(), lv.Status.INTERRUPTED),
+    ],
+)
+def test_an_exception_becomes_a_result(register, error, status):
+    def call(*_):
+        raise error
+
+    replaced(register, "osqp", call)
+    start = np.array([0.1, 0.2, 0.3])
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
+    assert solution.status is status
+    assert not error.args or f"{type(error).__name__}: it broke" in solution.message
+    assert np.array_equal(solution.impulse, start)
+    assert solution.dual is None
+
+
+@pytest.mark.parametrize("x", [None, np.array([np.nan, 1.0, 1.0]), np.zeros(2)])
+def test_no_iterate_returns_the_start_point(register, x):
+    replaced(register, "osqp", lambda *_: Answer(lv.Status.CONVERGED, "gave up", x))
+    start = np.array([0.1, 0.2, 0.3])
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp", impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert solution.message.startswith("gave up; no iterate")
+    assert np.array_equal(solution.impulse, start)
+
+
+def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(register):
+    asked = []
+
+    def call(qp, impulse, limit, extra):
+        asked.append((limit.eps, limit.gap))
+        return Answer(
+            lv.Status.CONVERGED, "solved", np.full(qp.n, 0.5 + limit.eps), np.zeros(0), np.zeros(qp.n)
+        )
+
+    replaced(register, "osqp", call)
+    solution = lv.solve(lv.Problem.lcp(*spd(3)), "osqp")
+    assert len(asked) == solution.work["backend_calls"] > 1
+    assert all(after < before for before, after in itertools.pairwise(asked))
+    assert solution.status is lv.Status.CONVERGED
+    assert "above tol" in solution.contradicted
+
+
+def test_the_best_of_several_answers_is_returned(register):
+    problem = lv.Problem.lcp(np.eye(3), np.ones(3))
+    answers = iter([1.5, 1.001, 1.2])
+
+    def call(qp, impulse, limit, extra):
+        x = next(answers) / (qp.sigma * qp.root)
+        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), {"iterations": 7})
+
+    replaced(register, "osqp", call)
+    solution = lv.solve(problem, "osqp")
+    assert np.allclose(solution.impulse, 1.001)
+    assert solution.work == {"backend_calls": 3, "iterations": 21}
+
+
+def test_tol_zero_runs_at_the_tightest_tolerance():
+    solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
+    assert solution.status in (lv.Status.STALLED, lv.Status.FLOOR)
+    assert solution.residual.relative <= 1e-10
+
+
+def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
+    monkeypatch.setattr(qp_solver, "DENSE_LIMIT", 8 * 10 * 10)
+    problem = lv.Problem.lcp(*spd(11))
+    with pytest.raises(lv.CapabilityError, match="dense matrices only"):
+        lv.solve(problem, "daqp")
+    assert lv.solve(problem, "osqp").success
+
+
+# -- friction cones -----------------------------------------------------------------------------------
+
+
+def test_cone_program_of_a_sliding_block():
+    # A block pushed sideways at 1 m/s on the ground, mu = 0.5: it keeps sliding, the relaxation lifts it by mu |u_t|.
+    moving = np.array([[1.0, 0, -0.2, 0, 0, 0]])
+    rows = touching([[-1, 0]], inv_inertia=np.zeros((1, 3, 3)), v_free=moving)
+    problem = lv.Problem.from_rows(rows, mu=0.5, tangents=2, friction="cone")
+    solution = lv.solve(problem, "clarabel_cone", tol=1e-8)
+    # Projection of (0.2, -1) on {|t| <= n / 2}: n = (0.2 + 0.5) / 1.25.
+    assert np.allclose(solution.impulse, [0.56, -0.28, 0.0], atol=1e-7)

@@ -1,0 +1,164 @@
+"""`lavender.torch` and `lavender.jax`: gradients by the frameworks' own checks, batches, and what they refuse."""
+
+import importlib
+import sys
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.gradient.layer import step
+
+
+def arrays(seed, contacts=2, tangents=2, nv=5):
+    """J, M, v*, mu, target and compliance of a step in which some contact slides and some sticks."""
+    rng = np.random.default_rng(seed)
+    m = contacts * (1 + tangents)
+    jac, root = rng.standard_normal((m, nv)), 0.3 * rng.standard_normal((nv, nv))
+    target = 0.3 * rng.standard_normal(m)
+    free = np.linalg.lstsq(jac[:: 1 + tangents], np.full(contacts, -2.0), rcond=None)[0]
+    mu, soft = rng.uniform(0.2, 1.0, contacts), rng.uniform(0.05, 0.1, m)
+    return jac, np.eye(nv) + root @ root.T, free + 0.2 * rng.standard_normal(nv), mu, target, soft
+
+
+def is_smooth(given):
+    made = step(given, None, "coulomb", "auto", 1e-12)
+    _, impulse = made.forward(*given)
+    problem = next(made.problems([x[None] for x in given]))
+    return float(lv.derivative(problem, impulse).distance.min()) > 1e-2
+
+
+GIVEN = [given for given in map(arrays, range(12)) if is_smooth(given)][:3]
+assert len(GIVEN) == 3
+
+
+def test_the_adjoint_is_summed_over_what_was_repeated():
+    jac, mass, free, mu, target, soft = GIVEN[0]
+    made = step((jac, mass, free, mu, target, soft), None, "coulomb", "auto", 1e-12)
+    frees = np.stack([free, free + 1e-3])
+    velocity, impulse = made.forward(jac, mass, frees, mu, target, soft)
+    assert velocity.shape == (2, 5) and impulse.shape == (2, 6)
+    both = made.backward(jac, mass, frees, mu, target, soft, impulse, np.ones((2, 5)), np.ones((2, 6)))
+    alone = [
+        made.backward(jac, mass, frees[i], mu, target, soft, impulse[i], np.ones(5), np.ones(6))
+        for i in (0, 1)
+    ]
+    for i, (x, y, z) in enumerate(zip(both, *alone, strict=True)):
+        assert x == pytest.approx(np.stack([y, z]) if i == 2 else y + z, rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", ["torch", "jax"])
+def test_a_missing_package_is_named(name, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    monkeypatch.delitem(sys.modules, f"lavender.{name}", raising=False)
+    with pytest.raises(lv.SolverUnavailable, match=rf"pip install 'lavender-contact\[{name}\]'"):
+        importlib.import_module(f"lavender.{name}")
+
+
+# -- PyTorch -----------------------------------------------------------------------------------------------------
+
+
+def torch_and_solve():
+    torch = pytest.importorskip("torch")
+    from lavender.torch import solve
+
+    return torch, solve
+
+
+@pytest.mark.parametrize("given", GIVEN)
+def test_gradcheck_of_torch(given):
+    torch, solve = torch_and_solve()
+    tensors = [torch.tensor(x, requires_grad=True) for x in given]
+
+    def function(J, M, v_free, mu, target, compliance):
+        return solve(J, M, v_free, mu, target=target, compliance=compliance, tol=1e-14)
+
+    assert torch.autograd.gradcheck(function, tensors, eps=1e-6, atol=1e-6)
+
+
+def test_batches_of_torch():
+    torch, solve = torch_and_solve()
+    stacked = [torch.tensor(np.stack(x)) for x in zip(*GIVEN, strict=True)]
+    velocity, impulse = solve(*stacked[:4], target=stacked[4], compliance=stacked[5])
+
+    def each(*x):
+        return solve(*x[:4], target=x[4], compliance=x[5])
+
+    mapped = torch.vmap(each)(*stacked)
+    assert torch.equal(mapped[0], velocity) and torch.equal(mapped[1], impulse)
+    alone = each(*(x[1] for x in stacked))
+    assert torch.allclose(alone[0], velocity[1], rtol=1e-9)
+    # of a gradient, and of one argument alone
+    of = torch.func.vmap(torch.func.grad(lambda mu, *x: each(*x[:3], mu, *x[3:])[0].sum()))
+    by_mu = of(stacked[3], *stacked[:3], *stacked[4:])
+    stacked[3].requires_grad_()
+    solve(*stacked[:4], target=stacked[4], compliance=stacked[5])[0].sum().backward()
+    assert torch.allclose(by_mu, stacked[3].grad, rtol=1e-9)
+    frees = stacked[2][0] + 1e-3 * torch.arange(4, dtype=torch.float64)[:, None]
+    one = torch.func.vmap(
+        lambda v: each(*(x[0] for x in stacked[:2]), v, *(x[0].detach() for x in stacked[3:]))[0]
+    )
+    assert one(frees).shape == (4, 5)
+
+
+def test_what_torch_refuses():
+    torch, solve = torch_and_solve()
+    jac, mass, free, mu, *_ = (torch.tensor(x) for x in GIVEN[0])
+    with pytest.raises(lv.InputError, match=r"J is torch.float32 on cpu; a tensor of float64"):
+        solve(jac.float(), mass, free, mu)
+    with pytest.raises(lv.InputError, match=r"v_free has shape \(4,\); \(\.\.\., 5\) is needed"):
+        solve(jac, mass, free[:4], mu)
+    with pytest.raises(lv.InputError, match="J has 6 rows for 4 values of mu"):
+        solve(jac, mass, free, torch.ones(4, dtype=torch.float64))
+
+
+# -- JAX ---------------------------------------------------------------------------------------------------------
+
+
+def jax_and_solve():
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    from lavender.jax import solve
+
+    return jax, solve
+
+
+@pytest.mark.parametrize("given", GIVEN)
+def test_check_grads_of_jax(given):
+    jax, solve = jax_and_solve()
+    from jax.test_util import check_grads
+
+    def function(J, M, v_free, mu, target, compliance):
+        return solve(J, M, v_free, mu, target=target, compliance=compliance, tol=1e-14)
+
+    check_grads(
+        function, tuple(map(jax.numpy.asarray, given)), order=1, modes=["rev"], eps=1e-6, atol=1e-5, rtol=1e-5
+    )
+
+
+def test_batches_and_jit_of_jax():
+    jax, solve = jax_and_solve()
+    stacked = [jax.numpy.asarray(np.stack(x)) for x in zip(*GIVEN, strict=True)]
+
+    def each(J, M, v_free, mu, target, compliance):
+        return solve(J, M, v_free, mu, target=target, compliance=compliance)
+
+    velocity, _ = each(*stacked)
+    assert np.array_equal(jax.vmap(each)(*stacked)[0], velocity)
+    assert np.array_equal(jax.jit(each)(*stacked)[0], velocity)
+    by_mu = jax.grad(lambda mu, x: each(*x[:3], mu, *x[3:])[0].sum())
+    whole = by_mu(stacked[3], (*stacked[:3], *stacked[4:]))
+    mapped = jax.vmap(by_mu)(stacked[3], (*stacked[:3], *stacked[4:]))
+    assert np.allclose(whole, mapped, rtol=1e-12)
+    # one argument mapped, the others shared
+    first = [x[0] for x in stacked]
+    frees = first[2] + 1e-3 * np.arange(4.0)[:, None]
+    one = jax.vmap(lambda v: each(*first[:2], v, *first[3:])[0])(frees)
+    assert np.allclose(one[0], velocity[0], rtol=1e-9)
+
+
+def test_what_jax_refuses():
+    jax, solve = jax_and_solve()
+    jac, mass, free, mu, *_ = GIVEN[0]
+    with pytest.raises(lv.InputError, match=r"J is float32; float64 is needed: jax.config.update"):
+        solve(jax.numpy.asarray(jac, "float32"), mass, free, mu)

@@ -1,0 +1,383 @@
+"""Derivatives of solutions: against differences, against their own adjoint, where they do not exist, and refusals."""
+
+import numpy as np
+import pytest
+from gradient_problems import KINDS, OPERATORS, directions, drawn, moved, named
+
+import lavender as lv
+
+LAWS = ("coulomb", "cone")
+H = 1e-5  # of differences: 1e-10 of curvature, 1e-9 of solutions to 1e-14
+CLOSE = 1e-6
+
+
+def solved(problem):
+    solution = lv.solve(problem, tol=1e-14)
+    assert solution.residual.relative < 1e-11 or solution.residual.at_floor, str(solution)
+    return solution
+
+
+def _problems():
+    for kind in KINDS:
+        for law in LAWS:
+            for operator in OPERATORS:
+                if kind == "round" and (law != "cone" or operator != "generalized"):
+                    continue
+                if operator == "bodies" and kind in ("free", "bounded", "equal", "round"):
+                    continue
+                if operator == "asymmetric" and law == "cone":
+                    continue
+                yield pytest.param(kind, law, operator, id=f"{kind}-{law}-{operator}")
+
+
+PROBLEMS = list(_problems())
+
+
+@pytest.mark.parametrize("kind, law, operator", PROBLEMS)
+def test_directions_agree_with_differences_of_solutions(kind, law, operator):
+    checked = 0
+    for seed in range(3):
+        p = drawn(seed, kind, law, operator)
+        solution = solved(p)
+        d = lv.derivative(p, solution)
+        if d.distance.min() < 1e-3:
+            continue
+        assert d.exists
+        for name, change in directions(p, np.random.default_rng(seed)).items():
+            found = d.jvp(**named(name, change))
+            ends = [solved(moved(p, name, change, h)) for h in (-H, H)]
+            wanted = (ends[1].impulse - ends[0].impulse) / (2.0 * H)
+            size = 1.0 + np.abs(wanted).max()
+            assert np.abs(found.impulse - wanted).max() <= CLOSE * size, (seed, name)
+            wanted = (ends[1].slack - ends[0].slack) / (2.0 * H)
+            assert np.abs(found.slack - wanted).max() <= CLOSE * size, (seed, name)
+            if p.matrix is None:
+                ends = [
+                    moved(p, name, change, h).velocity(x.impulse) for h, x in zip((-H, H), ends, strict=True)
+                ]
+                wanted = (ends[1] - ends[0]) / (2.0 * H)
+                assert np.abs(found.velocity - wanted).max() <= CLOSE * size, (seed, name)
+            checked += 1
+    assert checked > 0
+
+
+@pytest.mark.parametrize("kind, law, operator", PROBLEMS)
+def test_gradients_are_the_adjoint_of_directions(kind, law, operator):
+    # to rounding: both are the same linear map, read from its two ends
+    p = drawn(0, kind, law, operator)
+    d, rng = lv.derivative(p, solved(p)), np.random.default_rng(1)
+    weights = {"impulse": rng.standard_normal(p.m), "slack": rng.standard_normal(p.m)}
+    if p.matrix is None:
+        weights["velocity"] = rng.standard_normal(p.velocity(np.zeros(p.m)).shape)
+    g = d.vjp(**weights)
+    for name, change in directions(p, rng).items():
+        found = d.jvp(**named(name, change))
+        wanted = sum(float(np.sum(w * getattr(found, key))) for key, w in weights.items())
+        if name == "mu of each tangent":
+            two = np.isin(p.cones.kind, (lv.CONTACT_BOX, lv.CONTACT_ELLIPSE))
+            pairs = [(g.coefficients, np.where(two[:, None], change, [[1.0, 0.0]] * change))]
+        elif name in "AJM":
+            pairs = [(g.full(name), change)]
+        else:
+            pairs = [(getattr(g, key), x) for key, x in named(name, change).items()]
+        told = sum(float(np.sum(a * b)) for a, b in pairs)
+        assert told == pytest.approx(wanted, rel=1e-9, abs=1e-9), name
+
+
+# -- states ------------------------------------------------------------------------------------------------------
+
+
+def test_states_of_one_contact_pushed_harder_and_harder():
+    # mu 0.5, 10 N s of weight, mass 1: it holds up to 5 N s, then slides; lifted it is open
+    told = []
+    for push in (0.0, 4.0, 6.0):
+        p = lv.Problem.contact(np.eye(3), [10.0, push, 0.0], mu=[0.5])
+        state = lv.solve(p, tol=1e-12).state(0)
+        told.append((state.name, round(state.margin, 9), state.border))
+    assert told == [("sticks", 5.0, False), ("sticks", 1.0, False), ("slides", 1.0, False)]
+    lifted = lv.solve(lv.Problem.contact(np.eye(3), [-2.0, 1.0, 0.0], mu=[0.5]), tol=1e-12).state(0)
+    assert (lifted.name, lifted.rows, round(lifted.margin, 9)) == ("open", ("open",) * 3, 2.0)
+    # under the cone law the slide of 1 m/s pulls the contact by 0.5
+    cone = lv.Problem.contact(np.eye(3), [-2.0, 1.0, 0.0], mu=[0.5], friction="cone")
+    assert lv.solve(cone, tol=1e-12).state(0).margin == pytest.approx(1.5)
+
+
+def test_states_of_rows_and_parts():
+    p = lv.Problem.lcp(np.eye(4), [1.0, -1.0, 3.0, 0.0], [0.0, 0.0, 0.0, 0.0], [2.0, 2.0, 2.0, 2.0])
+    solution = lv.solve(p, tol=1e-12)
+    assert solution.states.names == ("free", "at a bound", "at a bound", "at a bound")
+    assert [s.margin for s in solution.states[:3]] == pytest.approx([1.0, 1.0, 1.0])
+    assert solution.states.borders == (3,) and "on a border" in str(solution.state(3))
+    with pytest.raises(IndexError, match="block 4; there are 4"):
+        solution.state(4)
+    spin = lv.Problem(np.array([10.0, 9.0, 0.0, 0.5]), lv.Cones.contacts(0.5, 2, 1.0), np.eye(4))
+    state = lv.solve(spin, tol=1e-12).state(0)
+    assert (state.name, state.rows) == ("slides", ("closed", "slides", "slides", "sticks"))
+    assert len(lv.solve(lv.Problem.linear(np.zeros((0, 0)), [])).states) == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_states_fit_impulse_and_slack(kind):
+    # the definition, in NumPy: what is open has no impulse, what sticks no slack, what slides is on its rim
+    law = "cone" if kind == "round" else "coulomb"
+    p = drawn(1, kind, law, "generalized")
+    solution, near = solved(p), 1e-8
+    lam, w, c = solution.impulse, solution.slack, p.cones
+    for i, state in enumerate(solution.states):
+        rows = np.arange(c.ptr[i], c.ptr[i + 1])
+        for j, name in zip(rows, state.rows, strict=True):
+            if name in ("sticks", "free") or (name == "closed" and law == "coulomb"):
+                assert abs(w[j]) < near
+            elif name == "open":
+                assert abs(lam[j]) < near
+            elif name == "at a bound":
+                assert min(abs(lam[j] - c.lower[j]), abs(lam[j] - c.upper[j])) < near
+        if state.name == "slides" and len(rows) == 3 and "box" not in kind:
+            reach = np.where(c.reach[rows[1:]] > 0.0, c.reach[rows[1:]], 1.0)
+            share = np.linalg.norm(lam[rows[1:]] / reach) / lam[rows[0]]
+            assert (
+                share == pytest.approx(0.0 if kind == "smooth" and i < 4 else 1.0, abs=1e-6)
+                or kind == "smooth"
+            )
+
+
+# -- where it does not exist ------------------------------------------------------------------------------------
+
+
+def table():
+    """A box on four corners, resting: three rows are enough to hold it."""
+    corner = np.array([(x, y) for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    jac = np.column_stack([np.ones(4), corner[:, 1], -corner[:, 0]])
+    return lv.Problem.from_jacobian(
+        jac, np.eye(3), [-1.0, 0.1, 0.0], cones=lv.Cones.bounded(np.zeros(4), np.full(4, np.inf))
+    )
+
+
+def test_of_rows_that_repeat_others_velocities_are_told_and_impulses_refused():
+    p = table()
+    d = lv.derivative(p, lv.solve(p, tol=1e-12))
+    assert not d.unique.impulse.any() and d.unique.slack.all() and d.unique.velocity
+    assert not d.unique.target.any() and not d.exists
+    g = d.vjp(velocity=[1.0, 2.0, 3.0])
+    assert np.abs(g.v_free).max() < 1e-9  # it stays at rest whatever pushes it a little
+    total = d.vjp(impulse=np.ones(4))  # their sum is unique: the weight
+    assert total.v_free == pytest.approx([-1.0, 0.0, 0.0], abs=1e-9)
+    with pytest.raises(
+        lv.CapabilityError, match=r"not unique here: impulse: not of 4 rows \(row 0, row 1, row 2, ..."
+    ):
+        d.vjp(impulse=[1.0, 0.0, 0.0, 0.0])
+    t = d.jvp(v_free=[0.3, 0.2, 0.1])
+    assert np.abs(t.velocity).max() < 1e-9 and np.abs(t.slack).max() < 1e-9
+    with pytest.raises(lv.CapabilityError, match="impulses are not unique here"):
+        _ = t.impulse
+
+
+def test_a_switch_is_flagged_within_the_error_of_the_answer():
+    a = np.array([[2.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    edge = np.array([10.0, 5.0, 0.0])  # N s, on the rim, about to slide
+
+    def push(x):
+        return lv.Problem.contact(a, a @ edge + [0.0, x, 0.0], mu=[0.5])
+
+    for gap, told in ((1e-3, ()), (1e-15, (0,)), (-1e-15, (0,)), (0.0, (0,))):
+        p = push(gap)
+        d = lv.derivative(p, lv.solve(p, tol=1e-13))
+        assert d.switching == told and d.exists == (not told), gap
+    # it slides by 1e-9 m/s: an exact answer sees it, one that is off by as much does not
+    p = push(1e-9)
+    assert lv.derivative(p, lv.solve(p, tol=1e-14)).switching == ()
+    rough = lv.derivative(p, edge + np.array([3e-9, 2e-9, 0.0]))
+    assert rough.switching == (0,) and "about to switch" in str(rough)
+    assert rough.distance[0] < 1e-8 and rough.distance_in_errors[0] < 10.0
+
+
+# -- what is refused ---------------------------------------------------------------------------------------------
+
+
+def test_refusals_say_what_came_and_what_to_do():
+    p = lv.Problem.contact(np.eye(3), [10.0, 6.0, 0.0], mu=[0.5])
+    solution = lv.solve(p, tol=1e-12)
+    with pytest.raises(
+        lv.InputError, match=r"relative residual is 1\.\d\de-02.*needs 1e-08 or the floor.*solve with tol"
+    ):
+        lv.derivative(p, solution.impulse * 0.99)
+    other = lv.Problem.contact(np.eye(3), [9.0, 6.0, 0.0], mu=[0.5])
+    with pytest.raises(lv.InputError, match="no solution of this problem"):
+        lv.derivative(other, solution)
+    with pytest.raises(lv.InputError, match=r"impulse \[N s\] has shape \(3,\); \(2,\)"):
+        lv.derivative(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), solution)
+    d = lv.derivative(p, solution)
+    with pytest.raises(lv.InputError, match="b must be finite"):
+        d.jvp(b=[np.nan, 0.0, 0.0])
+    with pytest.raises(lv.InputError, match="impulse must be finite"):
+        d.vjp(impulse=[np.nan, 0.0, 0.0])
+    with pytest.raises(lv.InputError, match="give velocity="):
+        d.vjp()
+    with pytest.raises(lv.InputError, match="give a change of the data: b, lower"):
+        d.jvp()
+    with pytest.raises(lv.InputError, match="'J' is no data of this problem"):
+        d.jvp(J=np.eye(3))
+    with pytest.raises(lv.CapabilityError, match="given as a matrix"):
+        d.vjp(velocity=np.ones(3))
+    g = d.vjp(impulse=np.ones(3))
+    with pytest.raises(lv.CapabilityError, match="J is of problems given as rows or generalized"):
+        _ = g.J
+    with pytest.raises(AttributeError, match="a gradient has no 'weight'"):
+        _ = g.weight
+    p = table()
+    d = lv.derivative(p, lv.solve(p, tol=1e-12))
+    with pytest.raises(lv.InputError, match="the change of M is not symmetric"):
+        d.jvp(M=np.triu(np.ones((3, 3))))
+
+
+def test_an_empty_problem_has_an_empty_derivative():
+    p = lv.Problem.linear(np.zeros((0, 0)), [])
+    d = lv.derivative(p, lv.solve(p))
+    assert d.jvp(b=[]).impulse.shape == (0,) and d.vjp(impulse=[]).b.shape == (0,) and d.exists
+    free = lv.Problem.from_jacobian(np.zeros((0, 2)), np.eye(2), [1.0, 2.0], cones=lv.Cones.free(0))
+    d = lv.derivative(free, lv.solve(free))
+    assert d.vjp(velocity=[3.0, 4.0]).v_free.tolist() == [3.0, 4.0]
+
+
+def test_equal_bounds_move_together():
+    p = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, 1.0], [0.25, 0.0], [0.25, np.inf])
+    d = lv.derivative(p, lv.solve(p, tol=1e-13))
+    assert d.exists and d.distance[0] == np.inf
+    t = d.jvp(lower=[1.0, 0.0], upper=[1.0, 0.0])
+    assert t.impulse == pytest.approx([1.0, -0.5])
+    g = d.vjp(impulse=[0.0, 1.0])
+    assert g.lower == pytest.approx([-0.25, 0.0]) and g.upper == pytest.approx([-0.25, 0.0])
+
+
+@pytest.mark.parametrize("name", ["pgs", "newton", "admm", "nncg", "direct"])
+def test_any_solvers_answer_serves(name):
+    p = drawn(2, "bounded", "cone", "dense").boxed(1.0)
+    solution = lv.solve(p, name, tol=1e-9, max_iter=100_000)
+    d, best = lv.derivative(p, solution), lv.derivative(p, solved(p))
+    y = np.random.default_rng(0).standard_normal(p.m)
+    assert d.vjp(impulse=y).b == pytest.approx(best.vjp(impulse=y).b, rel=1e-6, abs=1e-9)
+
+
+# -- many at once ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("operator", OPERATORS)
+def test_a_batch_is_each_one_alone(operator):
+    problems = [drawn(seed, "disk", "cone", operator) for seed in range(4)]
+    solutions = lv.solve_many(problems, tol=1e-12)
+    together, rng = lv.derivatives(problems, solutions), np.random.default_rng(0)
+    weights = {"impulse": [rng.standard_normal(p.m) for p in problems]}
+    if operator in ("generalized", "bodies"):
+        weights["velocity"] = [
+            rng.standard_normal(p.velocity(s.impulse).shape) for p, s in zip(problems, solutions, strict=True)
+        ]
+    found = together.vjp(**weights)
+    for i, (p, s) in enumerate(zip(problems, solutions, strict=True)):
+        alone = lv.derivative(p, s).vjp(**{name: x[i] for name, x in weights.items()})
+        for name in ("b", "mu", "lower"):
+            assert np.array_equal(getattr(found[i], name), getattr(alone, name)), (i, name)
+        if "velocity" in weights:
+            assert np.array_equal(found[i].full("J"), alone.full("J"))
+    assert (
+        len(together) == 4
+        and together[1].states.names == lv.derivative(problems[1], solutions[1]).states.names
+    )
+
+
+def test_batches_of_another_length_are_refused():
+    p = drawn(0, "disk", "cone", "generalized")
+    s = solved(p)
+    with pytest.raises(lv.InputError, match="1 solutions for 2 problems"):
+        lv.derivatives([p, p], [s])
+    with pytest.raises(lv.InputError, match="problem 1: this is no solution"):
+        lv.derivatives([p, p], [s, 1.1 * s.impulse])
+    with pytest.raises(lv.InputError, match="velocity has 2 cotangents for 1 problems"):
+        lv.derivatives([p], [s]).vjp(velocity=[1, 2])
+    with pytest.raises(lv.InputError, match="a list of them is needed"):
+        lv.derivatives(p, s)
+    assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]) == []
+
+
+@pytest.mark.parametrize("count", [3, 170])  # dense; sparse
+@pytest.mark.parametrize("law", ["lcp", "cone"])
+def test_contacts_given_twice_move_as_given_once(law, count):
+    rng = np.random.default_rng(count)
+    each, size = (1, 0) if law == "lcp" else (3, 2)
+    jac = np.zeros((each * count, 3 * count + 3))
+    for i in range(count):  # a chain: each contact between neighbours
+        jac[each * i : each * (i + 1), 3 * i : 3 * i + 6] = rng.standard_normal((each, 6))
+    free = rng.standard_normal(jac.shape[1])
+    made = []
+    for times in (1, 2):
+        rows = np.concatenate([jac] * times)
+        cones = lv.Cones.contacts(np.full(count * times, 0.4), size)
+        made.append(lv.Problem.from_jacobian(rows, np.eye(jac.shape[1]), free, cones=cones, friction="cone"))
+    found = [lv.derivative(p, solved(p)) for p in made]
+    assert found[0].unique and not found[1].unique.impulse.all() and found[1].unique.slack.all()
+    closed = [d.states.case[: each * count : each] != 0 for d in found]
+    assert np.array_equal(*closed)
+    assert np.array_equal(
+        found[1].unique.impulse[: each * count : each], ~closed[1]
+    )  # what is open is unique
+    y, push = rng.standard_normal((2, jac.shape[1]))
+    once, twice = (d.vjp(velocity=y).v_free for d in found)
+    assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
+    once, twice = (d.jvp(v_free=push).velocity for d in found)
+    assert twice == pytest.approx(once, rel=1e-7, abs=1e-7)
+
+
+def test_many_rows_of_bodies_agree_with_their_adjoint_and_with_differences():
+    p = drawn(0, "disk", "cone", "bodies", 200)
+    assert p.m > 500
+    d, rng = lv.derivative(p, solved(p)), np.random.default_rng(0)
+    y, change = rng.standard_normal((4, 6)), rng.standard_normal((4, 6))
+    moved_by = d.jvp(v_free=change).velocity
+    assert np.sum(d.vjp(velocity=y).v_free * change) == pytest.approx(np.sum(y * moved_by), rel=1e-9)
+    h = 0.1 * float(d.distance.min())
+    ends = [moved(p, "v_free", change, x) for x in (-h, h)]
+    velocities = [q.velocity(solved(q).impulse) for q in ends]
+    assert (velocities[1] - velocities[0]) / (2.0 * h) == pytest.approx(moved_by, rel=1e-4, abs=1e-4)
+
+
+def test_an_order_of_elimination_changes_nothing():
+    # a hub that stands last fills in: M's factor has velocities in another order
+    rng, n = np.random.default_rng(0), 60
+    mass = 4.0 * np.eye(n)
+    mass[-1, :-1] = mass[:-1, -1] = 0.2
+    mass[-1, -1] = 10.0
+    jac, free = rng.standard_normal((9, n)), rng.standard_normal(n)
+    given = {"cones": lv.Cones.contacts(np.full(3, 0.5)), "compliance": np.full(9, 0.1)}
+    p = lv.Problem.from_jacobian(jac, mass, free, **given)
+    turn = np.arange(n)[::-1]
+    q = lv.Problem.from_jacobian(jac[:, turn], mass[turn][:, turn], free[turn], **given)
+    assert p.generalized.order is not None and q.generalized.order is None
+    y, c = rng.standard_normal(n), rng.standard_normal(9)
+    one = lv.derivative(p, solved(p)).vjp(velocity=y, impulse=c)
+    two = lv.derivative(q, solved(q)).vjp(velocity=y[turn], impulse=c)
+    for name, back in (("v_free", turn), ("target", slice(None)), ("mu", slice(None))):
+        assert getattr(one, name) == pytest.approx(getattr(two, name)[back], rel=1e-8, abs=1e-10)
+    assert one.full("J") == pytest.approx(two.full("J")[:, turn], rel=1e-8, abs=1e-10)
+    both = lv.derivatives([p], [solved(p)]).vjp(velocity=[y], impulse=[c])[0]
+    assert np.array_equal(both.v_free, one.v_free)
+
+
+def test_what_changes_one_of_several_rows_that_share_a_load_is_refused():
+    """A box that slides on four corners: raise one, and it stands on three; which ones depends on the sign."""
+    at = [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]
+    jac = np.array([np.r_[d, np.cross(r, d)] for r in at for d in np.eye(3)[[2, 0, 1]]])
+    mass, free = np.diag([1.0, 1.0, 1.0, 1 / 6, 1 / 6, 1 / 6]), [1.0, 0.3, -0.1, 0.0, 0.0, 0.0]
+    p = lv.Problem.from_jacobian(jac, mass, free, cones=lv.Cones.contacts(0.5, count=4))
+    d = lv.derivative(p, lv.solve(p, tol=1e-13))
+    g = d.vjp(velocity=np.eye(6)[0])
+    for name in ("b", "target", "J", "compliance"):
+        with pytest.raises(lv.CapabilityError, match="share a load"):
+            getattr(g, name)
+    with pytest.raises(lv.CapabilityError, match="share a load"):
+        d.jvp(target=np.eye(12)[0])
+    # All corners together, the velocity, friction: these are told, and as adjoints.
+    change = {"v_free": np.arange(6.0), "mu": np.ones(4), "target": np.tile([1.0, 0.0, 0.0], 4)}
+    found = {name: d.jvp(**{name: x}).velocity[0] for name, x in change.items()}
+    assert np.sum(g.v_free * change["v_free"]) == pytest.approx(found["v_free"])
+    assert np.sum(g.mu * change["mu"]) == pytest.approx(found["mu"])
+    # It is lifted by 1 m/s more: 1 N s of normal impulse more, which slows it down along w_t by half of that.
+    assert found["target"] == pytest.approx(-0.5 * 1.0 / np.hypot(1.0, 0.3))

@@ -1,0 +1,209 @@
+"""What a certificate proves: no solution, or how large the impulses of every solution are."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from random_problems import FORMS, as_matrix, general, random_contact_problem, touching
+
+import lavender as lv
+from lavender import registry
+from lavender.judge.certificates import check_certificate, prove
+
+OURS = lv.available(external=False)
+OPEN = lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+
+
+def opposed(eps):
+    """Two rows that push apart what they hold; eps of softness in the second."""
+    return lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0 + eps]], [1.0, 1.0])
+
+
+# -- the bound on the impulses ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", lv.available(opposed(1.0)))
+def test_a_definite_matrix_is_never_called_infeasible(name):
+    """Its solution is b.y over the slack: 2e12 N s in each row, which some find, and all others say they miss."""
+    problem = opposed(1e-12)
+    solution = lv.solve(problem, name)
+    assert solution.status is not lv.Status.INFEASIBLE or solution.contradicted
+    if name in OURS:
+        assert not solution.contradicted
+    if solution.impulse_bound is not None:
+        eps = Fraction(1.0 + 1e-12) - 1
+        assert 1e12 <= solution.impulse_bound <= 4 / eps + 2  # the sum of (2 / eps + 1, 2 / eps)
+        assert "at least" in solution.message + solution.contradicted
+    if name == "newton":
+        assert solution.status is lv.Status.STALLED and solution.impulse_bound >= 2e12
+
+
+@pytest.mark.parametrize("name", ["auto", "direct", "newton", "lemke"])
+def test_what_is_proved_is_said(name):
+    near = "for data within rounding of yours; for yours every solution has an impulse of at least 9e+15 N s"
+    for eps, words in ((0.0, "no solution, proved"), (2.0**-52, f"no solution {near}")):
+        solution = lv.solve(opposed(eps), name)
+        assert solution.status is lv.Status.INFEASIBLE and not solution.contradicted
+        assert (solution.impulse_bound == np.inf) is (eps == 0.0)
+        assert words in solution.message
+    assert lv.solve(opposed(1.0), name).impulse_bound is None
+
+
+def held(law, soft, form):
+    """One body between floor and ceiling that come nearer, by rows of each law."""
+    rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))
+    friction = {"friction": law, "tangents": 2, "mu": 0.5} if law in ("coulomb", "cone") else {}
+    target = [0.1, 0.0, 0.0] * 2 if friction else 0.1
+    problem = lv.Problem.from_rows(rows, target=target, compliance=soft, **friction)
+    if law == "linear":  # no contacts: J and M of free rows
+        ends = np.full(2, np.inf)
+        return lv.Problem.from_jacobian(
+            [[1.0], [-1.0]], [[1.0]], [0.0], target=[0.1, 0.1], cones=lv.Cones.bounded(-ends, ends),
+            compliance=np.full(2, soft),
+        )  # fmt: skip
+    return FORMS[form](problem)
+
+
+@pytest.mark.parametrize("form", ["rows", "J and M"])
+@pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
+def test_softness_is_told_apart_from_what_is_rigid(law, form):
+    """However small R is, it is data: strictly convex problems have a solution, rigid ones here have none."""
+    for name in OURS:
+        for soft in (2e-18, 6e-16, 1e-12):
+            problem = held(law, soft, form)
+            if registry.get(name).refuses(problem):
+                continue
+            solution = lv.solve(problem, name, max_iter=200)
+            assert solution.status is not lv.Status.INFEASIBLE, (name, soft, str(solution))
+            assert not solution.contradicted
+            if solution.impulse_bound is not None:  # of the normals: 0.1 / soft each
+                assert 0.0 < solution.impulse_bound <= 0.2 / soft * (1.0 + 1e-9)
+        problem = held(law, 0.0, form)
+        if registry.get(name).refuses(problem) is None:
+            solution = lv.solve(problem, name, max_iter=200)
+            assert not solution.contradicted and not solution.success
+            if solution.status is lv.Status.INFEASIBLE:
+                assert solution.impulse_bound == np.inf and "no solution, proved" in solution.message
+    assert lv.solve(held(law, 0.0, form)).status is lv.Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+def test_no_solution_has_less_impulse_than_a_direction_says(law, form):
+    """(2) for any direction, of problems that are solved."""
+    told = 0
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        friction = {"friction": law} if law != "lcp" else {"tangents": 0, "spin": False}
+        problem = FORMS[form](random_contact_problem(seed, **friction))
+        solution = lv.solve(problem, tol=1e-9)
+        if not solution.success:
+            continue
+        for _ in range(20):
+            y, c = np.zeros(problem.m), problem.cones
+            y[c.normal_rows] = rng.uniform(0.0, 1.0, len(c.normal_rows)) * (
+                rng.random(len(c.normal_rows)) < 0.5
+            )
+            free = np.isneginf(c.lower) & np.isposinf(c.upper) & ~c.contact_rows
+            y[free] = rng.normal(size=free.sum())
+            found = prove(problem, y)
+            assert found.reason or not y.any()
+            assert found.impulse_bound <= np.abs(solution.impulse).sum() * (1.0 + 1e-6), seed
+            told += found.impulse_bound > 0.0
+    assert told > 20
+
+
+def test_a_certificate_excludes_every_answer_within_the_tolerance_it_was_asked_for():
+    """(5): the largest tolerance that a certificate excludes is below the residual of everybody's best."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        g = rng.normal(size=(6, 4))
+        g[5] = -(g[0] + 2.0 * g[1])
+        y = np.array([1.0, 2.0, 0.0, 0.0, 0.0, 1.0])
+        b = rng.normal(size=6)
+        b += y * (10.0 ** -rng.uniform(1.0, 7.0) - b @ y) / (y @ y)
+        problem = lv.Problem.lcp(g @ g.T, b)
+        levels = [tol for tol in np.geomspace(1e-14, 1.0, 60) if check_certificate(problem, y, tol) is None]
+        assert levels
+        for name in ("pgs", "nncg", "newton", "direct", "osqp"):
+            assert lv.solve(problem, name, tol=0.0, max_iter=2000).residual.relative > levels[-1], (
+                seed,
+                name,
+            )
+        loose = lv.solve(problem, tol=min(1.0, 30.0 * levels[-1]))
+        assert loose.status is not lv.Status.INFEASIBLE
+
+
+# -- what is nearly a certificate ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_a_direction_that_a_solver_rounded_is_polished(form):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        jac = rng.normal(size=(9, 12))
+        y = np.where(np.arange(9) < 5, rng.uniform(0.2, 1.0, 9), 0.0)
+        jac[4] = -(y[:4] @ jac[:4]) / y[4]
+        b = rng.normal(size=9)
+        b += y * (0.5 - b @ y) / (y @ y)
+        cones = lv.Cones.bounded(np.zeros(9), np.full(9, np.inf))
+        problem = lv.Problem.from_jacobian(jac, np.eye(12), np.zeros(12), target=b, cones=cones)
+        problem = as_matrix(problem) if form == "matrix" else problem
+        near = y * (1.0 + 1e-8 * rng.normal(size=9))
+        found = prove(problem, near)
+        assert not found.reason and found.impulse_bound > 1e12
+        assert np.abs(found.y - near).max() < 1e-6
+        assert prove(problem, y + 0.1 * rng.uniform(size=9)).reason
+
+
+# -- dust -----------------------------------------------------------------------------------------------
+
+
+def walking(seed, dust=2.78e-17):
+    """A condensed horizon of model-predictive control: M = P, J = -G, target = -h, some rows of G zero."""
+    rng = np.random.default_rng(seed)
+    n = 16
+    state = np.tril(np.cumsum(np.cumsum(np.eye(n), axis=0), axis=0)) * 1e-2
+    hessian = state.T @ state + 1e-3 * np.eye(n)
+    limits = np.vstack([np.zeros((1, n)), state[:-1]])  # the first step cannot be moved any more
+    jac = np.vstack([limits, -limits])
+    bound = np.concatenate([0.065 + np.zeros(n), 100.0 + 0.3 * rng.random(n)])
+    bound[0] = -dust  # a foot that stands on its border
+    free = -np.linalg.solve(hessian, state.T @ rng.normal(size=n))
+    cones = lv.Cones.bounded(np.zeros(2 * n), np.full(2 * n, np.inf))
+    return lv.Problem.from_jacobian(-jac, hessian, free, target=-bound, cones=cones)
+
+
+@pytest.mark.parametrize("name", lv.available(walking(0)))
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_dust_beside_the_numbers_that_made_it_asks_nothing(form, name):
+    for seed in range(3):
+        dusty = walking(seed)
+        problem = as_matrix(dusty) if form == "matrix" else dusty
+        assert len(problem.metric.empty) and problem.b[0] > 0.0
+        solution = lv.solve(problem, name, tol=1e-6)
+        clean = lv.solve(
+            problem.updated(b=np.where(np.arange(problem.m) == 0, 0.0, problem.b)), name, tol=1e-6
+        )
+        assert solution.success == clean.success, str(solution)
+        assert not solution.contradicted
+        if form == "J and M" and name in OURS:  # nor to any tolerance
+            assert lv.solve(problem, name, tol=1e-20).status is not lv.Status.INFEASIBLE
+    real = walking(0, dust=1e-3)
+    assert lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
+
+
+def test_an_empty_row_of_bodies_may_be_dust_as_well():
+    rows = random_contact_problem(3, tangents=0, spin=False).rows
+    jac = rows.jac.copy()
+    jac[0] = 0.0
+    for form in (lambda p: p, as_matrix, general):
+        for dust, status in ((1e-17, "CONVERGED"), (1e-2, "INFEASIBLE")):
+            target = np.zeros(len(jac) + rows.n_contacts)
+            given = lv.Rows(**{f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "jac"}, jac=jac)
+            target[0] = dust
+            problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
+            assert lv.solve(problem).status.name == status
+
+
+# -- who fights ------------------------------------------------------------------------------------------

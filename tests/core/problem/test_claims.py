@@ -1,0 +1,375 @@
+"""What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from random_problems import (
+    CONTACTS,
+    FORMS,
+    arrays_of,
+    nearly_singular,
+    random_contact_problem,
+    random_lcp,
+)
+
+import lavender as lv
+from lavender import registry
+
+#: Its solution, 1e310, is no number, and so the error of every impulse is infinite.
+FLOORLESS = lv.Problem.linear(1e-310 * np.eye(2), [1.0, 1.0])
+
+
+def says(status, **more):
+    return lv.Claim(status, 1, **more)
+
+
+# -- finite numbers -----------------------------------------------------------------------------------
+
+# Worked out anew at each call, and the caller's own.
+ANEW = {
+    "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "apart_rows", "spin_rows",
+    "rolling_rows", "reach", "coefficients", "stretch", "parents", "block_bodies",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", lv.available(FLOORLESS, external=False))
+def test_a_floor_that_is_not_finite_excuses_nothing(name):
+    solution = lv.solve(FLOORLESS, name)
+    assert not np.isfinite(solution.residual.floor)
+    assert not solution.residual.at_floor
+    assert solution.status is not lv.Status.FLOOR
+    assert not solution.success
+    with pytest.raises(lv.errors.SolveFailed):
+        solution.raise_for_status()
+
+
+def test_a_claim_of_floor_needs_finite_numbers(plug_in):
+    name = plug_in(lambda problem, impulse: says(lv.Status.FLOOR))
+    solution = lv.solve(FLOORLESS, name, impulse=[1e300, 1e300])
+    assert solution.contradicted
+    with pytest.raises(lv.errors.SolveFailed):
+        solution.raise_for_status()
+
+
+@pytest.mark.parametrize("name", lv.available(external=False))
+def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
+    """A formed of J and M has lost what J and M still tell: claims hold in the form that was given."""
+    count, wrong = 0, []
+    for seed in range(80):
+        problem = nearly_singular(seed)
+        if registry.get(name).refuses(problem):
+            continue
+        for tol in (1e-6, 1e-10, 1e-14):
+            solution = lv.solve(problem, name, tol=tol)
+            count += 1
+            if solution.contradicted:
+                wrong.append((seed, tol, str(solution)))
+    assert not wrong, wrong[:3]
+    assert count >= 30 or "matrix" not in registry.get(name).operators, "nearly all were refused"
+
+
+@pytest.mark.parametrize("name", lv.available(external=False, resumable=True))
+def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
+    """From what it returned, with nothing remembered: what had only lost its way would end below half."""
+    for seed in range(260):
+        problem = nearly_singular(seed)
+        if registry.get(name).refuses(problem):
+            continue
+        solution = lv.solve(problem, name)
+        if solution.status is lv.Status.STALLED:
+            again = lv.solve(problem, name, impulse=solution.impulse)
+            assert again.residual.relative >= 0.5 * solution.residual.relative, (
+                seed,
+                str(solution),
+                str(again),
+            )
+
+
+def test_infeasible_and_a_success_exclude_each_other():
+    # No impulse meets the second row, and doing nothing is within a tolerance of 1 of it.
+    problem = lv.Problem.lcp([[1.0, 0.0], [0.0, 0.0]], [0.0, 1.0])
+    assert lv.solve(problem, "pgs").status is lv.Status.INFEASIBLE
+    assert not lv.solve(problem, "pgs").success
+    loose = lv.solve(problem, "pgs", tol=1.0)
+    assert loose.success
+    assert loose.status is lv.Status.CONVERGED
+    assert loose.certificate is None
+
+
+@pytest.mark.parametrize(
+    "error", [FloatingPointError("underflow"), np.linalg.LinAlgError("singular"), MemoryError()]
+)
+@pytest.mark.parametrize("where", ["prepare", "run"])
+def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
+    class Breaks:
+        def prepare(self, problem):
+            if where == "prepare":
+                raise error
+
+        def update(self, state, problem):
+            return self.prepare(problem)
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            impulse[0] = np.nan
+            raise error
+
+    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
+    solver = lv.prepare(random_lcp(4), "breaks")
+    for _ in range(2):
+        solution = solver.solve()
+        assert solution.status is lv.Status.NUMERICAL_ERROR
+        assert type(error).__name__ in solution.message
+        assert np.isfinite(solution.impulse).all()
+
+
+def test_a_solver_that_does_nothing_is_stopped(plug_in):
+    name = plug_in(lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0),
+                   resumable=True)  # fmt: skip
+    solution = lv.solve(random_lcp(5), name, max_iter=10**9)
+    assert solution.status is lv.Status.STALLED
+    assert "none of the" in solution.message
+
+
+# -- the problem is out of reach ----------------------------------------------------------------------
+
+
+GIVEN = FORMS | {
+    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
+}
+
+
+def given_by(form):
+    return GIVEN[form](random_contact_problem(7))
+
+
+@pytest.mark.parametrize("form", GIVEN)
+def test_every_array_of_a_problem_is_read_only(form):
+    problem = given_by(form)
+    lv.solve(problem, "pgs", max_iter=3)
+    found = arrays_of(problem, "problem", set())
+    kept = [(name, array) for name, array in found if name.rpartition(".")[2] not in ANEW]
+    names = {name for name, _ in kept}
+    assert {"problem.b", "problem.csr.data", "problem.csr_data.d", "problem.cones.lower"} <= names
+    assert ("problem.jacobian.data" in names) == (form in ("rows", "J and M"))
+    assert [name for name, array in kept if array.flags.writeable] == []
+    for matrix in (problem.csr, problem.delassus()):
+        data = matrix.data if sp.issparse(matrix) else matrix
+        with pytest.raises(ValueError, match="read-only"):
+            data[...] = 0.0
+
+
+@pytest.mark.parametrize("form", GIVEN)
+def test_a_matrix_exchanged_by_a_solver_changes_no_verdict(form, plug_in):
+    """The arrays of a sparse matrix cannot be written, but exchanged: the judge does not look there."""
+    honest = given_by(form)
+    before = lv.solve(honest, "block_gauss_seidel", tol=1e-9)
+
+    def run(problem, impulse):
+        problem.csr.data = np.zeros_like(problem.csr.data)
+        y = np.zeros(problem.m)
+        y[int(problem.cones.ptr[problem.n_blocks - 1])] = 1.0
+        impulse[:] = before.impulse
+        return says(lv.Status.INFEASIBLE, certificate=y)
+
+    solution = lv.solve(given_by(form), plug_in(run), tol=1e-300)
+    assert "INFEASIBLE" in solution.contradicted
+    assert solution.residual.relative == before.residual.relative
+
+
+def test_the_error_of_doing_nothing_cannot_be_raised(plug_in):
+    def run(problem, impulse):
+        problem.data.set_start(1e300, 1e300)
+        return says(lv.Status.CONVERGED)
+
+    with pytest.raises(ValueError, match="known already"):
+        lv.solve(random_lcp(8), plug_in(run))
+
+
+def test_a_verdict_on_another_problem_is_not_taken(plug_in):
+    from lavender.judge.residuals import judged, remember
+
+    def run(problem, impulse):
+        easy = lv.Problem.lcp(problem.delassus(), np.zeros(problem.m) - 1.0)
+        impulse[:] = 0.0
+        remember(problem, judged(easy, impulse.copy()))
+        return says(lv.Status.CONVERGED)
+
+    problem = random_lcp(9)
+    solution = lv.solve(problem, plug_in(run))
+    assert solution.contradicted
+    np.testing.assert_array_equal(solution.residual.slack, -problem.b)
+
+
+# -- plug-ins that lie --------------------------------------------------------------------------------
+
+#: What a solver may return in place of the answer, of (problem, answer): each with a claim of success.
+LIARS = {
+    "constant": lambda p, x: np.full(p.m, 1000.0),
+    "runs away": lambda p, x: np.full(p.m, 1e18),
+    "clamp forgotten": lambda p, x: np.linalg.lstsq(p.dense(), p.b, rcond=None)[0],
+    "sign flipped": lambda p, x: -x,
+    "one row wrong": lambda p, x: x * np.where(np.arange(p.m) == np.abs(x).argmax(), 1.01, 1.0),
+    "stops early": lambda p, x: (1.0 - 1e-4) * x,
+}
+
+
+def laws():
+    """One problem of rows for every law."""
+    free = random_contact_problem(31, contacts=0, joints=9)
+    ends = np.full(free.m, np.inf)
+    yield replace(free, cones=replace(free.cones, lower=-ends, upper=ends))
+    yield random_contact_problem(32, tangents=0, spin=False)
+    yield from (make(33, law) for make in CONTACTS.values() for law in ("coulomb", "cone"))
+
+
+@pytest.mark.parametrize("form", GIVEN)
+@pytest.mark.parametrize("status", [lv.Status.CONVERGED, lv.Status.FLOOR])
+def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
+    """A matrix is what docs/plugin.md shows; that A was formed of bodies, or of J and M, excuses rounding alone."""
+    seen = set()
+    for rows in laws():
+        problem = GIVEN[form](replace(rows, compliance=rows.compliance + 0.3))
+        answer = lv.solve(problem, tol=1e-12)
+        assert answer.residual.relative <= 1e-11
+        seen.add(problem.law)
+        for name, lie in LIARS.items():
+            if problem.law == "linear" and name == "clamp forgotten":
+                continue  # nothing is to be clamped: this is the answer
+            told = lie(problem, answer.impulse)
+
+            def run(_, impulse, told=told):
+                impulse[:] = told
+                return says(status)
+
+            liar = plug_in(run, operators={"matrix"}, rolling=True, boxes={"coulomb", "cone"})
+            solution = lv.solve(problem, liar)
+            assert solution.contradicted, (problem, name, str(solution))
+    assert seen == {"linear", "lcp", "coulomb", "cone"}
+
+
+@pytest.mark.parametrize("form", GIVEN)
+def test_arrays_made_writable_by_a_solver_change_no_problem(form, plug_in):
+    problem, twin = given_by(form), given_by(form)
+
+    def run(problem, impulse):
+        for _, array in arrays_of(problem, "problem", set()):
+            base = array
+            while base is not None:
+                if isinstance(base, np.ndarray) and base.dtype == float and base.flags.owndata:
+                    base.flags.writeable = True
+                    base[...] = 0.0
+                base = base.base
+        return says(lv.Status.CONVERGED)
+
+    name = plug_in(run)
+    honest = lv.solve(twin, "pgs")
+    for start in (None, honest.impulse):
+        lv.solve(problem, name, impulse=start)
+        assert problem == twin
+        assert lv.solve(problem, "pgs").impulse.tobytes() == honest.impulse.tobytes()
+        np.testing.assert_array_equal(problem.d, twin.d)
+
+
+@pytest.mark.parametrize(
+    "claim",
+    [
+        None,
+        "CONVERGED",
+        lv.Claim(None, 1),
+        lv.Claim(lv.Status.CONVERGED, None),
+        lv.Claim(lv.Status.CONVERGED, 1.5),
+        lv.Claim(lv.Status.CONVERGED, -1),
+        lv.Claim(lv.Status.CONVERGED, 1, {"sweeps": None}),
+        lv.Claim(lv.Status.CONVERGED, 1, {1: 1}),
+        lv.Claim(lv.Status.CONVERGED, 1, message=None),
+        lv.Claim(lv.Status.CONVERGED, 1, form=3),
+        lv.Claim(lv.Status.INFEASIBLE, 1, certificate=[[1.0], [1.0, 2.0]]),
+    ],
+    ids=repr,
+)
+@pytest.mark.parametrize("resumable", [False, True])
+def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, claim, resumable):
+    problem = random_lcp(11)
+    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
+
+    def run(problem, impulse):
+        impulse[:] = answer
+        return claim
+
+    name = plug_in(run, resumable=resumable)
+    solution = lv.solve(problem, name)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert f"solver {name!r}" in solution.message
+    assert solution.success  # the judge reads the impulse, whatever was said of it
+    assert str(solution)
+    assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
+
+
+def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):
+    class SmallCall:
+        def solve(self, problem, impulse, tol):
+            raise AssertionError("asked")
+
+    register(
+        lv.SolverSpec(
+            name="few", factory="lavender.solvers.pgs:PGS", laws={"lcp"}, summary="", small=SmallCall()
+        )
+    )
+    assert lv.solve(random_lcp(15), "few", max_iter=2000).success
+    assert lv.solve_many([random_lcp(15)], "few")[0].iterations > 0
+    assert lv.solve(random_lcp(15), "few").iterations > 0
+
+
+# -- the floor is no excuse for an impulse that ran away ------------------------------------------------
+
+
+HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range
+
+
+def test_a_slack_that_rounding_hides_is_no_solution():
+    runaway = np.array([7881299347898371.0, 2627099782632790.0])
+    A, b = HIDDEN.dense(), HIDDEN.b
+    exact = [sum(Fraction(a) * Fraction(x) for a, x in zip(A[i], runaway, strict=True)) for i in range(2)]
+    assert exact[1] - Fraction(b[1]) == -3  # m/s, as much as doing nothing leaves of energy
+    found = lv.residual(HIDDEN, runaway)
+    assert found.slack[1] == 0.0 and found.relative == found.floor > 1.0
+
+
+@pytest.mark.parametrize("name", lv.available(HIDDEN, external=False))
+def test_nobody_solves_what_has_no_solution_by_running_away(name):
+    solution = lv.solve(HIDDEN, name, tol=1e-9)
+    assert not solution.success and not solution.contradicted
+    if name == "auto":
+        assert solution.status is lv.Status.INFEASIBLE
+
+
+@pytest.mark.parametrize("tangents", [1, 2])
+def test_a_certificate_of_normals_is_found_where_there_is_one_and_nowhere_else(tangents):
+    """Two contacts push against each other, or let go of each other."""
+    rng = np.random.default_rng(tangents)
+    jac = rng.normal(size=(2 * (1 + tangents), 3))
+    jac[1 + tangents] = -2.0 * jac[0]  # the second normal, against the first
+    b = 0.1 * rng.normal(size=len(jac))
+    for push, solved in ((-1.0, True), (1.0, False)):
+        b[0], b[1 + tangents] = push, push
+        problem = lv.Problem.contact(jac @ jac.T, b, [0.05, 0.02])
+        solution = lv.solve(problem)
+        assert not solution.contradicted
+        assert solution.success is solved
+        assert (solution.status is lv.Status.INFEASIBLE) is not solved, solution
+
+
+def test_every_test_of_the_floor_has_one_limit():
+    from lavender.judge.residuals import FLOOR_MOST, at_floor
+
+    hidden = 1e-3  # where rounding hides so much, the floor is the residual
+    assert at_floor(FLOOR_MOST, np.nextafter(hidden, 0.0))
+    assert not at_floor(np.nextafter(FLOOR_MOST, 1.0), np.nextafter(hidden, 0.0))
+    assert not at_floor(0.0, hidden)
+    assert at_floor(2e-9, 1e-9)
+    assert not at_floor(2.1e-9, 1e-9)
+    assert not at_floor(0.0, np.inf)
+    assert not at_floor(np.nan, 1.0)

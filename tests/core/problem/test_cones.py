@@ -1,0 +1,178 @@
+"""Cones: what blocks may be, bounds, and the NumPy projection against its conditions."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from random_problems import random_contact_problem, seeds
+
+import lavender as lv
+from lavender.problem.cones import project
+
+REFUSED = {
+    "a kind that does not exist": (lambda: lv.Cones([0, 1], [9], [0], [1], [0], [0]), "9"),
+    "ptr that falls": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
+    "an empty block": (lambda: lv.Cones([0, 0], [0], [], [], [0], [0]), "increase"),
+    "crossed bounds": (lambda: lv.Cones.bounded(np.array([1.0]), np.array([0.0])), "lower <= upper"),
+    "nothing between": (lambda: lv.Cones.bounded(np.array([np.inf]), np.array([np.inf])), "between"),
+    "negative friction": (lambda: lv.Cones.contacts(np.array([-0.1])), "mu"),
+    "negative radius": (
+        lambda: lv.Cones.contacts(np.array([0.5]), patch_radius=np.array([-1.0])),
+        "patch_radius",
+    ),
+    "six tangents": (lambda: lv.Cones.contacts(np.array([0.5]), tangents=6), "tangents"),
+    "spin without a row": (lambda: lv.Cones([0, 1], [2], [0], [0], [0.5], [0.1]), "contact"),
+    "mu of another number": (lambda: lv.Cones.contacts([0.5, 0.6], count=3), r"mu has shape \(2,\)"),
+    "less than none": (lambda: lv.Cones.contacts(0.5, count=-1), "count is -1"),
+    "a round cone of seven rows": (
+        lambda: lv.Cones([0, 7], [lv.ROUND], np.zeros(7), np.zeros(7), [1.0], [0.0]),
+        "a round cone of 7 rows",
+    ),
+    "spin beside a round cone": (lambda: lv.Cones.contacts(0.5, 3, 0.1), "no patch_radius"),
+    "no such shape": (lambda: lv.Cones.contacts(0.5, shape="square"), "unknown shape 'square'"),
+    "a side below zero": (lambda: lv.Cones.contacts([(0.5, -0.2)], shape="box"), "mu"),
+    "three sides": (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)], shape="box"), "one for each tangent"),
+    "a box that spins": (lambda: lv.Cones.contacts(0.5, 2, 0.1, shape="box"), "no spin"),
+    "a box of three tangents": (lambda: lv.Cones.contacts(0.5, 3, shape="box"), "up to two tangents"),
+    "a box of four rows": (
+        lambda: lv.Cones([0, 4], [4], np.zeros(4), np.ones(4), [0.5], [1.0]),
+        "box of 4 rows",
+    ),
+    "an arm below zero": (lambda: lv.Cones.contacts(0.5, rolling=-0.1), "rolling.*-0.1"),
+    "rolling on one tangent": (lambda: lv.Cones.contacts(0.5, 1, rolling=0.1), "tangents=2"),
+    "rolling in a round cone": (lambda: lv.Cones.contacts(0.5, 5, rolling=0.1), "round cone"),
+    "one arm for two": (lambda: lv.Cones.contacts([0.5, 0.5], rolling=[0.1]), "rolling"),
+    "rolling in four rows": (
+        lambda: lv.Cones([0, 4], [lv.CONTACT_ROLLING], np.zeros(4), np.ones(4), [0.5], [0.0], [0.1]),
+        "5 rows or 6",
+    ),
+    "rolling below zero": (
+        lambda: lv.Cones([0, 5], [lv.CONTACT_ROLLING], np.zeros(5), np.ones(5), [0.5], [0.0], [-1.0]),
+        "rolling.*-1",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_cone_is_refused_with_its_reason(name):
+    make, sign = REFUSED[name]
+    with pytest.raises((lv.InputError, lv.UnknownName), match=sign):
+        make()
+
+
+def test_sizes_and_kinds():
+    free, boxed = lv.Cones.free(3), lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
+    contacts = lv.Cones.contacts(np.array([0.5, 0.2]), patch_radius=np.array([0.1, 0.0]))
+    assert (free.n_rows, free.n_blocks, free.is_free, free.is_bounded_rows) == (3, 3, True, True)
+    assert (boxed.is_free, boxed.is_bounded_rows) == (False, True)
+    assert (contacts.n_rows, contacts.n_blocks, contacts.is_bounded_rows) == (8, 2, False)
+    assert contacts.n_tangents.tolist() == [2, 2]
+    assert lv.Cones.contacts(np.array([0.0]), tangents=0).is_bounded_rows
+
+
+def test_bounds_of_contact_rows_are_spelled_in_one_way():
+    # They are never read: cones that differ there alone are equal.
+    one = lv.Cones([0, 3], [1], [0.0, -1.0, -1.0], [9.0, 1.0, 1.0], [0.5], [0.0])
+    two = lv.Cones([0, 3], [1], [5.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.5], [0.0])
+    assert one == two
+    assert one.lower[0] == 0.0
+
+
+def test_arrays_stay_read_only_in_copies_and_pickles():
+    cones = lv.Cones.contacts(np.array([0.5]))
+    for other in (cones, copy.deepcopy(cones), pickle.loads(pickle.dumps(cones))):
+        assert other == cones
+        for name in ("ptr", "kind", "lower", "upper", "mu", "patch_radius"):
+            assert not getattr(other, name).flags.writeable
+    with pytest.raises(TypeError):
+        hash(cones)
+
+
+@given(seed=seeds, size=st.floats(1e-3, 1e3))
+def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
+    cones = random_contact_problem(seed, joints=2, contacts=4).cones
+    x = size * np.random.default_rng(seed).standard_normal(cones.n_rows)
+    y = project(cones, x)
+    twice = project(cones, y)
+    # Scaling a tangent back to its disk rounds once each time.
+    np.testing.assert_allclose(twice, y, rtol=1e-15, atol=0.0)
+    for i in range(cones.n_blocks):
+        j, end, nt = cones.ptr[i], cones.ptr[i + 1], cones.n_tangents[i]
+        if cones.kind[i] == lv.ROW:
+            assert np.all(y[j:end] == np.clip(x[j:end], cones.lower[j:end], cones.upper[j:end]))
+            continue
+        assert y[j] == max(0.0, x[j])
+        limit = cones.mu[i] * y[j]
+        t, given_t = y[j + 1 : j + 1 + nt], x[j + 1 : j + 1 + nt]
+        assert np.linalg.norm(t) <= limit * (1.0 + 1e-15)
+        if np.linalg.norm(given_t) <= limit:
+            assert np.all(t == given_t)
+        elif nt:
+            assert t @ given_t >= 0.0
+        if cones.kind[i] == lv.CONTACT_SPIN:
+            assert abs(y[end - 1]) <= limit * cones.patch_radius[i]
+
+
+def _the_long_way(cones):
+    """The same blocks from lists, which no quick way takes."""
+    return lv.Cones(*(getattr(cones, name).tolist() for name in FIELDS))
+
+
+FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
+PARTS = st.one_of(
+    st.builds(lv.Cones.free, st.integers(0, 4)),
+    st.integers(0, 4).map(lambda m: lv.Cones.bounded(-np.arange(float(m)), np.full(m, np.inf))),
+    st.builds(
+        lambda mu, tangents, count: lv.Cones.contacts(mu, tangents, count=count),
+        st.floats(0.0, 2.0), st.integers(0, 5), st.integers(0, 3),
+    ),
+    st.builds(
+        lambda mu, tangents: lv.Cones.contacts(np.array(mu), tangents, np.arange(float(len(mu)))),
+        st.lists(st.floats(0.0, 2.0), max_size=3), st.integers(0, 2),
+    ),
+)  # fmt: skip
+
+
+@given(first=PARTS, second=PARTS)
+def test_quick_ways_make_what_the_long_way_makes(first, second):
+    both = first + second
+    lists = [getattr(first, name).tolist() + getattr(second, name).tolist() for name in FIELDS[1:]]
+    ptr = first.ptr.tolist() + (second.ptr[1:] + first.n_rows).tolist()
+    for cones, long in (
+        (first, _the_long_way(first)),
+        (both, _the_long_way(both)),
+        (both, lv.Cones(ptr, *lists)),
+    ):
+        assert cones == long
+        for name in ("is_free", "is_bounded_rows", "has_round", "n_rows", "n_blocks"):
+            assert getattr(cones, name) == getattr(long, name)
+        size, kind = np.diff(cones.ptr), cones.kind
+        unbounded = np.isinf(cones.lower) & np.isinf(cones.upper)
+        assert cones.is_free == (not kind.any() and bool(unbounded.all()))
+        assert cones.is_bounded_rows == bool(np.all((kind == 0) | (size == 1)))
+        assert cones.has_round == bool(np.any(kind == 3))
+        for name in FIELDS:
+            assert not getattr(cones, name).flags.writeable
+
+
+def test_arrays_that_are_given_stay_the_givers_own():
+    lower, upper = np.zeros(2), np.ones(2)
+    ptr, kind, zero = np.arange(3, dtype=np.int32), np.zeros(2, np.int32), np.zeros(2)
+    for cones in (lv.Cones.bounded(lower, upper), lv.Cones(ptr, kind, lower, upper, zero, zero)):
+        lower[0] = upper[0] = 5.0
+        assert cones.lower[0] == 0.0
+        assert cones.upper[0] == 1.0
+        lower[0], upper[0] = 0.0, 1.0
+        assert lower.flags.writeable
+        assert ptr.flags.writeable
+
+
+@pytest.mark.parametrize("count", [-1, 2**31 - 1, 2**40])
+def test_counts_beyond_32_bits_are_refused(count):
+    with pytest.raises(lv.InputError, match=str(count)):
+        lv.Cones.free(count)
+    with pytest.raises(lv.InputError, match=str(count)):
+        lv.Cones.contacts(0.5, count=count)

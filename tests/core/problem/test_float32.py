@@ -1,0 +1,181 @@
+"""Answers made in float32: what rounding explains, what stopped early, and data that are widened exactly."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from random_problems import random_contact_problem, random_lcp, seeds
+from random_trees import random_tree, tree_mass
+
+import lavender as lv
+from lavender.judge.residuals import UNIT32, rounded
+
+
+def robot(seed, m=12, n=10, soft=True, number=np.float64):
+    """Bounded rows on a random forest, as soft as those of engines (2 to 20 % of the diagonal of A)."""
+    rng = np.random.default_rng(seed)
+    mass = tree_mass(rng, random_tree(rng, n))
+    jac = rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.6)
+    jac[:, 0] += 0.3
+    compliance = rng.uniform(0.02, 0.2, m) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T)
+    upper = np.where(rng.random(m) < 0.3, rng.uniform(0.05, 0.5, m), np.inf)
+    return lv.Problem.from_jacobian(
+        jac.astype(number), mass.astype(number), rng.normal(size=n).astype(number), target=rng.uniform(-0.1, 0.1, m),
+        cones=lv.Cones.bounded(np.zeros(m), upper), compliance=compliance if soft else None, name=f"robot {seed}",
+    )  # fmt: skip
+
+
+# -- the floor --------------------------------------------------------------------------------------
+
+
+def dense_parts(p):
+    """A, J, M^-1, M, v*: dense, whatever the problem holds."""
+    if p.rows is not None:
+        inverse = p.rows.inverse_mass_matrix().toarray()
+        return p.dense(), p.jacobian.toarray(), inverse, None, p.rows.v_free.ravel()
+    g = p.generalized
+    mass = g.mass.toarray()
+    return p.dense(), g.jac.toarray(), np.linalg.inv(mass), mass, g.v_free
+
+
+@pytest.mark.parametrize("form", ["rows", "matrix", "generalized"])
+@settings(max_examples=10, deadline=None)
+@given(seed=seeds)
+def test_the_parts_of_the_floor_are_the_formulas_written_densely(form, seed):
+    p = (
+        random_contact_problem(seed)
+        if form == "rows"
+        else robot(seed)
+        if form == "generalized"
+        else random_lcp(seed)
+    )
+    lam = lv.solve(p, max_iter=50).impulse
+    if form == "matrix":
+        a = p.dense()
+        own, data, velocities = a**2 @ lam**2, a**2 @ lam**2 + p.b**2, 0.0 * p.b
+    else:
+        a, jac, inverse, mass, free = dense_parts(p)
+        x, pushed = inverse @ jac.T @ lam, jac.T**2 @ lam**2
+        through = (jac @ inverse) ** 2
+        rounded_mass = jac**2 @ inverse**2 @ (jac.T @ lam) ** 2 if mass is None else through @ mass**2 @ x**2
+        own, b2 = a**2 @ lam**2, (p.b + jac @ free) ** 2 + 2 * jac**2 @ free**2
+        data = jac**2 @ x**2 + through @ pushed + rounded_mass + p.compliance**2 * lam**2 + b2
+        velocities = 0.0 * p.b
+        if form == "generalized":
+            acts = (lam != p.cones.lower) & (lam != p.cones.upper) & (lam != 0.0)
+            seen = jac**2 @ x**2 + p.b**2 + p.compliance**2 * lam**2
+            velocities = a**2 @ np.where(acts, seen / p.compliance**2, 0.0)
+    for got, want in zip(rounded(p, lam), (own, data, velocities), strict=True):
+        np.testing.assert_allclose(got, UNIT32**2 * want, rtol=1e-9, atol=1e-30)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=seeds)
+def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_not(seed):
+    p = random_lcp(seed)
+    exact = lv.solve(p, "direct" if p.is_symmetric else "auto", tol=1e-12, max_iter=100_000)
+    if not exact.residual.relative < 1e-10:
+        return
+    there = lv.residual(p, exact.impulse.astype(np.float32), precision="float32")
+    assert there.verdict == "at its floor", there
+    assert there.relative <= 4.0 * there.floor
+    off = lv.residual(p, 0.99 * exact.impulse, precision="float32")
+    if off.relative > 1e-4:  # of what 1 % less does; rounding is below that here
+        assert off.verdict == "stopped early"
+        assert off.excess == off.relative / off.floor > 4.0
+        assert f"stopped early, {off.excess:.2g} times its floor" in str(off)
+
+
+def test_an_answer_that_is_no_better_than_none_is_wrong():
+    p = robot(3)
+    exact = lv.solve(p, tol=1e-10).impulse
+    for impulse in (-exact, np.full(p.m, np.nan), np.full(p.m, 1e30), p.start()):
+        assert lv.residual(p, impulse, precision="float32").verdict == "wrong"
+    assert lv.residual(p, exact, precision="float32").verdict == "at its floor"
+
+
+def test_where_there_is_nothing_to_do_rounding_is_no_mistake():
+    p = lv.Problem.lcp(np.eye(2), [-1.0, -1e-12])  # both separate
+    assert lv.residual(p, np.zeros(2)).nothing_to_do
+    assert lv.residual(p, np.zeros(2), precision="float32").verdict == "at its floor"
+    assert lv.residual(p, np.full(2, 1e30), precision="float32").verdict == "wrong"
+
+
+def test_the_error_does_not_depend_on_the_precision_and_the_floor_does():
+    p = robot(5)
+    impulse = lv.solve(p, tol=1e-5).impulse
+    one, two = lv.residual(p, impulse), lv.residual(p, impulse, precision="float32")
+    assert (one.relative, one.energy, one.velocity) == (two.relative, two.energy, two.velocity)
+    assert one.rounding is None
+    assert one.precision == "float64"
+    assert two.floor > 1e6 * one.floor
+    parts = (two.rounding.impulse, two.rounding.data, two.rounding.velocities)
+    # Norms of sums of squares: between the largest part and all of them.
+    assert max(parts) <= two.floor * (1 + 1e-12)
+    assert two.floor <= sum(parts) * (1 + 1e-12)
+
+
+def test_a_row_that_is_rigid_reads_no_impulse_off_velocities():
+    p = robot(5, m=6, soft=False)
+    assert lv.residual(p, lv.solve(p).impulse, precision="float32").rounding.velocities == 0.0
+
+
+@pytest.mark.parametrize("word", ["float16", "single", 32])
+def test_another_precision_is_told(word):
+    p = random_lcp(1)
+    with pytest.raises(lv.InputError, match=r"precision is .*'float64' or 'float32'"):
+        lv.residual(p, p.start(), precision=word)
+    with pytest.raises(lv.InputError, match=r"precision is .*'float64' or 'float32'"):
+        lv.Problem.lcp(np.eye(1), [1.0], precision=word)
+
+
+# -- early stops, planted -----------------------------------------------------------------------------
+
+
+# -- data in float32 ----------------------------------------------------------------------------------
+
+
+def test_j_and_m_in_float32_are_widened_exactly_and_say_so():
+    p = robot(7, number=np.float32)
+    assert p.precision == "float32"
+    rng = np.random.default_rng(7)
+    mass = tree_mass(rng, random_tree(rng, 10)).astype(np.float32)
+    assert np.array_equal(np.tril(p.generalized.mass.toarray()), np.tril(mass.astype(np.float64)))
+    assert np.array_equal(p.generalized.v_free, p.generalized.v_free.astype(np.float32))
+    assert lv.residual(p, p.start()).precision == "float32"  # the judge takes the problem's
+    assert lv.residual(p, p.start(), precision="float64").precision == "float64"
+    assert lv.solve(p).residual.precision == "float64"  # our solvers work in float64
+    jac, mass = sp.csr_array(p.generalized.jac), p.generalized.mass.toarray()
+    v = p.generalized.v_free
+    for j, m, free, precision in (
+        (jac.astype(np.float32), sp.csr_array(mass.astype(np.float32)), v.astype(np.float32), "float32"),
+        (jac.astype(np.float32), [mass.astype(np.float32)], v.astype(np.float32), "float32"),
+        (jac, mass.astype(np.float32), v.astype(np.float32), "float64"),
+        (jac.astype(np.float32), mass.astype(np.float32), v.tolist(), "float64"),
+    ):
+        made = lv.Problem.from_jacobian(j, m, free, cones=p.cones)
+        assert made.precision == precision
+    forced = lv.Problem.from_jacobian(jac, mass, v, cones=p.cones, precision="float32")
+    assert forced.precision == "float32"
+
+
+def test_a_mass_matrix_summed_in_float32_need_not_be_symmetric_to_the_last_bit():
+    mass = np.array([[2.0, 0.3], [0.3, 1.0]], np.float32)
+    mass[0, 1] = np.nextafter(mass[0, 1], np.float32(1))
+    jac, v = np.eye(2, dtype=np.float32), np.zeros(2, np.float32)
+    made = lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.free(2))
+    assert made.generalized.mass.toarray()[1, 0] == mass[1, 0]
+    with pytest.raises(lv.InputError, match="M is not symmetric"):
+        lv.Problem.from_jacobian(jac, mass.astype(float), v, cones=lv.Cones.free(2))
+    mass[0, 1] = 0.4
+    with pytest.raises(lv.InputError, match="M is not symmetric"):
+        lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.free(2))
+
+
+def test_a_matrix_in_float32_already_has_no_rounding_of_data():
+    a, b = [[2.0, 1.0], [1.0, 2.0]], [1.0, 0.3]
+    single = lv.Problem.lcp(np.float32(a), np.float32(b), precision="float32")
+    impulse = lv.solve(single).impulse
+    assert lv.residual(single, impulse).rounding.data == 0.0
+    other = lv.Problem.lcp(a, b)
+    assert lv.residual(other, impulse, precision="float32").rounding.data > 0.0

@@ -1,0 +1,538 @@
+"""Generalised coordinates: J and M as simulators hold them, against A formed densely and twins that share nothing."""
+
+import copy
+import pickle
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import as_matrix, seeds
+from random_trees import chain, random_general, random_tree, tree_mass
+
+import lavender as lv
+from lavender import registry
+from lavender.problem import generalized as coordinates
+from lavender.solvers.newton import Newton
+from lavender.solvers.newton_systems import general
+from lavender.solvers.sweeping import reads_whitened
+from lavender_ext.generalized.newton import ENDS
+
+# -- the operator ----------------------------------------------------------------------------------
+
+
+def row_by_row(mass, x):
+    """M^-1 x by M = L^T D L, a row after the other."""
+    low, x = np.tril(mass), x.copy()
+    n = len(x)
+    for k in range(n - 1, -1, -1):
+        for a in range(k - 1, -1, -1):
+            f = low[k, a] * (1.0 / low[k, k])
+            low[a, : a + 1] -= f * low[k, : a + 1]
+            low[k, a] = f
+    for k in range(n - 1, -1, -1):
+        x[:k] -= low[k, :k] * x[k]
+    for k in range(n):
+        x[k] *= 1.0 / low[k, k]
+        for a in range(k):
+            x[k] -= low[k, a] * x[a]
+    return x
+
+
+@given(seeds)
+@settings(max_examples=300, deadline=None)
+def test_rows_that_are_eliminated_together_have_the_bits_of_one_after_the_other(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 24))
+    parent = np.arange(n) - 1 if seed % 3 == 0 else random_tree(rng, n)
+    mass = tree_mass(rng, parent) + 0.1 * np.eye(n)  # long chains alone lose definiteness to rounding
+    if seed % 4 == 1 and n > 2:  # fills in
+        mass[n - 1, 0] += 1e-3
+        mass[0, n - 1] += 1e-3
+        mass[0, 0] += 2e-3
+        mass[n - 1, n - 1] += 2e-3
+    x = rng.normal(size=n)
+    general = lv.Generalized(np.ones((1, n)), mass, np.zeros(n))
+    if general.order is None:
+        assert general.solve(x).tobytes() == row_by_row(mass, x).tobytes()
+
+
+def test_the_factor_of_a_tree_hardly_fills_in_whatever_the_order_of_its_velocities(monkeypatch):
+    monkeypatch.setattr(coordinates, "FACTORS", np.inf)  # whatever the search costs
+    rng = np.random.default_rng(1)
+    parent = random_tree(rng, 30)
+    mass = tree_mass(rng, parent)
+    jac = rng.normal(size=(4, 30))
+    general = lv.Generalized(jac, mass, np.zeros(30))
+    assert general.order is None
+    assert general.operator.fill == 0
+    shuffle = rng.permutation(30)
+    mixed = lv.Generalized(jac[:, shuffle], mass[np.ix_(shuffle, shuffle)], np.zeros(30))
+    assert mixed.order is not None
+    assert mixed.operator.work <= 1.25 * general.operator.work  # in the order that was drawn 12 times as much
+    np.testing.assert_allclose(mixed.jac.toarray(), jac[:, shuffle])
+    np.testing.assert_allclose(mixed.mass.toarray(), mass[np.ix_(shuffle, shuffle)])
+    x = rng.normal(size=30)
+    np.testing.assert_allclose(mixed.solve(x[shuffle]), np.linalg.solve(mass, x)[shuffle], rtol=1e-10)
+    assert len(np.unique(mixed.trees)) == sum(p < 0 for p in parent)
+
+
+def test_few_velocities_keep_the_order_given():
+    """A search for another order costs more than all the factors of a robot whose root slides in two directions."""
+    rng = np.random.default_rng(5)
+    mass = np.diag(np.full(9, 3.0))
+    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 8)  # a star whose centre comes last fills in
+    general = lv.Generalized(np.eye(9)[:2], mass, np.zeros(9))
+    assert general.operator.fill > 0
+    assert general.order is None
+    x = rng.normal(size=9)
+    np.testing.assert_allclose(general.solve(x), np.linalg.solve(mass, x), rtol=1e-12)
+
+
+def test_a_mesh_fills_in_but_less_than_as_given():
+    # A grid of 12 x 12 masses coupled to their neighbours, numbered at random.
+    side = 12
+    graph = sp.kron(sp.eye(side), sp.diags([1.0, 1.0], [-1, 1], (side, side))) + sp.kron(
+        sp.diags([1.0, 1.0], [-1, 1], (side, side)), sp.eye(side)
+    )
+    mass = (6.0 * sp.eye(side**2) - graph).toarray()
+    order = np.random.default_rng(0).permutation(side**2)
+    mass = mass[np.ix_(order, order)]
+    general = lv.Generalized(np.eye(side**2)[:3], mass, np.zeros(side**2))
+    assert 0 < general.operator.fill < 3000  # a band of 12 holds 1,700; the numbering given fills 4,000
+    x = np.random.default_rng(1).normal(size=side**2)
+    np.testing.assert_allclose(mass @ general.solve(x), x, atol=1e-12)
+
+
+def test_m_is_refused_where_it_is_no_mass_matrix():
+    jac, good = np.ones((1, 2)), np.array([[2.0, 0.5], [0.5, 1.0]])
+    with pytest.raises(lv.InputError, match=r"not positive definite: the pivot of knee"):
+        lv.Generalized(jac, np.diag([1.0, 0.0]), np.zeros(2), ["hip", "knee"])
+    with pytest.raises(lv.InputError, match="not positive definite"):
+        lv.Generalized(jac, [[1.0, 2.0], [2.0, 1.0]], np.zeros(2))
+    with pytest.raises(
+        lv.InputError, match=r"not symmetric: at \(hip, knee\)|not symmetric: at \(knee, hip\)"
+    ):
+        lv.Generalized(jac, np.triu(good), np.zeros(2), ["hip", "knee"])
+    with pytest.raises(lv.InputError, match="not symmetric"):
+        lv.Generalized(jac, sp.csr_array(np.triu(good)), np.zeros(2))
+    with pytest.raises(lv.InputError, match=r"J has shape \(1, 3\); \(any, 2\) is needed, as M has 2"):
+        lv.Generalized(np.ones((1, 3)), good, np.zeros(2))
+    with pytest.raises(lv.InputError, match="a square matrix"):
+        lv.Generalized(jac, np.ones((2, 3)), np.zeros(2))
+    with pytest.raises(lv.InputError, match="1 names for 2"):
+        lv.Generalized(jac, good, np.zeros(2), ["hip"])
+    with pytest.raises(lv.InputError, match="J has 1 rows; 2 are needed"):
+        lv.Problem.from_jacobian(jac, good, np.zeros(2), cones=lv.Cones.free(2))
+    with pytest.raises(lv.InputError, match="one of them"):
+        lv.Problem(
+            np.zeros(1), lv.Cones.free(1), np.eye(1), generalized=lv.Generalized(jac, good, np.zeros(2))
+        )
+    with pytest.raises(AttributeError, match="frozen"):
+        lv.Generalized(jac, good, np.zeros(2)).v_free = np.ones(2)
+
+
+def test_every_way_to_give_j_and_m_is_one_problem():
+    rng = np.random.default_rng(3)
+    blocks = [tree_mass(rng, [-1, 0, 1]), tree_mass(rng, [-1, 0])]
+    mass = sp.block_diag(blocks).toarray()
+    jac = rng.normal(size=(3, 5)) * (rng.random((3, 5)) < 0.7)
+    v = rng.normal(size=5)
+    problems = [
+        lv.Problem.from_jacobian(j, m, v, cones=lv.Cones.contacts(0.5))
+        for j in (jac, sp.csr_array(jac), sp.coo_matrix(jac))
+        for m in (mass, sp.csc_array(mass), blocks)
+    ]
+    assert all(p == problems[0] for p in problems)
+    assert problems[0].operator == "generalized"
+    assert problems[0] != lv.Problem.from_jacobian(jac, 2.0 * mass, v, cones=lv.Cones.contacts(0.5))
+    for made in (copy.deepcopy(problems[0]), pickle.loads(pickle.dumps(problems[0]))):
+        assert made == problems[0]
+        assert not made.generalized.jac.data.flags.writeable
+
+
+def test_no_velocities_no_rows_and_rows_on_nothing():
+    none = lv.Problem.from_jacobian(np.zeros((0, 3)), np.eye(3), np.ones(3), cones=lv.Cones.free(0))
+    assert lv.solve(none, "newton").success
+    assert np.array_equal(none.velocity([]), np.ones(3))
+    still = lv.Problem.from_jacobian(np.zeros((2, 0)), np.zeros((0, 0)), [], cones=lv.Cones.free(2))
+    assert lv.solve(still, "newton").success
+    jac = np.array([[1.0, 0.0], [0.0, 0.0]])
+    bounds = lv.Cones.bounded(np.zeros(2), np.full(2, 4.0))
+    empty = lv.Problem.from_jacobian(jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=bounds)
+    solution = lv.solve(empty, "newton", tol=1e-12)
+    np.testing.assert_allclose(solution.impulse, [1.0, 4.0])  # the row on nothing: decided on the spot
+    hopeless = lv.Problem.from_jacobian(
+        jac, np.eye(2), [-1.0, 0.0], target=[0.0, 1.0], cones=lv.Cones.free(2)
+    )
+    assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
+
+
+# -- cones that are easy to build -------------------------------------------------------------------
+
+
+def test_cones_add_up():
+    cones = lv.Cones.free(6) + lv.Cones.bounded([0.0, -1.0], [1.0, 1.0]) + lv.Cones.contacts(0.5, 2, count=8)
+    assert (cones.n_rows, cones.n_blocks) == (6 + 2 + 24, 6 + 2 + 8)
+    assert np.array_equal(cones.mu[8:], np.full(8, 0.5))
+    # What was put together passes the door of what is made whole.
+    assert lv.Cones(cones.ptr, cones.kind, cones.lower, cones.upper, cones.mu, cones.patch_radius) == cones
+    assert not cones.ptr.flags.writeable
+    assert lv.Cones.contacts(0.5).n_blocks == 1
+    assert lv.Cones.contacts([0.5, 0.6], patch_radius=0.1).n_rows == 8
+    assert lv.Cones.contacts(0.5, 5, count=2).kind.tolist() == [lv.ROUND] * 2
+    assert lv.Cones.free(0) + lv.Cones.free(1) == lv.Cones.free(1)
+
+
+# -- newton over velocities -------------------------------------------------------------------------
+
+
+@settings(deadline=None)
+@given(seed=seeds)
+@pytest.mark.parametrize("soft", [True, False])
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_newton_over_velocities_reaches_the_floor_or_tol(friction, soft, seed):
+    problem = random_general(seed, friction, compliance=soft)
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
+    if soft or friction == "cone":
+        assert solution.residual.relative <= max(1e-10, 2 * solution.residual.floor), str(solution)
+    assert not solution.contradicted
+    assert "csr" not in problem.__dict__  # A was not formed
+    assert solution.solver.form == "generalized velocities"
+
+
+@pytest.mark.parametrize("kind", ["linear", "lcp"])
+def test_bounded_rows_and_equations_need_few_steps(kind):
+    rng = np.random.default_rng(4)
+    parent = random_tree(rng, 20)
+    m = 40 if kind == "lcp" else 12
+    jac = np.zeros((m, 20))
+    for row in jac:
+        on = chain(parent, int(rng.integers(0, 20)))
+        row[on] = rng.normal(size=len(on))
+    cones = lv.Cones.free(m) if kind == "linear" else lv.Cones.bounded(np.zeros(m), np.full(m, np.inf))
+    problem = lv.Problem.from_jacobian(
+        jac, tree_mass(rng, parent), rng.normal(size=20), cones=cones, compliance=0.05
+    )
+    assert problem.law == kind
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    assert solution.residual.relative <= max(1e-12, 2 * solution.residual.floor)
+    assert solution.iterations <= (3 if kind == "linear" else 15)  # measured: 2 and 6
+    again = lv.solve(problem, "newton", tol=1e-12, impulse=solution.impulse)
+    assert again.iterations == 0
+
+
+def test_slow_steps_are_few_between_two_looks_and_end_where_many_do(monkeypatch):
+    """Ctrl-C is seen between two calls of the kernel: a call is counted for WATCHED at most, by structure alone."""
+    problem = random_general(21, "cone", n=30, contacts=12)
+    whole = lv.solve(problem, "newton", tol=1e-10, form="velocity")
+    asked = []
+
+    class Spy:
+        def __init__(self, kernel):
+            self.kernel, self.islands, self.largest = kernel, kernel.islands, kernel.largest
+
+        def run(self, impulse, tol, steps, *rest):
+            asked.append(steps)
+            return self.kernel.run(impulse, tol, steps, *rest)
+
+    monkeypatch.setattr(general, "WATCHED", 0.0)
+    impulse = problem.start()
+    claim = general.run(problem, Spy(general.prepare(problem)), impulse, 100, 1e-10, None)
+    assert set(asked) == {1} and len(asked) == claim.iterations
+    assert claim.status is lv.Status.CONVERGED
+    assert claim.work == whole.work and np.array_equal(impulse, whole.impulse)
+
+
+@pytest.mark.parametrize("tangents", [3, 4, 5])
+def test_a_round_cone_is_one_cone(tangents):
+    problem = random_general(13, "cone", tangents=tangents)
+    solution = lv.solve(problem, "newton", tol=1e-11)
+    assert solution.residual.relative <= max(1e-11, 2 * solution.residual.floor)
+    lam, w, c = solution.impulse, solution.slack, problem.cones
+    for i in np.flatnonzero(c.kind == lv.ROUND):
+        j, end = c.ptr[i], c.ptr[i + 1]
+        # In the cone, in its dual, and at right angles: what (de)fines the solution, without any metric.
+        assert np.linalg.norm(lam[j + 1 : end]) <= c.mu[i] * lam[j] * (1 + 1e-8) + 1e-9
+        assert c.mu[i] * np.linalg.norm(w[j + 1 : end]) <= w[j] * (1 + 1e-8) + 1e-9
+        assert abs(lam[j:end] @ w[j:end]) < 1e-8
+    assert problem.row_name(int(c.ptr[4]) + 3).endswith("spin")
+    with pytest.raises(lv.InputError, match="no Coulomb law"):
+        problem.relaxed("coulomb")
+    takes = {name for name, spec in registry.specs().items() if spec.round_cones}
+    assert {"newton", "block_gauss_seidel", "nncg", "admm", "clarabel_cone"} <= takes
+    for name, reason in lv.known(problem).items():
+        if "cone" in registry.specs()[name].laws and name not in takes:
+            assert reason and ("round cones" in reason or "pip install" in reason)
+
+
+# -- many at once -------------------------------------------------------------------------------------
+
+
+def test_many_start_where_they_are_told():
+    problem = random_general(4, "cone")
+    cold = lv.solve(problem, tol=1e-9)
+    warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
+    assert warm[0].iterations == 0
+    assert warm[1].iterations > 0
+    with pytest.raises(lv.InputError, match="one Problem; a list"):
+        lv.solve_many(problem)
+    with pytest.raises(lv.InputError, match="1 impulses for 2"):
+        lv.solve_many([problem, problem], impulses=[None])
+    with pytest.raises(lv.InputError, match="threads is 0"):
+        lv.solve_many([problem], threads=0)
+    with pytest.raises(lv.UnknownName):
+        lv.solve_many([problem], "pgss")
+    with pytest.raises(lv.InputError):
+        lv.solve_many([3])
+    assert len(lv.solve_many([])) == 0
+
+
+def test_updated_is_the_same_structure_with_new_numbers():
+    problem = random_general(9, "cone")
+    general = problem.generalized
+    rng = np.random.default_rng(0)
+    jac, v = general.jac.toarray() * 1.1, rng.normal(size=general.nv)
+    new = problem.updated(J=jac, M=2.0 * general.mass.toarray(), v_free=v, target=0.1)
+    made = lv.Problem.from_jacobian(jac, 2.0 * general.mass.toarray(), v, target=0.1, cones=problem.cones,
+                                    compliance=problem.compliance, friction="cone", name=problem.name)  # fmt: skip
+    assert new == made
+    assert problem.updated(b=2.0 * problem.b).b[0] == 2.0 * problem.b[0]
+    assert problem.updated(b=problem.b) == problem
+    with pytest.raises(lv.InputError, match="give target or b"):
+        problem.updated(J=jac)
+    with pytest.raises(lv.InputError, match="not both"):
+        problem.updated(b=problem.b, target=0.0)
+    with pytest.raises(lv.InputError, match="generalised coordinates"):
+        as_matrix(problem).updated(v_free=v, target=0.0)
+    with pytest.raises(lv.InputError, match="J has shape"):
+        problem.updated(J=jac[:, 1:], target=0.0)
+
+
+def test_nothing_of_the_judge_forms_a():
+    problem = random_general(6, "cone")
+    solution = lv.solve(problem, tol=1e-8)
+    lv.residual(problem, solution.impulse)
+    problem.velocity(solution.impulse)
+    assert "csr_data" not in problem.__dict__
+    assert "_compressed" not in problem.__dict__
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone", "lcp"])
+@settings(max_examples=15)
+def test_branches_are_factored_in_their_own_pattern(friction, seed):
+    """Large trees, some contacts between branches: few entries in a row of N, the solution of A."""
+    contacts = 0 if friction == "lcp" else 6
+    problem = random_general(seed, "cone" if friction == "lcp" else friction, n=200, contacts=contacts)
+    kernel = general.prepare(problem)
+    trees = np.bincount(problem.generalized.trees)
+    if friction != "coulomb":  # whose matrix lacks symmetry and is kept whole
+        assert kernel.largest <= max(40, trees.max() // 2)
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-11)
+    assert solution.residual.relative <= 1e-11 or solution.residual.at_floor
+    other = lv.solve(as_matrix(problem), "newton", tol=1e-11)
+    # Every row is soft by 0.01 / kg or more, so residuals of 1e-11 are impulses of 1e-8 of their size.
+    if friction != "coulomb":
+        np.testing.assert_allclose(
+            solution.impulse, other.impulse, atol=1e-7 * (1 + np.abs(other.impulse).max())
+        )
+
+
+@given(seed=seeds, steps=st.integers(1, 12))
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@settings(max_examples=15)
+def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(friction, seed, steps):
+    """Cut anywhere, in one of several islands: the same impulse and counts."""
+    problem = random_general(seed, friction, n=24, compliance=False)
+    whole, cut = problem.start(), problem.start()
+    end, counts = general.prepare(problem).run(whole, 1e-9, 90)
+    kernel, done, now, again = general.prepare(problem), np.zeros(4, int), ENDS["spent"], False
+    while now == ENDS["spent"] and done[0] < 90:
+        now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), again)
+        done, again = done + more, kernel.waits
+    assert (now, tuple(done)) == (end, counts)
+    assert kernel.waits == (end == ENDS["spent"])
+    np.testing.assert_array_equal(cut, whole)
+
+
+def test_newton_that_waits_begins_anew_unless_it_is_told_to_go_on():
+    problem = random_general(3, "coulomb", n=24, compliance=False)
+    kernel, fresh = general.prepare(problem), problem.start()
+    end, counts = kernel.run(fresh, 1e-9, 5)
+    assert end == ENDS["spent"] and kernel.waits
+    other = problem.start()
+    assert kernel.run(other, 1e-9, 5) == (end, counts)
+    np.testing.assert_array_equal(other, fresh)
+
+
+def test_a_look_at_j_changes_nothing_that_kernels_read():
+    """Velocities in an order of the factor's own: J is given back in the order given, of a copy."""
+    rng = np.random.default_rng(0)
+    mass = np.diag(np.full(120, 30.0))
+    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 119)  # a star whose centre comes last fills in
+    jac = rng.normal(size=(4, 120))
+    problem = lv.Problem.from_jacobian(
+        jac, mass, rng.normal(size=120), cones=lv.Cones.free(4), compliance=0.1
+    )
+    assert problem.generalized.order is not None
+    lam = rng.normal(size=4)
+    before = problem.slack(lam)
+    np.testing.assert_array_equal(problem.jacobian.toarray(), jac)
+    np.testing.assert_array_equal(problem.slack(lam), before)
+
+
+def cloth(side, seed, friction="cone"):
+    """Masses on a square grid, each of one velocity, stiff rows between neighbours, contacts of three rows."""
+    rng = np.random.default_rng(seed)
+    n = side * side
+    number = rng.permutation(n).reshape(side, side)  # in no order that anybody meant
+    pairs = np.concatenate([np.stack([number[1:], number[:-1]], -1).reshape(-1, 2),
+                            np.stack([number[:, 1:], number[:, :-1]], -1).reshape(-1, 2)])  # fmt: skip
+    jac = sp.lil_array((len(pairs) + 3 * side, n))
+    for i, (a, b) in enumerate(pairs):
+        jac[i, a], jac[i, b] = 1.0, -1.0
+    for i in range(3 * side):
+        jac[len(pairs) + i, number[i // 3, i % 3]] = 1.0
+    cones = lv.Cones.bounded(np.full(len(pairs), -np.inf), np.full(len(pairs), np.inf))
+    return lv.Problem.from_jacobian(
+        jac.tocsr(), sp.diags_array(rng.uniform(0.5, 2.0, n)), rng.normal(size=n),
+        cones=cones + lv.Cones.contacts(0.5, 2, count=side), compliance=0.2, friction=friction,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_many_small_trees_are_put_in_an_order_that_fills_in_little(seed):
+    problem = cloth(24, seed)
+    assert problem.generalized.order is not None
+    # Its factor costs what a dense one of 96 velocities costs; in the order that was drawn, one of 430.
+    assert general.prepare(problem).largest <= 120
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-10)
+    assert solution.success
+    other = lv.solve(problem, "newton", form="impulse", tol=1e-10)
+    np.testing.assert_allclose(solution.impulse, other.impulse, atol=1e-7)
+    v = problem.velocity(solution.impulse)
+    given = problem.generalized
+    np.testing.assert_allclose(
+        given.mass @ (v - given.v_free), problem.jacobian.T @ solution.impulse, atol=1e-11
+    )
+
+
+def test_room_for_a_pattern_grows():
+    """More entries in a row than there is room for at first, of more columns than are kept dense for that."""
+    problem = cloth(50, 0)
+    kernel = general.prepare(problem)
+    assert kernel.fits and kernel.largest < 200
+    assert lv.solve(problem, "newton", form="velocity", tol=1e-9).success
+    assert lv.solve_many([problem], tol=1e-6)[0].success
+
+
+def test_an_island_too_large_for_a_dense_matrix_goes_over_the_rows(monkeypatch):
+    monkeypatch.setattr(general, "ROOM", 30.0)  # five velocities, dense
+    problem = random_general(6, "cone")
+    solver, impulse = Newton(), problem.start().copy()  # behind the small call, which has room of its own
+    claim = solver.run(solver.prepare(problem), impulse, 100, 1e-8)
+    assert claim.form == "impulse" and lv.residual(problem, impulse).relative <= 1e-8
+    with pytest.raises(lv.CapabilityError, match="room for a matrix of"):
+        lv.solve(random_general(6, "cone"), "newton", form="velocity")
+    small = lv.Problem.from_jacobian([[1.0]], [[2.0]], [-1.0], cones=lv.Cones.contacts(0.0, 0))
+    assert [s.success for s in lv.solve_many([random_general(6, "cone"), small])] == [True, True]
+
+
+# -- sweeps ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "nncg", "anderson"])
+@given(seed=seeds, friction=st.sampled_from(["cone", "coulomb"]), spin=st.booleans(), few=st.booleans())
+@settings(max_examples=8)
+def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
+    """Many rows on few velocities are swept over Y, few rows on many over A: the same iterates to rounding."""
+    problem = random_general(seed, friction, n=30 if few else 6, contacts=2 if few else 6, spin=spin)
+    if lv.known(problem)[name]:
+        assert name == "pgs" and problem.law == "cone"
+        return
+    one = lv.solve(problem, name, tol=0.0, max_iter=12)
+    same = lv.solve(as_matrix(problem), name, tol=0.0, max_iter=12)
+    scale = 1.0 + np.abs(same.impulse).max()
+    # Sums in another order: 1e-13 of their terms, and a factor of a few on each of a dozen sweeps.
+    np.testing.assert_allclose(one.impulse, same.impulse, atol=1e-7 * scale)
+    assert ("whitened J" in one.solver.form) == reads_whitened(problem)
+    found = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
+    assert found.success or found.status is not lv.Status.CONVERGED
+
+
+@given(seed=seeds)
+def test_what_a_sweep_costs_is_counted_without_forming_a(seed):
+    problem = random_general(seed, "cone", n=int(np.random.default_rng(seed).integers(4, 90)), contacts=4)
+    entries = problem.metric.entries_of_a
+    y = problem.metric.work - 4 * problem.m
+    assert "csr" not in problem.__dict__
+    whitened = problem.whitened
+    assert y >= 2 * whitened.nnz  # zeros inside a panel are stored
+    touched = (np.abs(whitened) @ np.abs(whitened).T).nnz
+    assert touched <= entries <= touched * max(1, int(problem.generalized.trees.max()) + 1)
+    assert reads_whitened(problem) == (y < entries)
+
+
+def test_many_columns_and_few_have_the_same_panels():
+    """Sets of columns as bits up to 64 velocities, as lists beyond: a chain of 64 and the same beside one more."""
+    small = random_general(5, "cone", n=64)
+    jac = sp.hstack([small.jacobian, sp.csr_array((small.m, 1))])
+    mass = sp.block_diag([small.generalized.mass, [[1.0]]])
+    large = lv.Problem.from_jacobian(
+        sp.csr_array(jac), sp.csr_array(mass), np.append(small.generalized.v_free, 0.0), cones=small.cones,
+        compliance=small.compliance, friction="cone",
+    )  # fmt: skip
+    np.testing.assert_array_equal(small.d, large.d)
+    np.testing.assert_array_equal(small.whitened.toarray(), large.whitened.toarray()[:, :-1])
+
+
+def test_many_rows_on_many_trees_are_ordered_whoever_else_holds_the_pattern():
+    """Several entries of a row on one tree are summed, in a copy: J's own arrays are frozen."""
+    rng = np.random.default_rng(0)
+    nv, contacts = 400, 400
+    parent = np.arange(-1, nv - 1)
+    parent[:: nv // 30] = -1  # chains
+    jac = np.zeros((3 * contacts, nv))
+    for first in range(0, 3 * contacts, 3):
+        for end in rng.integers(0, nv, 2):
+            for i in range(int(end), max(int(end) - 6, -1), -1):
+                jac[first : first + 3, i] = rng.normal(size=3)
+                if parent[i] < 0:
+                    break
+    mass = sp.diags_array(
+        [np.full(nv - 1, 0.1), np.full(nv, 2.0), np.full(nv - 1, 0.1)], offsets=[-1, 0, 1]
+    ).tolil()
+    for i in np.flatnonzero(parent < 0):
+        if i:
+            mass[i, i - 1] = mass[i - 1, i] = 0.0
+    problem = lv.Problem.from_jacobian(
+        jac, sp.csr_array(mass), rng.normal(size=nv), cones=lv.Cones.contacts(np.full(contacts, 0.5), 2),
+        friction="coulomb",
+    )  # fmt: skip
+    assert problem.generalized is not None
+    assert np.isfinite(lv.solve(problem, tol=1e-3, max_iter=50).residual.relative)
+
+
+@given(seed=seeds, same=st.sampled_from(["tree", "size", "nothing"]))
+def test_the_pattern_of_a_factor_serves_again_where_it_is_the_same_and_nowhere_else(seed, same):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 12))
+    tree = random_tree(rng, n)
+    other = tree if same == "tree" else random_tree(rng, n if same == "size" else n + 1)
+
+    def made(parent, like=None):
+        lower = sp.csr_array(np.tril(tree_mass(rng, parent)))
+        mass = lower.indptr.astype(np.int32), lower.indices.astype(np.int32), lower.data
+        jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
+        return mass, lv.Generalized.compressed(jac, mass, np.zeros(len(parent)), like=like)
+
+    _, before = made(other)
+    mass, shared = made(tree, before.operator)
+    jac = np.zeros(1, np.int32), np.zeros(0, np.int32), np.zeros(0)
+    alone = lv.Generalized.compressed(jac, mass, np.zeros(n))
+    x = rng.normal(size=n)
+    assert np.array_equal(shared.solve(x), alone.solve(x))
+    assert np.array_equal(shared.operator.parents, alone.operator.parents)
+    assert (shared.operator.fill, shared.operator.work) == (alone.operator.fill, alone.operator.work)

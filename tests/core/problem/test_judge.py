@@ -1,0 +1,459 @@
+"""The judge against a NumPy twin that shares nothing with it, and the laws its numbers must obey."""
+
+import dataclasses
+
+import judge_twin
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from judge_twin import spec_of
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_trees import random_general
+
+import lavender as lv
+from lavender.judge import residuals
+from lavender.judge.certificates import check_certificate
+from lavender.judge.measures import natural_map, qp_residual
+from lavender.judge.residuals import judged, known, remember
+
+# -- the twin --------------------------------------------------------------------------------------
+
+
+def equals_the_twin(problem, lam):
+    """Everything the judge says of an impulse, and what it is made of; 1e-9: M and its inverse, roots of many terms."""
+    twin, found = judge_twin.Problem(spec_of(problem)), lv.residual(problem, lam)
+    close = 1e-9 if problem.operator == "generalized" else 1e-12
+    np.testing.assert_allclose(problem.disk.d, twin.d.astype(float), rtol=close)
+    np.testing.assert_allclose(problem.disk.metric.nu, twin.nu.astype(float), rtol=close)
+    x = lam / twin.stretch
+    w = twin.slack(x)
+    e, size = twin.error(x, w), (twin.size @ np.abs(x) + twin.b_size).astype(float)
+    np.testing.assert_allclose(found.slack * twin.stretch, w, rtol=0, atol=close * size.max())
+    np.testing.assert_allclose(found.error, twin.stretch * e, rtol=0, atol=1e-10 * np.abs(e).max())
+    said = twin.judge(lam)
+    np.testing.assert_allclose([found.energy, found.velocity], [said.energy, said.velocity], rtol=1e-9)
+    speeds = twin.speeds(e)
+    assert speeds[found.worst_row] == pytest.approx(float(speeds.max()), rel=1e-9)
+    for impulse in (lam, lv.solve(problem, tol=1e-9).impulse):
+        found, said = lv.residual(problem, impulse), twin.judge(impulse)
+        assert abs(found.relative - said.relative) <= 1e-9 * said.relative + said.allowed
+        # The floor takes absolute products of three factors; sizes of arms stand for those of their products here.
+        assert 0.1 * found.floor <= said.floor <= 100.0 * found.floor
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("kind", CONTACTS)
+@settings(max_examples=10)
+@given(seed=seeds)
+def test_the_judge_equals_its_twin_in_every_form(kind, friction, seed):
+    base = CONTACTS[kind](seed, friction)
+    lam = np.random.default_rng(seed + 1).normal(size=base.m)
+    for given_by in FORMS.values():
+        equals_the_twin(given_by(base), lam)
+
+
+@settings(max_examples=20)
+@given(seed=seeds, tangents=st.integers(1, 5), soft=st.booleans())
+def test_the_judge_equals_its_twin_on_round_cones(seed, tangents, soft):
+    problem = random_general(seed, "cone", tangents=tangents, compliance=soft)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    for p in (problem, as_matrix(problem)):
+        equals_the_twin(p, lam)
+
+
+@given(seed=seeds, kind=st.sampled_from(sorted(CONTACTS)))
+def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
+    problem = CONTACTS[kind](seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    jac, minv = problem.jacobian.toarray(), problem.rows.inverse_mass_matrix().toarray()
+    a = jac @ minv @ jac.T + np.diag(problem.compliance)
+    free = problem.rows.v_free.ravel()
+    # 1e-13 of the size of what is added: a few roundings on a few dozen terms, of J and M those of M and its inverse.
+    for form, given_by in FORMS.items():
+        p, atol = given_by(problem), 1e-11 if form == "J and M" else 1e-13
+        np.testing.assert_allclose(
+            p.slack(lam), a @ lam - p.b, atol=atol * np.abs(a).sum() * np.abs(lam).max()
+        )
+        np.testing.assert_allclose(p.dense(), a, atol=atol * np.abs(a).max())
+        assert p.csr.has_canonical_format
+        np.testing.assert_array_equal(p.dense(), p.dense().T)
+        if form != "matrix":
+            np.testing.assert_allclose(p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol)
+
+
+# -- zero at solutions made by hand ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("spin", [False, True])
+def test_zero_at_a_solution_made_by_hand(friction, spin):
+    """Choose lambda and a matching slack for open, sticking and sliding contacts; b follows."""
+    rng = np.random.default_rng(5)
+    size = 3 + spin
+    mu, r = np.array([0.5, 0.5, 0.8]), np.array([0.3, 0.3, 0.2])
+    m = 3 * size
+    g = rng.normal(size=(m, m))
+    a = g @ g.T
+    lam, w = np.zeros((3, size)), np.zeros((3, size))
+    w[0, 0] = 0.7  # open: lambda = 0, separating
+    if friction == "cone":
+        w[0, 0] = 10.0  # deep inside the dual cone, so that tangential velocity asks nothing
+    w[0, 1:3] = 0.1, -0.2
+    lam[1, 0], lam[1, 1:3] = 2.0, (0.3, 0.1)  # sticking, inside the disk
+    lam[2, 0] = 1.5  # sliding: tangent impulse opposite to slip, on the disk
+    slip = np.array([0.6, -0.8])
+    lam[2, 1:3] = -mu[2] * 1.5 * slip
+    w[2, 1:3] = 0.9 * slip
+    if friction == "cone":
+        w[2, 0] = mu[2] * 0.9  # the relaxation lifts a slider by mu |slip|
+    if spin:
+        lam[1, 3] = 0.01
+        lam[2, 3], w[2, 3] = mu[2] * r[2] * 1.5, -0.4
+        if friction == "cone":
+            w[2, 0] += mu[2] * r[2] * 0.4
+    b = a @ lam.ravel() - w.ravel()
+    problem = lv.Problem.contact(a, b, mu, patch_radius=r if spin else None, friction=friction)
+    judged = lv.residual(problem, lam.ravel())
+    # b is rounded once when it is formed, w once more: the floor says what that costs.
+    assert judged.relative <= 4 * judged.floor
+
+
+def test_zero_at_bounds_of_boxed_rows():
+    a = np.diag([2.0, 2.0, 2.0, 2.0])
+    problem = lv.Problem.lcp(a, [-1.0, 1.0, 9.0, -9.0], lower=[0, 0, -1, -1], upper=[np.inf, np.inf, 1, 1])
+    assert lv.residual(problem, [0.0, 0.5, 1.0, -1.0]).relative == 0.0
+
+
+# -- invariance ----------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+def test_scaling_single_rows_leaves_the_energy_ratio_alone(seed):
+    """Row i in its own unit: A -> S A S, b -> S b, lambda -> lambda / S."""
+    problem = random_lcp(seed, boxed=True)
+    rng = np.random.default_rng(seed)
+    lam, s = rng.normal(size=problem.m), 10.0 ** rng.uniform(-3, 3, problem.m)
+    c = problem.cones
+    scaled = lv.Problem.lcp(s[:, None] * problem.matrix * s, s * problem.b, c.lower / s, c.upper / s)
+    x, y = lv.residual(problem, lam), lv.residual(scaled, lam / s)
+    np.testing.assert_allclose(y.energy / y.energy_start, x.energy / x.energy_start, rtol=1e-11)
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_rotating_the_tangent_frame_changes_nothing(friction, seed):
+    problem = random_contact_problem(seed, friction, tangents=2, joints=0)
+    rng = np.random.default_rng(seed)
+    lam = rng.normal(size=problem.m)
+    turn = np.eye(problem.m)
+    for i in range(problem.n_blocks):
+        j, angle = problem.cones.ptr[i], rng.uniform(0, 2 * np.pi)
+        turn[j + 1 : j + 3, j + 1 : j + 3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    a = turn @ problem.dense() @ turn.T
+    turned = lv.Problem(turn @ problem.b, problem.cones, a, friction=friction)
+    x, y = lv.residual(as_matrix(problem), lam), lv.residual(turned, turn @ lam)
+    np.testing.assert_allclose(
+        [y.relative, y.energy, y.velocity], [x.relative, x.energy, x.velocity], rtol=1e-11
+    )
+
+
+def test_a_thousand_separating_rows_dilute_nothing():
+    problem = random_lcp(7, boxed=False)
+    lam = np.random.default_rng(1).uniform(size=problem.m)
+    m, n = problem.m, 1000
+    a = np.eye(m + n)
+    a[:m, :m] = problem.matrix
+    padded = lv.Problem.lcp(a, np.concatenate([problem.b, np.full(n, -5.0)]))
+    x, y = lv.residual(problem, lam), lv.residual(padded, np.concatenate([lam, np.zeros(n)]))
+    assert (x.relative, x.energy, x.velocity) == (y.relative, y.energy, y.velocity)
+
+
+def test_mass_ratio_hides_neither_the_light_nor_the_heavy_body():
+    """Two resting bodies, 1 kg and 1e6 kg; one of them ignored: its error is as large as doing nothing."""
+    a, b = np.diag([1.0, 1e-6]), np.array([0.1, 0.1])
+    problem = lv.Problem.lcp(a, b)
+    exact = np.array([0.1, 1e5])
+    assert lv.residual(problem, exact).relative <= lv.residual(problem, exact).floor
+    light_wrong, heavy_wrong = exact * [0.0, 1.0], exact * [1.0, 0.0]
+    light, heavy = lv.residual(problem, light_wrong), lv.residual(problem, heavy_wrong)
+    assert light.relative == pytest.approx(1.0)  # V sees it, E alone would say 1e-3
+    assert light.energy / light.energy_start < 2e-3
+    assert heavy.relative == pytest.approx(1.0)
+    assert (light.worst_row, heavy.worst_row) == (0, 1)
+
+
+# -- diagonals, b = 0, floor ---------------------------------------------------------------------------
+
+
+def test_diagonal_falls_back_where_it_must():
+    a = np.array([[0.0, 3.0, 0.0], [3.0, -1.0, 0.0], [0.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(lv.Problem.lcp(a, np.zeros(3)).d, [3.0, 3.0, 3.0])
+    tiny = np.array([[1e-12, 1.0], [1.0, 2.0]])
+    np.testing.assert_array_equal(lv.Problem.lcp(tiny, np.zeros(2)).d, [1.0, 2.0])
+    np.testing.assert_array_equal(lv.Problem.lcp(np.zeros((2, 2)), np.zeros(2)).d, [1.0, 1.0])
+    pair = lv.Problem.contact(np.diag([1.0, 1.0, 10.0]), np.zeros(3), [0.5])
+    np.testing.assert_array_equal(pair.d, [1.0, 5.5, 5.5])
+
+
+def test_nothing_to_do_and_nothing_done_is_no_error():
+    problem = lv.Problem.lcp(np.eye(3), np.zeros(3))
+    assert lv.residual(problem, np.zeros(3)).relative == 0.0
+    assert lv.residual(problem, np.ones(3)).relative == np.inf
+    # Doing nothing solves this one: the norms of b stand in.
+    resting = lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -3.0])
+    assert lv.residual(resting, np.zeros(3)).relative == 0.0
+    assert lv.residual(resting, [1e-3, 0.0, 0.0]).relative == pytest.approx(1e-3 / 3.0)
+    empty = lv.Problem.lcp(np.zeros((0, 0)), [])
+    assert lv.residual(empty, []).relative == 0.0
+
+
+def test_lost_iterates_are_seen():
+    for friction in ("coulomb", "cone"):
+        problem = random_contact_problem(1, friction)
+        for bad in (np.nan, np.inf, -np.inf):
+            for row in range(problem.m):
+                lam = np.zeros(problem.m)
+                lam[row] = bad
+                assert lv.residual(problem, lam).relative == np.inf, (friction, bad, row)
+
+
+@given(seed=seeds)
+def test_floor_bounds_the_rounded_exact_solution(seed):
+    """A solution in long double, rounded to float64, scores at most twice the floor, and not far below it."""
+    rng = np.random.default_rng(seed)
+    m = 12
+    scale = 10.0 ** rng.uniform(-3, 3, m)
+    g = rng.normal(size=(m, m)) * scale[:, None]
+    a = np.round(g @ g.T, 12)
+    a = (a + a.T) / 2 + np.diag(scale**2)
+    b = rng.normal(size=m) * scale
+    x = np.linalg.solve(a, b)
+    la, lb, exact = a.astype(np.longdouble), b.astype(np.longdouble), x.astype(np.longdouble)
+    for _ in range(20):  # refinement: each step gains the digits of the float64 factorisation
+        exact += np.linalg.solve(a, (lb - la @ exact).astype(float))
+    judged = lv.residual(lv.Problem.linear(a, b), exact.astype(float))
+    assert judged.relative <= 2.0 * judged.floor
+    assert judged.floor <= 1e-6
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@given(seed=seeds)
+def test_floor_bounds_the_rounded_slider_between_tangents_of_unlike_mass(friction, seed):
+    """It slides along the light one: A lambda says nothing of the impulse's own rounding, which d makes a velocity."""
+    rng = np.random.default_rng(seed)
+    normal, light, mu, b = rng.uniform(0.5, 2.0, 4).astype(np.longdouble)
+    d = np.diag([normal, 10.0 ** rng.uniform(0.0, 12.0), light]).astype(float)
+    push = 4.0 * mu * b * light / normal  # four times what the contact holds
+    x = b / normal if friction == "coulomb" else (b + mu * push) / (normal + mu * mu * light)
+    problem = lv.Problem.contact(d, np.array([b, 0.0, push], float), [float(mu)], friction=friction)
+    exact = np.array([x, 0.0, mu * x], float)
+    judged = lv.residual(problem, exact)
+    # A disk: both lambda_t and mu lambda_n are rounded. The projection on a cone rounds in five more operations.
+    assert judged.relative <= (2.0 if friction == "coulomb" else 7.0) * judged.floor
+    if friction == "coulomb":  # a wide cone's nearest point follows the tangents
+        off = lv.residual(problem, exact * [1.0, 1.0, 1.0 + 2.0**-46])  # by 64 units of the last place
+        assert off.relative > 2.0 * off.floor
+
+
+# -- other measures --------------------------------------------------------------------------------------
+
+
+def test_qp_residual_checks_the_sign_of_multipliers():
+    """min x^2 with x <= 1 and the multiplier -2: every residual but the sign is zero at the wrong point x = 1."""
+    problem = lv.Problem.lcp([[2.0]], [0.0], lower=-np.inf, upper=1.0)
+    wrong = qp_residual(problem, [1.0], [-2.0])
+    assert (wrong.primal, wrong.dual) == (0.0, 0.0)
+    assert wrong.sign == 2.0
+    assert qp_residual(problem, [0.0], [0.0]).worst == 0.0
+
+
+@given(seed=seeds)
+def test_natural_map_is_the_plain_formula(seed):
+    problem = random_lcp(seed)
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    c, w = problem.cones, problem.matrix @ lam - problem.b
+    expected = np.linalg.norm(lam - np.clip(lam - w, c.lower, c.upper))
+    np.testing.assert_allclose(natural_map(problem, lam), expected, rtol=1e-13)
+
+
+def test_certificates_are_checked():
+    a = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    infeasible = lv.Problem.lcp(a, [1.0, 1.0])
+    assert check_certificate(infeasible, [1.0, 1.0]) is None
+    assert "not positive" in check_certificate(infeasible, [-1.0, -1.0])
+    assert "above rounding" in check_certificate(infeasible, [1.0, 0.5])
+    assert check_certificate(lv.Problem.lcp(a, [1.0, -2.0]), [1.0, 1.0]) is not None
+    free = lv.Problem.linear(a, [1.0, 1.0])
+    assert check_certificate(free, [1.0, 1.0]) is None
+    boxed = lv.Problem.lcp(a, [1.0, 1.0], upper=5.0)
+    assert "leaves the bounds" in check_certificate(boxed, [1.0, 1.0])
+
+
+def test_a_sum_that_rounds_to_zero_proves_nothing():
+    """A^T y is (0, 0, -2^-53), which impulses of 3e7 N s meet to 1e-9; exact zeros are a proof at the same b.y."""
+    y, b = [1.0, 1.0, -1.0], np.array([1.0, 0.0, 1.0 - 3e-9])
+    for small, proves in ((2.0**-53, False), (0.0, True)):
+        a = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, small], [1.0, 1.0, 1.0]])
+        for upper in (np.inf, 1e12):
+            problem = lv.Problem.lcp(a, b, lower=-np.inf, upper=[np.inf, np.inf, upper])
+            assert (check_certificate(problem, y) is None) is proves
+        met = np.array([1.0 - 3e-9 * 2.0**53, -3e-9, 3e-9 * 2.0**53])
+        if not proves:
+            assert lv.residual(problem, met).relative < 2e-9
+    for jac, proves in (([[1.0], [-1.0]], True), ([[1.0], [2.0**-30 - 1.0]], False)):
+        cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-10]
+        opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
+        assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
+
+
+def test_certificates_hold_for_any_matrix_and_every_law():
+    # A^T y = 0 and y.w >= 0 on every row: nothing about symmetry, definiteness or friction is needed.
+    a = np.array([[0.0, 0.0, 0.0], [3.0, 1.0, -2.0], [1.0, 4.0, 1.0]])
+    b, y = [1.0, 2.0, -1.0], [1.0, 0.0, 0.0]
+    assert check_certificate(lv.Problem.lcp(a, b, [0.0, -1.0, -2.0], [np.inf, 1.0, 5.0]), y) is None
+    assert check_certificate(lv.Problem.contact(a, b, [0.5]), y) is None
+    assert check_certificate(lv.Problem.contact(a, b, [0.5], friction="cone"), y) is None
+    # z = A^T y may pull towards finite bounds, or into the polar cone: then what they give counts.
+    box = [np.array([[-1.0, 1.0], [0.0, 1.0]]), [2.0, 1.0], 0.0]
+    assert check_certificate(lv.Problem.lcp(*box, [np.inf, 1.5]), [1.0, 0.0]) is None
+    assert "can meet" in check_certificate(lv.Problem.lcp(*box, [np.inf, 2.5]), [1.0, 0.0])
+    slope = np.array([[-1.0, 0.6], [0.0, 1.0]])
+    assert check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [1.5]), [1.0, 0.0]) is None
+    assert "can meet" in check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [2.0]), [1.0, 0.0])
+
+
+def test_a_certificate_along_a_tangent_proves_nothing_under_coulomb():
+    a = np.zeros((2, 2))
+    contact = lv.Problem.contact(a, [0.0, 1.0], [1.0])
+    assert "along the normal" in check_certificate(contact, [1.0, 1.0])
+    # lambda_n is free to grow, so the tangent is solved by lambda_t = mu lambda_n; relaxed it never is.
+    assert check_certificate(contact.relaxed("cone"), [1.0, 1.0]) is None
+
+
+def test_a_nearly_singular_matrix_gives_no_certificate():
+    # lambda = (-99, 100) solves it; A y is small beside |A| |y|, but no smaller than what b asks of it.
+    h = 1e-11
+    problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0 + h]], [1.0, 1.0 + 100.0 * h])
+    assert lv.residual(problem, [-99.0, 100.0]).relative < 1e-6
+    assert check_certificate(problem, [-1.0, 1.0]) is not None
+
+
+def test_bounds_that_are_huge_beside_the_step_are_seen():
+    # w pushes into a bound on which lambda already sits: no error, however large the bound.
+    for bound in (1e6, 1e100, 1e300):
+        problem = lv.Problem.lcp([[0.0, 0.0], [0.0, 1.0]], [1.0, 1.0], -bound, bound)
+        assert lv.residual(problem, [bound, 1.0]).relative == 0.0
+        assert lv.residual(problem, [-bound, 1.0]).relative > 0.1
+        assert lv.solve(problem, "pgs").impulse.tolist() == [bound, 1.0]
+
+
+@pytest.mark.parametrize("kind", ["rows", *CONTACTS])
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_the_size_of_the_numbers_changes_no_residual(kind, seed):
+    """Powers of two, so that A, b and lambda keep their bits: squares of e, w or d alone would vanish or overflow."""
+    friction = ("coulomb", "cone")[seed % 2]
+    problem = (
+        random_lcp(seed, boxed=False)
+        if kind == "rows"
+        else as_matrix(CONTACTS[kind](seed, friction, joints=0))
+    )
+    lam = np.random.default_rng(seed).normal(size=problem.m)
+    usual = lv.residual(problem, lam)
+    for a, b in (
+        (530, 0),
+        (-530, 0),
+        (0, -600),
+        (0, 600),
+        (600, -300),
+        (-900, -800),
+        (900, 900),
+        (-300, -990),
+    ):
+        scaled = lv.Problem(
+            problem.b * 2.0**b, problem.cones, problem.csr * 2.0**a, friction=problem.friction
+        )
+        got = lv.residual(scaled, lam * 2.0 ** (b - a))
+        # A dozen sums of positive terms: 1e-13 is a hundred roundings.
+        assert got.relative == pytest.approx(usual.relative, rel=1e-13)
+        # Its squares, 2^-106 of those of e, come so near to the end of float64 that digits go.
+        assert got.floor == pytest.approx(usual.floor, rel=1e-10, abs=0.0)
+        assert got.velocity == pytest.approx(usual.velocity * 2.0**b, rel=1e-13)
+        assert got.worst_row == usual.worst_row
+
+
+@pytest.mark.parametrize("form", ["rows", "generalized"])
+@pytest.mark.parametrize("small", [1e-170, 1e-200, 1e-300])
+def test_a_row_whose_products_vanish_makes_no_claim_about_itself(form, small):
+    """A_11 = small^2 > 0 is 0 in float64: how far others are from lambda_1 = 1 / small^2, nobody can tell."""
+    if form == "rows":
+        jac = np.zeros((2, 12))
+        jac[0, 6], jac[1, 7] = 1.0, small
+        rows = touching([], inv_mass=[1.0], jac=jac, joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 0]])
+        problem = lv.Problem([0.0, 1.0], lv.Cones.free(2), rows=rows)
+    else:
+        problem = lv.Problem.from_jacobian(
+            np.diag([1.0, small]), np.eye(2), [0.0, 0.0], cones=lv.Cones.free(2), target=[0.0, 1.0]
+        )
+    assert len(problem.metric.empty) == 1
+    for impulse in ([0.0, 0.0], [0.0, 1.0], [1.0, 1e300]):
+        assert lv.residual(problem, impulse).relative == np.inf
+    for solver in ("pgs", "auto"):
+        found = lv.solve(problem, solver, max_iter=5)
+        assert not found.success
+        assert found.status is not lv.Status.INFEASIBLE or found.contradicted
+
+
+def test_residual_reads_as_one_line_and_names_the_worst_row():
+    problem = random_contact_problem(0)
+    judged = lv.residual(problem, problem.start())
+    assert judged.worst_name == problem.row_name(judged.worst_row)
+    assert judged.worst_name in str(judged)
+    assert "\n" not in str(judged)
+    assert dataclasses.is_dataclass(judged)
+    by_row = judged.velocity_by_row
+    assert by_row.max() <= judged.velocity * (1 + 1e-12)
+
+
+def test_a_remembered_result_serves_its_own_impulse_alone():
+    problem = random_contact_problem(2)
+    first = np.linspace(0.1, 1.0, problem.m)
+    other = first.copy()
+    other[-1] = np.nextafter(other[-1], 2.0)
+    fresh = [lv.residual(problem, x) for x in (first, other)]
+    remember(problem, judged(problem, first.copy()))
+    for x, expected in ((other, fresh[1]), (first, fresh[0])):
+        found = lv.residual(problem, x)
+        assert (found.relative, found.floor, found.worst_row) == (
+            expected.relative, expected.floor, expected.worst_row
+        )  # fmt: skip
+        np.testing.assert_array_equal(found.error, expected.error)
+        np.testing.assert_array_equal(found.slack, expected.slack)
+    assert known(problem, problem.start()) == lv.residual(problem, problem.start()).relative
+    assert known(problem, other) is None
+    remember(problem, judged(problem, other))
+    assert known(problem, other) == fresh[1].relative
+
+
+# -- nothing to do ----------------------------------------------------------------------------------
+
+
+def test_where_doing_nothing_is_right_nobody_solves_and_nobody_fails():
+    a = np.diag([1.0, 2.0])
+    for b, nothing in (
+        ([-1.0, -2.0], True),  # separating: zero is the solution
+        ([1e-10, -1.0], True),  # below a nanometre per second
+        ([2e-9, -1.0], False),
+        ([1.0, 0.0], False),
+    ):
+        p = lv.Problem.lcp(a, b)
+        assert residuals.nothing_to_do(p) is nothing
+        assert lv.residual(p, [0.0, 0.0]).nothing_to_do is nothing
+    # In the unit of speed, whatever the masses: V0 is a velocity.
+    assert residuals.nothing_to_do(lv.Problem.lcp(1e12 * a, [1e-10, -1.0]))
+    assert not residuals.nothing_to_do(lv.Problem.lcp(1e-12 * a, [2e-9, -1.0]))
+    # Doing nothing is zero clipped to the bounds.
+    assert residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 0.0], lower=1.0))
+    assert not residuals.nothing_to_do(lv.Problem.lcp(a, [0.0, 5.0], lower=1.0))
+    assert residuals.nothing_to_do(lv.Problem.lcp(np.zeros((0, 0)), []))

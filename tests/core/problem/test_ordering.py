@@ -1,0 +1,127 @@
+"""Orders of blocks: permutations that keep joints first, levels, colours, and what is refused."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
+
+import lavender as lv
+from lavender.problem.ordering import ORDERS, block_order, body_ranks, colors, levels
+
+
+@given(seed=seeds)
+@pytest.mark.parametrize("order", ORDERS)
+def test_named_orders_are_permutations_with_joints_first(order, seed):
+    problem = random_contact_problem(seed)
+    o = block_order(problem, order, seed=seed if order == "random" else 0)
+    assert sorted(o.blocks.tolist()) == list(range(problem.n_blocks))
+    assert o.split == problem.rows.n_joints
+    assert sorted(o.blocks[: o.split].tolist()) == list(range(o.split))
+
+
+@given(seed=seeds)
+def test_colors_share_no_moving_body(seed):
+    problem = random_contact_problem(seed, bodies=6, contacts=20)
+    o = block_order(problem, "colored")
+    body = np.concatenate([problem.rows.joint_body, problem.rows.contact_body])
+    assert o.color_ptr[0] == 0
+    assert o.color_ptr[-1] == problem.n_blocks
+    for first, end in zip(o.color_ptr[:-1], o.color_ptr[1:], strict=True):
+        moving = body[o.blocks[first:end]].ravel()
+        moving = moving[moving >= 0]
+        assert len(moving) == len(set(moving.tolist()))
+
+
+@given(seed=seeds)
+def test_colors_of_a_matrix_share_no_entry(seed):
+    problem = as_matrix(random_contact_problem(seed, bodies=6, contacts=20))
+    color, a, ptr = colors(problem), problem.dense(), problem.cones.ptr
+    for i in range(problem.n_blocks):
+        for j in range(i):
+            if color[i] == color[j]:
+                assert not a[ptr[i] : ptr[i + 1], ptr[j] : ptr[j + 1]].any()
+
+
+def test_more_than_63_colors_are_found():
+    """100 contacts of one body with 100 others: every one needs its own colour."""
+    n = 100
+    rows = touching(np.stack([np.zeros(n), np.arange(1, n + 1)], axis=1))
+    assert sorted(colors(lv.Problem.from_rows(rows)).tolist()) == list(range(n))
+
+
+def test_levels_count_from_the_ground():
+    n = 6
+    body = np.stack([np.arange(-1, n - 1), np.arange(n)], axis=1)
+    shuffled = np.random.default_rng(3).permutation(n)
+    rows = touching(body[shuffled])
+    problem = lv.Problem.from_rows(rows)
+    np.testing.assert_array_equal(levels(problem), shuffled)
+    np.testing.assert_array_equal(shuffled[block_order(problem, "bottom_up").blocks], np.arange(n))
+    np.testing.assert_array_equal(shuffled[block_order(problem, "top_down").blocks], np.arange(n)[::-1])
+    matrix = as_matrix(problem)
+    ground = np.flatnonzero(shuffled == 0)
+    np.testing.assert_array_equal(levels(matrix, ground), shuffled)
+    with pytest.raises(lv.CapabilityError, match="ground"):
+        block_order(matrix, "bottom_up")
+
+
+def test_symmetric_is_forwards_then_backwards():
+    problem = random_lcp(4)
+    forwards = lv.solve(problem, "pgs", tol=0.0, max_iter=1)
+    both = sweeps(problem, "pgs", 1, order="reverse", impulse=forwards.impulse)
+    np.testing.assert_array_equal(sweeps(problem, "pgs", 2, order="symmetric"), both)
+
+
+@given(seed=seeds)
+def test_local_order_keeps_blocks_of_a_body_together(seed):
+    problem = random_contact_problem(seed, bodies=30, joints=0, contacts=60)
+    body = problem.rows.contact_body
+    given, local = (body[block_order(problem, name).blocks] for name in ("given", "local"))
+
+    def jumps(pairs):
+        return np.abs(np.diff(np.where(pairs.min(axis=1) < 0, pairs.max(axis=1), pairs.min(axis=1)))).sum()
+
+    assert jumps(local) <= jumps(given)
+
+
+def test_ranks_are_a_permutation_that_brings_neighbours_near():
+    # A chain of 20,000 bodies whose numbers are shuffled: neighbours are 6,700 apart in the mean.
+    n = 20_000
+    rng = np.random.default_rng(0)
+    chain = rng.permutation(n)
+    body = np.stack([chain[:-1], chain[1:]], axis=1)
+    rows = touching(body, inv_inertia=np.zeros((n, 3, 3)))
+    rank = body_ranks(lv.Problem.from_rows(rows))
+    assert np.array_equal(np.sort(rank), np.arange(n))
+    assert np.abs(np.diff(rank[body], axis=1)).max() == 1
+
+
+REFUSED = {
+    "no such order": ({"order": "bottomup"}, lv.UnknownName, "bottom_up"),
+    "a block twice": ({"order": [0, 0, 2]}, lv.InputError, "once"),
+    "too few": ({"order": [0, 1]}, lv.InputError, "shape"),
+    "negative seed": ({"order": "random", "seed": -1}, lv.InputError, "seed"),
+    "a seed that nothing draws": ({"order": "reverse", "seed": 3}, lv.InputError, "random"),
+    "ground that nothing uses": ({"order": "reverse", "ground": [0]}, lv.InputError, "ground"),
+    "ground of an array": ({"order": [2, 1, 0], "ground": [0]}, lv.InputError, "ground"),
+    "ground out of range": ({"order": "bottom_up", "ground": [3]}, lv.InputError, "3 blocks"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_makes_no_order_is_refused_with_its_reason(name):
+    options, error, sign = REFUSED[name]
+    problem = lv.Problem.lcp(np.eye(3), np.ones(3))
+    with pytest.raises(error, match=sign):
+        block_order(problem, **options)
+
+
+def test_a_copy_can_be_swept_without_touching_the_order():
+    order = block_order(random_lcp(0), "random", seed=4)
+    copy = order.fresh()
+    copy.blocks[:] = copy.blocks[::-1].copy()
+    copy.rng[:] = 0
+    assert not np.array_equal(order.blocks, copy.blocks)
+    assert order.rng[0] == 4
+    assert not order.is_fixed
+    assert block_order(random_lcp(0), "reverse").is_fixed

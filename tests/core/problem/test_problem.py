@@ -1,0 +1,400 @@
+"""Problems: what they derive, what they keep, and every kind of bad input by its message."""
+
+import copy
+import pickle
+import warnings
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from random_problems import (
+    CONTACTS,
+    arrays_of,
+    as_matrix,
+    random_contact_problem,
+    random_lcp,
+    random_rows,
+    seeds,
+    touching,
+)
+from worked import python
+
+import lavender as lv
+from lavender.problem.generalized import issparse
+from lavender.problem.generalized import sp as late
+
+I2 = np.eye(2)
+
+
+# -- classes and forms -----------------------------------------------------------------------------------
+
+
+def test_the_class_follows_from_the_blocks():
+    assert lv.Problem.linear(I2, [1, 1]).law == "linear"
+    assert lv.Problem.lcp(I2, [1, 1]).law == "lcp"
+    assert lv.Problem.lcp(I2, [1, 1], lower=-np.inf).law == "linear"
+    assert lv.Problem.contact(I2, [1, 1], [0.0, 0.0]).law == "lcp"  # normals only
+    assert lv.Problem.contact(I2, [1, 1], [0.5]).law == "coulomb"
+    assert lv.Problem.contact(I2, [1, 1], [0.5], friction="cone").law == "cone"
+    assert lv.Problem.contact(I2, [1, 1], [0.5], patch_radius=[0.1]).law == "coulomb"
+
+
+def test_the_matrix_is_kept_as_given():
+    a = np.array([[1.0, 2.0], [0.5, -1.0]])
+    problem = lv.Problem.lcp(a, [1.0, 1.0])
+    assert problem.delassus() is problem.matrix
+    a[0, 0] = 99.0  # the caller's array is not ours
+    assert problem.matrix[0, 0] == 1.0
+    with pytest.raises(ValueError, match="read-only"):
+        problem.matrix[0, 0] = 3.0
+    adopted = np.ascontiguousarray(a)
+    problem = lv.Problem.lcp(adopted, [1.0, 1.0], copy=False)
+    assert problem.matrix is adopted
+    assert not adopted.flags.writeable
+
+
+@pytest.mark.parametrize("form", [sp.csr_array, sp.csc_array, sp.coo_array, sp.csr_matrix])
+def test_sparse_formats_mean_the_same(form):
+    problem = random_lcp(3)
+    sparse = lv.Problem(problem.b, problem.cones, form(problem.matrix))
+    np.testing.assert_array_equal(sparse.dense(), problem.matrix)
+    x, y = (lv.solve(p, "pgs", tol=0.0, max_iter=9).impulse for p in (problem, sparse))
+    assert x.tobytes() == y.tobytes()
+
+
+def test_duplicate_entries_add_up():
+    a = sp.coo_array(([1.0, 1.0, 2.0], ([0, 0, 1], [0, 0, 1])), shape=(2, 2))
+    np.testing.assert_array_equal(lv.Problem.lcp(a, [1, 1]).dense(), 2 * I2)
+
+
+@given(seed=seeds)
+def test_velocity_form_is_the_same_problem(seed):
+    problem = random_contact_problem(seed)
+    form = problem.velocity_form()
+    k, s = form.jacobian.toarray(), form.scale
+    a = (k @ k.T + np.diag(form.theta)) / np.outer(s, s)
+    np.testing.assert_allclose(a, problem.dense(), atol=1e-12 * np.abs(a).max())
+    np.testing.assert_allclose(form.rhs / s, problem.b, rtol=1e-14)
+    z = np.ones(problem.m)
+    np.testing.assert_allclose(form.impulse(z), s)
+
+
+def test_from_rows_forms_b_from_target_and_free_velocity():
+    rng = np.random.default_rng(2)
+    rows = random_rows(rng)
+    problem = lv.Problem.from_rows(rows, target=0.25, mu=0.3, tangents=2)
+    np.testing.assert_allclose(problem.b, 0.25 - problem.jacobian @ rows.v_free.ravel(), atol=1e-13)
+    # w is then the relative velocity after the step minus its target.
+    lam = rng.normal(size=problem.m)
+    after = problem.jacobian @ problem.velocity(lam).ravel()
+    np.testing.assert_allclose(problem.slack(lam), after - 0.25, atol=1e-11)
+
+
+def test_relaxed_and_boxed_change_the_law_alone():
+    problem = random_contact_problem(4, tangents=2, spin=True)
+    cone = problem.relaxed("cone")
+    assert (cone.law, cone.relaxed("coulomb")) == ("cone", problem)
+    c = problem.rows.n_contacts
+    boxed = problem.boxed(np.full(c, 2.0))
+    assert boxed.law == "lcp"
+    i = problem.rows.n_joints
+    j, mu, r = problem.cones.ptr[i], problem.cones.mu[i], problem.cones.patch_radius[i]
+    np.testing.assert_allclose(boxed.cones.upper[j : j + 4], [np.inf, 2 * mu, 2 * mu, 2 * mu * r])
+    np.testing.assert_allclose(boxed.cones.lower[j : j + 4], [0.0, -2 * mu, -2 * mu, -2 * mu * r])
+    with pytest.raises(lv.InputError, match="negative"):
+        problem.boxed(np.full(c, -1.0))
+
+
+def test_equality_is_of_values():
+    assert random_contact_problem(1) == random_contact_problem(1)
+    assert random_contact_problem(1) != random_contact_problem(2)
+    assert as_matrix(random_contact_problem(1)) != random_contact_problem(1)
+    p = random_lcp(1)
+    assert p != lv.Problem(p.b, p.cones, p.matrix, guess=np.zeros(p.m))
+    assert p != lv.Problem(p.b, p.cones, sp.csr_array(p.matrix))
+
+
+def test_rows_have_names():
+    problem = random_contact_problem(6, tangents=2, spin=True)
+    kj = problem.rows.n_joints
+    first = int(problem.cones.ptr[kj])
+    assert [problem.row_name(first + i) for i in range(4)] == [
+        "contact 0, normal", "contact 0, tangent 1", "contact 0, tangent 2", "contact 0, spin",
+    ]  # fmt: skip
+    named = lv.Problem(
+        problem.b,
+        problem.cones,
+        rows=problem.rows,
+        names=[f"hinge {i}" for i in range(kj)] + ["box 1 on box 2"] * 8,
+    )
+    wide = int(np.argmax(np.diff(problem.cones.ptr[: kj + 1]) > 1))
+    assert named.row_name(int(problem.cones.ptr[wide]) + 1) == f"hinge {wide}, axis 1"
+    assert named.row_name(first) == "box 1 on box 2, normal"
+    assert random_lcp(1).row_name(3) == "row 3"
+    with pytest.raises(lv.InputError, match="row is 99"):
+        random_lcp(1).row_name(99)
+
+
+def test_pinned_bodies_are_legal():
+    """A body of infinite mass gives empty rows of A."""
+    still = {"inv_mass": [0.0], "inv_inertia": np.zeros((1, 3, 3)), "v_free": np.ones((1, 6))}
+    rows = touching([[-1, 0], [0, -1]], **still)
+    problem = lv.Problem.from_rows(rows, target=[0.0, -1.0])
+    assert not problem.csr.toarray().any()
+    np.testing.assert_array_equal(problem.d, [1.0, 1.0])
+    assert lv.solve(problem, "sequential_impulses").success
+
+
+# -- bad input ---------------------------------------------------------------------------------------------
+
+NAN, INF = np.nan, np.inf
+GAP = np.ma.array([1.0, 2.0], mask=[False, True])
+BAD_PROBLEMS = {
+    "NaN in A": (
+        lambda: lv.Problem.lcp([[NAN, 0], [0, 1]], [1, 1]),
+        r"A \[1/kg\] must be finite; entry \[0, 0\] is nan",
+    ),
+    "inf in sparse A": (lambda: lv.Problem.lcp(sp.csr_array([[INF, 0], [0, 1.0]]), [1, 1]), "must be finite"),
+    "not square": (lambda: lv.Problem.lcp(np.ones((2, 3)), [1, 1]), r"shape \(2, 3\); \(2, 2\) is needed"),
+    "sparse, not square": (
+        lambda: lv.Problem.lcp(sp.csr_array(np.ones((2, 3))), [1, 1]),
+        r"\(2, 2\) is needed",
+    ),
+    "A and b disagree": (lambda: lv.Problem.lcp(I2, [1, 1, 1]), r"\(3, 3\) is needed"),
+    "lower > upper": (lambda: lv.Problem.lcp(I2, [1, 1], 2.0, 1.0), "row 0: lower = 2.0, upper = 1.0"),
+    "lower = inf": (lambda: lv.Problem.lcp(I2, [1, 1], INF, INF), "a number between"),
+    "negative mu": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [-0.1]),
+        r"mu must not be negative; entry \[0\]",
+    ),
+    "infinite mu": (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [INF]), "mu must be finite"),
+    "negative radius": (
+        lambda: lv.Problem.contact(np.eye(4), np.ones(4), [1], [-1]),
+        "patch_radius must not be negative",
+    ),
+    "rows per contact": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1, 1]), "5 rows for 2"),
+    "five rows": (lambda: lv.Problem.contact(np.eye(5), np.ones(5), [1]), "up to two tangents"),
+    "law": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
+        "'coulomb' or 'cone'",
+    ),
+    "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
+    "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
+    "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),
+    "both forms": (
+        lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))),
+        "one of them",
+    ),
+    "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
+    "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
+    "masked b": (lambda: lv.Problem.lcp(I2, GAP), r"b \[m/s\] has no value at \[1\], 1 masked in all"),
+    "a judge without a problem": (lambda: lv.residual(None, [1.0]), "a lavender.Problem is needed"),
+    "one bound": (lambda: lv.Cones.bounded(0.0, 1.0), r"lower \[N s\] has shape \(\); \(any,\) is needed"),
+    "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
+    "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
+    "friction beyond float64": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e308),
+        r"mu N \[N s\] must be finite",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PROBLEMS)
+def test_bad_problems_say_what_came_and_what_was_needed(case):
+    make, message = BAD_PROBLEMS[case]
+    with pytest.raises(lv.InputError, match=message) as raised:
+        make()
+    assert isinstance(raised.value, ValueError)
+    assert isinstance(raised.value, lv.LavenderError)
+
+
+def rows_with(**changes):
+    rows = random_rows(np.random.default_rng(0))
+    values = {f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "copy"}
+    return lv.Rows(**{**values, **changes})
+
+
+BAD_ROWS = {
+    "missing body": ({"contact_body": np.full((8, 2), [0, 9])}, "body 9; there are 5 bodies"),
+    "body -2": ({"contact_body": np.full((8, 2), [0, -2])}, "body -2"),
+    "itself": ({"contact_body": np.full((8, 2), [3, 3])}, "joins body 3 to itself"),
+    "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
+    "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
+    "axes whose product is inf - inf": (
+        {"normal": np.tile([1e200, 1e200, 0], (8, 1)), "tangent": np.tile([1e200, -1e200, 0], (8, 1))},
+        "off by inf",
+    ),
+    "tangent": (
+        {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
+        "orthogonal",
+    ),
+    "arms": ({"arm_a": np.zeros((7, 3))}, r"\(8, 3\) is needed"),
+    "velocity": ({"v_free": np.full((5, 6), NAN)}, "v_free must be finite"),
+    "jac": ({"jac": np.zeros((1, 12))}, "jac has shape"),
+    "fractional body": ({"contact_body": np.full((8, 2), 0.5)}, "whole numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ROWS)
+def test_bad_rows_say_what_came_and_what_was_needed(case):
+    changes, message = BAD_ROWS[case]
+    with pytest.raises(lv.InputError, match=message):
+        rows_with(**changes)
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
+    for problem in (random_lcp(0), random_contact_problem(0), as_matrix(random_contact_problem(0))):
+        solution = lv.solve(problem, "pgs", history=True)
+        twin, result = again(problem), again(solution)
+        assert twin == problem
+        assert not twin.b.flags.writeable
+        assert not twin.cones.ptr.flags.writeable
+        assert twin.rows is None or not twin.rows.jac.flags.writeable
+        np.testing.assert_array_equal(lv.solve(twin, "pgs").impulse, solution.impulse)
+        np.testing.assert_array_equal(result.slack, solution.slack)
+        assert str(result) == str(solution)
+        assert result.work == solution.work
+
+
+def test_history_is_there_where_empty_rows_decide():
+    solution = lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]), "pgs", history=True)
+    assert solution.status is lv.Status.INFEASIBLE
+    assert solution.history.iterations.tolist() == [0]
+
+
+def test_large_finite_numbers_are_finite():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        problem = lv.Problem.lcp(I2, [1.2e308, 1.2e308])
+        assert lv.solve(problem, "pgs").success
+        np.testing.assert_array_equal(lv.solve(problem, "pgs").impulse, problem.b)
+    # |b| itself overflows: nothing to measure against, so nothing is judged solved but an error of 0.
+    problem = lv.Problem.lcp(I2, [1.7e308, 1.7e308])
+    assert lv.residual(problem, problem.b).relative == 0.0
+    assert lv.residual(problem, 0.999 * problem.b).relative == np.inf
+
+
+# -- the registry --------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_from_a_real_signal():
+    code = (
+        "import _thread, threading, numpy as np, lavender as lv\n"
+        "problem = lv.Problem.lcp(np.eye(3) * 2 - np.eye(3, k=1) - np.eye(3, k=-1), [1.0, 1.0, 1.0])\n"
+        "lv.solve(problem, 'pgs')\n"  # first: what is imported at first use takes its time
+        "seen = threading.Event()\n"
+        "threading.Thread(target=lambda: seen.wait() and _thread.interrupt_main()).start()\n"
+        "watch = lambda n, impulse, residual: seen.set() if n > 1000 else None\n"
+        "solution = lv.solve(problem, 'pgs', tol=0.0, max_iter=2**31 - 1, callback=watch)\n"
+        "assert solution.status is lv.Status.INTERRUPTED, solution\n"
+        "assert solution.iterations > 1000 and solution.residual.relative < 1e-9, solution\n"
+    )
+    python("-c", code)
+
+
+# -- what is given stays the giver's ---------------------------------------------------------------------
+
+
+def given_arrays():
+    """Arrays as callers hold them, float64 and int32, writable and contiguous: what could be taken as it is."""
+    general = random_contact_problem(3)
+    rows = general.rows
+    jac = general.jacobian.toarray()
+    given = {
+        "A": random_lcp(3).dense(), "b": np.array(random_lcp(3).b), "lower": np.zeros(12), "upper": np.full(12, 2.0),
+        "mu": np.full(4, 0.5), "patch": np.full(4, 0.1), "guess": np.zeros(12),
+        "J": jac, "M": 2.0 * np.eye(jac.shape[1]),
+        "v": np.ones(jac.shape[1]), "target": np.array(general.b), "soft": np.full(general.m, 1e-3),
+        "warm": np.zeros(general.m), "key": np.arange(12, dtype=np.uint64),
+    }  # fmt: skip
+    return given | {f.name: np.array(getattr(rows, f.name)) for f in fields(rows) if f.name != "copy"}
+
+
+def makers(sparse):
+    """A problem of each constructor; `sparse`, where it is not None, is the format of A, J and M."""
+    form = sparse or (lambda a: a)
+    cones = random_contact_problem(3).cones
+
+    def of_rows(g):
+        return lv.Rows(**{f.name: g[f.name] for f in fields(lv.Rows) if f.name != "copy"})
+
+    def of_jacobian(g):
+        return lv.Problem.from_jacobian(
+            form(g["J"]), form(g["M"]), g["v"], target=g["target"], cones=cones, compliance=g["soft"], guess=g["warm"]
+        )  # fmt: skip
+
+    def blocks_of_mass(g):
+        half = g["M"].shape[0] // 2
+        blocks = [np.ascontiguousarray(g["M"][:half, :half]), np.ascontiguousarray(g["M"][half:, half:])]
+        made = lv.Problem.from_jacobian(g["J"], blocks, g["v"], target=g["target"], cones=cones)
+        assert all(block.flags.writeable for block in blocks)
+        return made
+
+    return {
+        "linear": lambda g: lv.Problem.linear(form(g["A"]), g["b"], guess=g["guess"]),
+        "lcp": lambda g: lv.Problem.lcp(form(g["A"]), g["b"], g["lower"], g["upper"], key=g["key"]),
+        "contact": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"]),
+        "spin": lambda g: lv.Problem.contact(form(g["A"]), g["b"], g["mu"], patch_radius=g["patch"]),
+        "from_rows": lambda g: lv.Problem.from_rows(of_rows(g), g["target"][: len(g["jac"]) + len(g["normal"])]),
+        "from_jacobian": of_jacobian,
+        "blocks of M": blocks_of_mass,
+        "updated": lambda g: of_jacobian(given_arrays()).updated(
+            J=form(g["J"]), M=form(g["M"]), v_free=g["v"], target=g["target"], guess=g["warm"]
+        ),
+        "with a new J": lambda g: of_jacobian(given_arrays()).updated(J=form(g["J"]), b=g["target"]),
+        "of an adopted one": lambda g: (
+            lv.Problem.lcp(given_arrays()["A"], given_arrays()["b"], copy=False).updated(b=g["b"], guess=g["guess"])
+        ),
+        "of another law": lambda g: random_contact_problem(3).relaxed().updated(b=g["target"], guess=g["warm"]),
+        "replaced": lambda g: replace(random_contact_problem(3), b=g["target"], guess=g["warm"]),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("sparse", [None, sp.csr_array, sp.csc_array, sp.coo_array, sp.bsr_array])
+@pytest.mark.parametrize("maker", makers(None))
+def test_arrays_that_are_copied_stay_writable_and_unshared(maker, sparse):
+    given, matrices = given_arrays(), []
+    form = sparse and (lambda a: matrices.append(sparse(a)) or matrices[-1])
+    problem = makers(form)[maker](given)
+    before = pickle.dumps(problem)
+    assert [name for name, array in given.items() if not array.flags.writeable] == []
+    kept = arrays_of(problem, "problem", set())
+    assert [k for k, x in kept for y in given.values() if x.size and np.shares_memory(x, y)] == []
+    for array in given.values():
+        array[...] = array + 1  # a loop fills its arrays anew
+    for matrix in matrices:
+        matrix.data += 1.0
+    assert pickle.dumps(problem) == before
+
+
+def test_arrays_that_are_adopted_are_shared_and_read_only():
+    given = given_arrays()
+    problem = lv.Problem(given["b"], random_lcp(3).cones, given["A"], guess=given["guess"], copy=False)
+    for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
+        assert kept is given[name]
+        assert not kept.flags.writeable
+
+
+def test_impulses_of_another_kind_of_contact_are_not_carried():
+    disk, box = (CONTACTS[kind](1) for kind in ("disks", "boxes"))
+    disk, box = (replace(problem, key=None) for problem in (disk, box))
+    assert np.array_equal(disk.cones.ptr, box.cones.ptr)
+    impulse = np.ones(disk.m)
+    np.testing.assert_array_equal(disk.carry((disk, impulse)), impulse)
+    np.testing.assert_array_equal(box.carry((disk, impulse)), box.start())
+
+
+def test_what_loads_scipy_late_is_copied_and_asks_types_alone():
+    assert late.csgraph  # a module of its own, which has been used
+    for again in (copy.copy(late), pickle.loads(pickle.dumps(late))):
+        assert again.csr_array is sp.csr_array
+
+    class Foreign:
+        def __getattr__(self, name):
+            raise RuntimeError(name)
+
+    assert not issparse(Foreign())
+    assert issparse(sp.eye_array(2))

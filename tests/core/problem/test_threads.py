@@ -1,0 +1,164 @@
+"""Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
+
+import ast
+import os
+import sys
+import sysconfig
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_problems import FORMS, random_contact_problem, random_lcp
+from worked import python, syntax_of_package
+
+import lavender as lv
+import lavender_ext
+from lavender.base.errors import InUse
+
+KERNELS = Path(lavender_ext.__file__).parent
+
+
+def test_a_prepared_solver_refuses_a_second_thread():
+    solver = lv.prepare(random_lcp(1), "pgs")
+    inside, leave = threading.Event(), threading.Event()
+
+    def callback(iterations, impulse, residual):
+        inside.set()
+        assert leave.wait(600)
+        return True
+
+    with ThreadPoolExecutor(1) as pool:
+        first = pool.submit(solver.solve, tol=1e-12, callback=callback)
+        try:
+            assert inside.wait(600)
+            with pytest.raises(InUse, match="make one for each thread"):
+                solver.solve()
+        finally:
+            leave.set()
+        assert first.result().status is lv.Status.INTERRUPTED
+    assert solver.solve(tol=1e-6, max_iter=10_000).success  # free again
+
+
+def test_a_prepared_solver_refuses_its_own_callback():
+    solver = lv.prepare(random_lcp(2), "pgs")
+    with pytest.raises(InUse):
+        solver.solve(callback=lambda *_: solver.solve())
+    assert solver.solve(max_iter=10_000).success
+
+
+def test_an_error_leaves_a_prepared_solver_free():
+    solver = lv.prepare(random_lcp(3), "pgs")
+    with pytest.raises(lv.InputError):
+        solver.solve(tol=-1.0)
+    assert solver.solve(max_iter=10_000).success
+
+
+def at_once(function, n=8):
+    """Results of n threads that begin together."""
+    gate = threading.Barrier(n)
+
+    def run():
+        gate.wait(600)
+        return function()
+
+    with ThreadPoolExecutor(n) as pool:
+        return [future.result() for future in [pool.submit(run) for _ in range(n)]]
+
+
+@pytest.mark.skipif(not sysconfig.get_config_var("Py_GIL_DISABLED"), reason="this Python has a GIL")
+def test_where_there_is_no_gil_no_kernel_brings_it_back():
+    modules = [".".join(p.relative_to(KERNELS.parent).with_suffix("").parts) for p in KERNELS.rglob("*.pyx")]
+    code = f"""
+import importlib, sys
+import lavender
+for name in {modules}:
+    importlib.import_module(name)
+    assert not sys._is_gil_enabled(), name
+"""
+    python("-W", "error", "-c", code)
+
+
+@pytest.fixture
+def often():
+    """Threads change as often as they can."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    yield
+    sys.setswitchinterval(before)
+
+
+def unseen(seed, form):
+    """A problem without friction of which nothing was worked out yet."""
+    problem = random_contact_problem(seed, tangents=0, spin=False, joints=0, contacts=12)
+    return FORMS[form](problem)
+
+
+@pytest.mark.parametrize(
+    ("form", "name"),
+    [(form, name) for form in FORMS for name in lv.available(unseen(0, form), external=False)],
+)
+def test_threads_share_a_problem_that_nobody_has_looked_at(name, form, often):
+    """Everything derived is worked out at first use, by whichever thread comes first: the bits are those of one."""
+    for seed in range(3):
+        alone, problem = lv.solve(unseen(seed, form), name, max_iter=30), unseen(seed, form)
+        for found in at_once(lambda p=problem: lv.solve(p, name, max_iter=30)):
+            assert found.impulse.tobytes() == alone.impulse.tobytes()
+            assert found.residual.relative == alone.residual.relative
+            assert (found.status, found.work) == (alone.status, alone.work)
+
+
+def test_what_is_derived_is_one_object_for_all_threads(often):
+    for seed in range(20):
+        problem = random_contact_problem(seed)
+        for name in ("data", "csr", "csr_data", "jacobian"):
+            assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
+
+
+def test_threads_prepare_each_their_own(often):
+    problem = random_contact_problem(5)
+    alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
+    for found in at_once(lambda: lv.prepare(problem, "block_gauss_seidel").solve(max_iter=50)):
+        np.testing.assert_array_equal(found.impulse, alone.impulse)
+
+
+def test_no_object_has_a_property_of_functools():
+    found = [
+        f"{path.name}:{node.lineno}"
+        for path, tree in syntax_of_package().items()
+        for node in ast.walk(tree)
+        if (isinstance(node, ast.ImportFrom) and node.module == "functools")
+        for name in node.names
+        if name.name == "cached_property"
+    ]
+    assert found == []
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
+def test_a_process_forked_while_a_thread_works_solves_the_same_problem():
+    script = """if True:
+        import os, signal, threading
+        import numpy as np
+        import lavender as lv
+
+        problem = lv.Problem.contact(np.eye(6), [-1.0, 0.5, 0.0] * 2, 0.5)
+        held, leave = threading.Event(), threading.Event()
+
+        def work():
+            with problem.derived.lock:
+                held.set()
+                leave.wait(600)
+
+        thread = threading.Thread(target=work)
+        thread.start()
+        held.wait(600)
+        child = os.fork()
+        if not child:
+            signal.alarm(60)  # of a child that waits for ever
+            os._exit(not lv.prepare(problem, "pgs").solve(tol=1e-6).success)
+        status = os.waitpid(child, 0)[1]
+        leave.set()
+        thread.join()
+        assert status == 0, status"""
+    python("-W", "ignore::DeprecationWarning", "-c", script)

@@ -1,0 +1,162 @@
+"""ADMM: mass ratios, redundancy, friction and every kind of factorisation."""
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from random_problems import random_contact_problem, random_lcp, side_by_side
+
+import lavender as lv
+from lavender.solvers import admm
+
+
+@pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
+def test_every_factorisation_gives_the_same(law):
+    base = random_contact_problem(51, friction="cone" if law == "cone" else "coulomb", contacts=14, bodies=4)
+    cones = base.cones
+    if law == "linear":
+        cones = lv.Cones.free(base.m)
+    elif law == "lcp":
+        cones = lv.Cones.bounded(
+            np.where(np.isfinite(cones.lower), cones.lower, -1.0), np.full(base.m, np.inf)
+        )
+    a = base.dense() + 0.3 * np.eye(base.m)
+    problem = lv.Problem(base.b, cones, a, friction=base.friction)
+    assert problem.law == law
+    dense = lv.solve(problem, "admm", tol=1e-10, max_iter=20_000)
+    assert dense.solver.form == "Cholesky"
+    results = [dense]
+    slightly = a + 1e-13 * np.abs(a).max() * np.triu(np.ones_like(a), 1)
+    lu = lv.solve(
+        lv.Problem(base.b, cones, slightly, friction=base.friction), "admm", tol=1e-10, max_iter=20_000
+    )
+    assert lu.solver.form == "LU"
+    results.append(lu)
+    # Eight of them side by side make a matrix of few entries.
+    eight = lv.solve(side_by_side([problem] * 8), "admm", tol=1e-10, max_iter=20_000)
+    assert eight.solver.form == "Cholesky"
+    for solution in results:
+        assert solution.success
+        # Eigenvalues of A from 0.3 to about 30.
+        np.testing.assert_allclose(solution.impulse, dense.impulse, atol=1e-7 * np.abs(dense.impulse).max())
+    assert eight.success
+    np.testing.assert_allclose(
+        eight.impulse[: base.m], dense.impulse, atol=1e-7 * np.abs(dense.impulse).max()
+    )
+
+
+@pytest.mark.parametrize(
+    ("seed", "m", "rank"),
+    [*((seed, 14, 6) for seed in range(6)), (22, 12, 2), (80, 12, 3), (97, 12, 4), (200, 12, 2)],
+)
+def test_singular_boxed_problems(seed, m, rank):
+    # On the last four unbounded mixing went to impulses of 1e12 to 1e15. (Seed 400, rank 2 takes more iterations.)
+    solution = lv.solve(random_lcp(seed, m=m, rank=rank), "admm", tol=1e-9, max_iter=20_000)
+    assert solution.success, solution
+
+
+def test_far_from_symmetric():
+    rng = np.random.default_rng(9)
+    for _ in range(5):
+        g = rng.standard_normal((8, 8))
+        k = rng.standard_normal((8, 8))
+        problem = lv.Problem.lcp(g @ g.T + 0.5 * np.eye(8) + k - k.T, rng.standard_normal(8))
+        # Monotone: the symmetric part is definite, so the splitting converges.
+        assert lv.solve(problem, "admm", tol=1e-9, max_iter=20_000).success
+
+
+def test_a_pattern_that_is_not_symmetric():
+    # Entries above the diagonal alone, in the last column: LU by panels wants their mirrors, if only as zeros.
+    a = 2.0 * np.eye(80)
+    a[np.arange(79), np.arange(1, 80)] = -0.5
+    a[:79, 79] += 0.25
+    problem = lv.Problem.lcp(sp.csr_array(a), np.linspace(0.5, 1.5, 80))
+    solution = lv.solve(problem, "admm", tol=1e-12)
+    assert solution.success
+    assert solution.solver.form == "LU"
+    np.testing.assert_allclose(a @ solution.impulse, problem.b, rtol=1e-10)
+
+
+@pytest.mark.parametrize("m", [60, 1200])
+def test_pivots_across_panels_take_no_longer_than_the_time_limit(m):
+    # A chain of whose diagonal rho = 0.1 leaves nothing: every pivot is a neighbour's.
+    a = sp.diags_array([np.full(m, -0.1), np.ones(m - 1), np.full(m - 1, -0.999)], offsets=[0, 1, -1])
+    problem = lv.Problem(np.linspace(0.5, 1.5, m), lv.Cones.free(m), sp.csr_array(a))
+    prepared = lv.prepare(problem, "admm")
+    state = prepared.state
+    assert (state.factor is None) == (m > 1000), "of 60 rows at once"
+    if m == 60:
+        assert state.full
+        r = np.linspace(-1.0, 1.0, m)
+        x = state.factor[2][0].solve(r)
+        np.testing.assert_allclose(state.matrix @ x + state.splitting.rho * x, r, atol=1e-12)
+    # A minute is enough for 60 rows on any machine; of 1200 the factor is expected to take longer than 50 ms.
+    solution = prepared.solve(time_limit=60.0 if m == 60 else 0.05, max_iter=30)
+    assert (solution.status is lv.Status.TIME_LIMIT and solution.iterations == 0) == (m > 1000)
+    assert m > 60 or solution.work["factorisations"] >= 1
+    assert lv.solve(problem, "admm", max_iter=3).work["factorisations"] == 1
+
+
+def test_a_linear_system_that_is_not_definite():
+    # A saddle: masses, joints, and a little give in each of these.
+    h = sp.random_array((60, 200), density=0.05, rng=np.random.default_rng(0))
+    a = sp.csr_array(sp.block_array([[2.0 * sp.eye_array(200), h.T], [h, -1e-3 * sp.eye_array(60)]]))
+    problem = lv.Problem(np.linspace(-1.0, 1.0, 260), lv.Cones.free(260), a)
+    solution = lv.solve(problem, "admm", tol=1e-9)
+    assert solution.success
+    assert solution.solver.form == "LU"
+    np.testing.assert_allclose(a @ solution.impulse, problem.b, atol=1e-7)
+    bounded = lv.solve(lv.Problem.lcp(a, problem.b), "admm")
+    assert bounded.status is lv.Status.NUMERICAL_ERROR
+
+
+def test_a_factor_of_more_entries_than_can_be_counted_is_said(monkeypatch):
+    class Large:
+        def __init__(self, *_):
+            raise OverflowError("the factor has 2^31 entries or more")
+
+    monkeypatch.setattr(admm, "SparsePanels", Large)
+    a = sp.diags_array([np.full(89, -1.0), np.full(90, 2.0), np.full(89, -1.0)], offsets=[-1, 0, 1])
+    problem = lv.Problem.lcp(sp.csr_array(a), np.ones(90))
+    assert "entries" in admm.ADMM().prepare(problem)  # which auto calls, and goes on to another
+    assert lv.solve(problem, "admm").status is lv.Status.NUMERICAL_ERROR
+
+
+def test_without_memory_it_is_plain_admm_by_hand():
+    """Five iterations against the formulas in NumPy with a dense inverse."""
+    problem = random_lcp(4, m=7)
+    root = np.sqrt(problem.d)
+    b_ = problem.dense() / root[:, None] / root
+    c = problem.b / root
+    low, high = problem.cones.lower * root, problem.cones.upper * root
+    rho = 0.1
+    inverse = np.linalg.inv(b_ + rho * np.eye(7))
+    start = problem.start()
+    u = root * start + (c - b_ @ (root * start)) / rho
+    for n in range(1, 6):
+        z = np.clip(u, low, high)
+        y = rho * (u - z)
+        x = inverse @ (c + rho * z - y)
+        got = lv.solve(problem, "admm", memory=0, tol=0.0, max_iter=n)
+        np.testing.assert_allclose(
+            got.impulse, z / root, rtol=1e-10, atol=1e-12
+        )  # the inverse loses some digits
+        u = u + 1.6 * (x - z)
+
+
+def test_wrong_options_are_refused():
+    problem = random_lcp(1)
+    for memory in (-1, 17, 0.5):
+        with pytest.raises(lv.InputError, match="memory"):
+            lv.solve(problem, "admm", memory=memory)
+    for alpha in (0.0, 2.0):
+        with pytest.raises(lv.InputError, match="relaxation"):
+            lv.solve(problem, "admm", relaxation=alpha)
+
+
+@pytest.mark.parametrize("m", [0, 4])
+def test_work_is_told_once_however_a_run_is_cut(m):
+    problem = lv.Problem.lcp(np.eye(m), np.ones(m))
+    whole = lv.solve(problem, "admm", tol=0.0, max_iter=9)
+    cut = lv.solve(problem, "admm", tol=0.0, max_iter=9, callback=lambda *_: False)
+    assert dict(whole.work) == dict(cut.work)
+    assert whole.work["factorisations"] >= 1

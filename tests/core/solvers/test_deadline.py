@@ -1,0 +1,265 @@
+"""A time limit is the caller's clock: played here by counted work, so that nothing hangs on the machine."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from random_problems import FORMS, random_contact_problem
+
+import lavender as lv
+from benchmarks.made import fresh
+from lavender import registry
+from lavender.base import deadline
+from lavender.judge import residuals
+from lavender.judge.residuals import judging_time
+from lavender.solvers.auto import Auto
+from lavender.solvers.setup_times import forming
+from lavender.solvers.small import AUTO, DIRECT, NEWTON
+
+
+class Clock:
+    """Stands still but for counted work."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    monkeypatch.setattr(deadline, "perf_counter", made)
+    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
+    return made
+
+
+def dense(m, law, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(m, m // 2))
+    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
+    return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
+
+
+def over_velocities(m, nv, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(nv, nv))
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    mass = half @ half.T / nv + np.eye(nv)
+    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
+
+
+def test_set_up_is_inside(clock, monkeypatch):
+    problem, given = dense(100, "lcp"), []
+    newton = registry.get("newton").load()
+    prepare, run = newton.prepare, newton.run
+
+    def slow(self, *of):
+        clock.now += 0.6
+        return prepare(self, of[-1])
+
+    def told(self, state, impulse, max_iter, tol, time_limit=None):
+        given.append(time_limit)
+        return run(self, state, impulse, max_iter, tol, time_limit)
+
+    monkeypatch.setattr(newton, "prepare", slow)
+    monkeypatch.setattr(newton, "update", slow)
+    monkeypatch.setattr(newton, "run", told)
+    assert lv.solve(problem, "newton", time_limit=1.0).success
+    prepared = lv.prepare(problem, "newton")
+    assert prepared.solve(time_limit=1.0).success
+    assert prepared.solve(dense(100, "lcp", 1), time_limit=1.0).success
+    inside = [left < 0.4 for left in given]
+    assert inside == [True, False, True]
+
+
+def test_a_set_up_that_was_late_is_done_by_the_next_call():
+    problem, other = dense(200, "lcp"), dense(200, "lcp", 1)
+    lv.residual(problem, problem.start())
+    prepared = lv.prepare(problem, "newton")
+    for asked in (other, problem, None):
+        late = prepared.solve(asked, time_limit=1e-6)
+        assert late.status is lv.Status.TIME_LIMIT
+        assert prepared.solve(asked).success
+
+
+@pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
+def test_where_the_judge_would_be_late_the_start_goes_back_unjudged(name, clock):
+    """What he reads of a large A takes longer than a short limit: he is asked when somebody looks."""
+    problem = dense(600, "lcp")
+    for start in (None, np.ones(600)):
+        fresh_one = fresh(problem)
+        solution = lv.solve(fresh_one, name, impulse=start, time_limit=1e-5)
+        assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(fresh_one)
+        expected = problem.start() if start is None else start
+        assert np.array_equal(solution.impulse, expected) and not solution.impulse.flags.writeable
+        assert solution.residual.relative == lv.residual(problem, expected).relative
+        assert solution.iterations == 0 and "unjudged" in solution.message and str(solution)
+
+
+def test_a_of_j_and_m_is_counted_by_its_products():
+    """Of a sparse J they are few; by rows that share a tree, all of them, forming A was counted 30 times too dear."""
+    rng = np.random.default_rng(0)
+    jac = np.zeros((900, 300))
+    jac[np.arange(900)[:, None], rng.integers(0, 300, (900, 3))] = 1.0
+    mass = np.eye(300) + 1e-3 * (np.eye(300, k=1) + np.eye(300, k=-1))  # one tree
+    cones = lv.Cones.contacts(np.full(300, 0.5), 2)
+    sparse = lv.Problem.from_jacobian(jac, mass, np.ones(300), cones=cones)
+    full = over_velocities(900, 300)
+    for problem in (sparse, full):
+        whole = problem.metric.whitened()
+        columns = np.bincount(whole[1], minlength=300)
+        assert problem.metric.products_of_a >= np.sum(columns.astype(float) ** 2)
+    assert full.metric.products_of_a == 300 * 900**2
+    assert forming(sparse) < forming(full)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeypatch):
+    """The bits of no limit, and nothing is prepared; one that binds ends it no worse than it began."""
+    ended = []
+    for seed in range(12):
+        problem = FORMS[form](random_contact_problem(seed, "coulomb" if law == "lcp" else law, 2, False))
+        if law == "lcp":
+            problem = lv.Problem.lcp(problem.dense() + 0.1 * np.diag(problem.d), problem.b)
+        without = lv.solve(fresh(problem), tol=1e-9)
+        if without.turns and problem.m <= registry.SMALL_ROWS:
+            with monkeypatch.context() as patch:
+                patch.setattr(Auto, "run", None)
+                within = lv.solve(fresh(problem), tol=1e-9, time_limit=10.0)
+            assert within.impulse.tobytes() == without.impulse.tobytes()
+            assert within.message == without.message and within.work == without.work
+        for most in (0.0, 3e3, 1e4, 1e5, 1e6):
+            small = fresh(problem)
+            found = AUTO.solve(small, None, 1e-9, most)
+            assert small.derived.vain is None  # it may be tried again without a limit
+            if found is not None:
+                claim = AUTO.claim(small, found[1], None, found[0].relative, lv.Status.TIME_LIMIT)
+                assert claim.message and np.isfinite(found[0].impulse).all()
+                ended.append(found[0].relative <= 1e-9)
+    assert any(ended) and not all(ended)
+
+
+@pytest.mark.parametrize("small", [AUTO, DIRECT, NEWTON], ids=lambda small: small.name)
+def test_more_counted_cost_of_a_small_call_ends_more_problems(small):
+    ends = []
+    for most in (1e2, 1e4, 1e6, 1e9):
+        found = [small.solve(dense(48, "lcp", seed), None, 1e-9, most) for seed in range(10)]
+        ends.append(sum(x is not None and x[0].relative <= 1e-9 for x in found))
+    assert ends == sorted(ends)
+    assert ends[-1] == 10 or (small.limits is not None and not small.pivots)
+
+
+def test_the_limit_of_many_is_of_the_whole_call(clock, monkeypatch):
+    problems = [dense(100, "lcp", seed) for seed in range(6)]
+    run = Auto.run
+
+    def slow(self, state, impulse, max_iter, tol, time_limit=None):
+        clock.now += min(0.4, time_limit)
+        return run(self, state, impulse, max_iter, tol, None)
+
+    monkeypatch.setattr(Auto, "run", slow)
+    for threads in (1, 2):
+        clock.now = 0.0
+        solutions = lv.solve_many(problems, time_limit=1.0, threads=threads)
+        assert len(solutions) == 6 and clock.now <= 1.0
+        assert solutions[0].success
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, clock):
+    """The judge's time was kept free for each: of 1,000 problems under 0.1 s nothing was solved."""
+    drawn = (FORMS[form](random_contact_problem(seed, "cone", 2, False)) for seed in range(20))
+    small = [fresh(p) for p in drawn if p.m <= registry.SMALL_ROWS for _ in range(50)]
+    without = lv.solve_many(small, threads=threads)
+    within = lv.solve_many([fresh(p) for p in small], time_limit=0.3, threads=threads)
+    assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
+    assert [a.status for a in within] == [b.status for b in without]
+
+
+def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
+    problems = [dense(100, "lcp", seed) for seed in range(4)]
+    first = lv.solve(problems[0])
+
+    def slow(*of, **more):
+        clock.now += 1.0
+        return first
+
+    monkeypatch.setattr(sys.modules["lavender.solving.many"], "solve", slow)
+    starts = [None, None, np.ones(100), None]
+    made = lv.solve_many(problems, time_limit=0.5, impulses=starts)
+    assert made[0] is first or made[0].success
+    for problem, start, late in zip(problems[1:], starts[1:], made[1:], strict=True):
+        assert late.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+        assert np.array_equal(late.impulse, problem.start() if start is None else start)
+        assert (
+            late.residual.relative == lv.residual(problem, late.impulse).relative and "turn" in late.message
+        )
+    with pytest.raises(lv.CapabilityError):
+        lv.solve_many([problems[0], dense(30, "cone")], "direct", time_limit=0.5)
+
+
+def test_the_first_solve_imports_nothing():
+    """0.2 to 0.45 s went into it, in the first call of a control loop."""
+    code = """
+import sys
+import numpy as np
+import lavender as lv
+
+rng = np.random.default_rng(0)
+half = rng.normal(size=(300, 100))
+A = half @ half.T / 300 + 0.1 * np.eye(300)
+problems = [
+    lv.Problem.lcp(A, rng.normal(size=300)),
+    lv.Problem.contact(A, rng.normal(size=300), 0.5),
+    lv.Problem.contact(A[:30, :30], rng.normal(size=30), 0.5, friction="cone"),
+    lv.Problem.from_jacobian(half, np.eye(100), rng.normal(size=100), cones=lv.Cones.contacts(0.5, 2, count=100)),
+]
+before = set(sys.modules)
+for problem in problems:
+    lv.solve(problem, time_limit=0.01)
+print(sorted(set(sys.modules) - before))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_package_loads_what_auto_needs_and_a_name_its_own_file():
+    """Files of the others, and what nobody needs, are a quarter of what `import lavender` adds to NumPy."""
+    code = """
+import sys
+
+site = set(sys.modules)  # with what .pth files of other packages load
+import lavender as lv
+
+files = lambda: {name.rpartition(".")[2] for name in sys.modules if name.startswith("lavender.solvers.")}
+others = {"lemke", "jacobi", "gauss_seidel", "sequential_impulses"} & files()
+print(sorted(others), "pathlib" in set(sys.modules) - site)
+before = set(sys.modules)
+lv.solve(lv.Problem.lcp([[2.0]], [1.0]), "jacobi", time_limit=0.01)
+print(sorted(set(sys.modules) - before))
+print(list(lv.registry.specs())[:3], list(lv.registry.specs())[-1], lv.registry.get("jacobi").own)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    first, second, third = done.stdout.splitlines()
+    assert first == "[] False"
+    assert "lavender.solvers.jacobi" in second and "external" not in second and "lemke" not in second
+    # The order of the table, whoever was asked for first.
+    assert third.startswith("['auto', 'direct', 'newton']") and third.endswith("True")
+
+
+@pytest.mark.parametrize(("contacts", "velocities"), [(60, 120), (100, 200), (200, 300)])
+def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatch):
+    """A of dense J and M had been formed to count what it costs: 5 times the limit, and nothing found."""
+    rng = np.random.default_rng(0)
+    jac, root = rng.normal(size=(3 * contacts, velocities)), rng.normal(size=(velocities, velocities))
+    mass = root @ root.T / velocities + 0.1 * np.eye(velocities)
+    problem = lv.Problem.from_jacobian(
+        jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
+    )
+    limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming(problem)
+    lv.solve(problem, time_limit=limit)
+    assert "_compressed" not in vars(problem)

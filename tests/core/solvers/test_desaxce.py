@@ -1,0 +1,101 @@
+"""De Saxce's interior point and the augmented system: against dense algebra, and on scenes at rest and sliding."""
+
+import dataclasses
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import random_contact_problem, seeds
+from twins import block_diagonal
+
+from lavender.solvers.newton_systems import systems
+from lavender.solvers.newton_systems.systems import make_system
+from lavender_ext.core.problem import LAWS
+
+
+def dense_h(system):
+    return np.array([system.solve.times(e) for e in np.eye(system.solve.m)]).T
+
+
+def problem_of(seed, compliant, friction="coulomb"):
+    problem = random_contact_problem(seed, friction=friction, bodies=5, contacts=8)
+    return problem if compliant else dataclasses.replace(problem, compliance=np.zeros(problem.m))
+
+
+# -- equations ----------------------------------------------------------------------------------------
+
+
+@given(seed=seeds)
+@settings(max_examples=30)
+def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
+    system = make_system(problem_of(seed, True), "velocity")
+    sc = solve = system.solve
+    rng = np.random.default_rng(seed)
+    s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
+    phi, psi = solve.slip(s)
+    for i in range(len(sc.kind)):
+        j, end, spin = sc.ptr[i], sc.ptr[i + 1], sc.kind[i] == 2
+        expected = 0.0
+        if sc.kind[i] != 0:
+            expected = sc.a_t[i] * np.linalg.norm(s[j + 1 : end - spin])
+            expected += sc.a_s[i] * abs(s[end - 1]) if spin else 0.0
+        assert phi[j] == pytest.approx(expected, rel=1e-14, abs=1e-300)
+        assert psi[j] == 0.0
+    step = 1e-6
+    difference = (solve.slip(s + step * ds)[0] - solve.slip(s - step * ds)[0]) / (2.0 * step)
+    # The third derivative of |s_t| grows like 1/|s_t|^2, and spin has a kink: only where nothing is near 0.
+    smooth = [
+        i
+        for i in range(len(sc.kind))
+        if sc.kind[i] == 0 or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
+    ]
+    along = np.add.reduceat(psi * ds, sc.ptr[:-1])
+    np.testing.assert_allclose(difference[sc.ptr[:-1]][smooth], along[smooth], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("compliant", [True, False])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_the_system_of_a_step_is_solved(form, compliant, seed):
+    problem = problem_of(seed, compliant)
+    with mock.patch.multiple(systems, DENSE_ROWS=0 if form == "sparse" else 150, DENSE_FILL=2.0):
+        system = make_system(problem, "velocity" if form in ("velocity", "augmented") else "impulse")
+    sc = solve = system.solve
+    first = np.repeat(sc.ptr[:-1], np.diff(sc.ptr))
+    solve.begin(1e-10, 0.9)
+    for _ in range(3):
+        solve.weigh(1e-10)
+        w = np.linalg.inv(block_diagonal(system, solve.v)) - np.diag(sc.theta)
+        c = np.eye(sc.m)
+        np.subtract.at(c, (first, np.arange(sc.m)), solve.turn(0.9))
+        assert solve.factor("pair", augmented=form == "augmented")
+        r = np.random.default_rng(seed).normal(size=sc.m)
+        x = solve.solve("pair", r)
+        expected = np.linalg.solve(dense_h(system) + c @ w, r)
+        # W holds entries up to 1e10 of delta's reciprocal beside 1: what the dense inverse keeps of 16 digits.
+        np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
+        assert solve.advance()[0]
+
+
+@pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
+@given(seed=seeds)
+@settings(max_examples=15)
+def test_augmented_system_is_the_same_newton_system(law, seed):
+    problem = problem_of(seed, True, "cone" if law == LAWS["cone"] else "coulomb")
+    system = make_system(problem, "velocity")
+    solve = system.solve
+    m = solve.m
+    rng = np.random.default_rng(seed)
+    z, r = rng.normal(size=m), rng.normal(size=m)
+    solve.natural(z, solve.times(z) - system.solve.g, law, 1e-3)
+    assert solve.factor("natural", 1e-3, augmented=True)
+    p = block_diagonal(system, solve.p)
+    matrix = np.eye(m) - p + p @ (dense_h(system) + 1e-3 * np.eye(m))
+    x = solve.solve("natural", r)
+    # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
+    np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
+
+
+# -- scenes at rest: many redundant points, few of which slip -------------------------------------------

@@ -1,0 +1,470 @@
+"""`direct`: every factorisation, pivoting against enumeration, singular and infeasible problems."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import assume, example, given
+from random_problems import good, seeds, without_solution
+
+import lavender as lv
+from lavender.base.lu import sparse_lu
+from lavender.judge.certificates import check_certificate
+from lavender.solvers.direct import Direct
+from lavender.solvers.pivoting import DenseFactor, PivotState
+from lavender_ext.factor.sparse import SparsePanels
+from lavender_ext.pivot import direct, principal
+from lavender_ext.pivot.principal import SMALL
+
+
+def spd(rng, m, spread=2.0):
+    q, _ = np.linalg.qr(rng.normal(size=(m, m)))
+    return q @ np.diag(10.0 ** rng.uniform(-spread, 0.0, m)) @ q.T
+
+
+def symmetric(a):
+    return 0.5 * (a + a.T)
+
+
+def laplacian(n):
+    """n x n grid: half bandwidth n, sparse."""
+    t = sp.diags_array([-np.ones(n - 1), 2.5 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    return sp.csr_array(sp.kron(sp.eye_array(n), t) + sp.kron(t, sp.eye_array(n)))
+
+
+def tridiagonal(m, diagonal=2.01):
+    return sp.csr_array(
+        sp.diags_array([-np.ones(m - 1), diagonal * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1])
+    )
+
+
+def shuffled(rng, a):
+    order = rng.permutation(a.shape[0])
+    return sp.csr_array(a[order][:, order])
+
+
+RNG = np.random.default_rng(5)
+LINEAR = {
+    "tridiagonal": (tridiagonal(500), "band"),
+    "pentadiagonal": (sp.csr_array(tridiagonal(300) @ tridiagonal(300)), "band"),
+    "shuffled tridiagonal": (shuffled(RNG, tridiagonal(500)), "sparse"),
+    **{f"tridiagonal of {m}": (tridiagonal(m), "band") for m in (1, 2, 3, 4, 9)},  # from both ends
+    "diagonal": (sp.csr_array(sp.diags_array(np.arange(1.0, 100.0))), "band"),
+    "small": (symmetric(spd(RNG, 20)), "band"),
+    "dense": (symmetric(spd(RNG, 150)), "dense"),
+    "sparse": (laplacian(60), "sparse"),
+    "asymmetric": (spd(RNG, 30) + np.triu(RNG.normal(size=(30, 30))), "LU"),
+    "asymmetric sparse": (sp.csr_array(laplacian(20) + sp.diags_array(np.ones(399), offsets=1)), "LU"),
+    "indefinite": (symmetric(RNG.normal(size=(40, 40))), "LU"),
+    "indefinite dense": (symmetric(RNG.normal(size=(120, 120))), "LU"),
+    "indefinite sparse": (sp.csr_array(laplacian(60) - 3.3 * sp.eye_array(3600)), "LU"),
+    "zero diagonal": (np.array([[0.0, 1.0], [1.0, 0.0]]), "LU"),
+}
+
+
+@pytest.mark.parametrize("case", LINEAR)
+def test_every_factorisation_reaches_rounding(case):
+    a, form = LINEAR[case]
+    problem = lv.Problem.linear(a, np.random.default_rng(1).normal(size=a.shape[0]))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.solver.form == form
+    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR)
+    assert not solution.contradicted
+    assert good(solution), solution
+    assert solution.work["factorisations"] >= 1
+
+
+@example(seed=0, m=6, band=0, bound=63)  # at a bound every row: its zeros would be pivots at rounding
+@example(seed=0, m=6, band=1, bound=63)
+@given(seed=seeds, m=st.integers(1, 9), band=st.integers(0, 3), bound=st.integers(0, 511))
+def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
+    rng = np.random.default_rng(seed)
+    lower = sum((np.diag(rng.normal(size=m - k), -k) for k in range(min(band, m - 1) + 1)), np.zeros((m, m)))
+    a = lower @ lower.T + np.eye(m)
+    free = np.array([not bound >> i & 1 for i in range(m)])
+    wide = np.where(free, np.inf, 0.0)
+    problem = lv.Problem.lcp(a, rng.normal(size=m), -wide, wide)
+    lv.residual(problem, np.zeros(m))  # the error of doing nothing, which what is found is measured against
+    order = rng.permutation(m).astype(np.int32)
+    for p, width in ((np.arange(m, dtype=np.int32), max(problem.bandwidth)), (order, m - 1)):
+        rows = direct.Pivoting(problem.csr_data, width, p, 1e-13)
+        rows.begin(np.zeros(m), np.inf, 0)  # whatever is found is good: nothing is refined
+        assert rows.turn(1) == principal.SOLVED
+        expected = np.zeros(m)
+        expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
+        # Condition of 1 + L L^T with |L| of a few: far below 1e4.
+        np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("m", [90, 300])
+@pytest.mark.parametrize("shape", ["dense", "sparse"])
+def test_larger_semidefinite_problems_need_descent(m, shape):
+    rng = np.random.default_rng(m)
+    if shape == "dense":
+        g = rng.normal(size=(m, m // 2))
+    else:
+        g = np.where(rng.random((m, m // 2)) < 3.0 / m, rng.random((m, m // 2)), 0.0)
+    a = sp.csr_array(g @ g.T)
+    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert "singular" in solution.message
+    assert solution.work["shifts"] >= 1
+
+
+def test_a_stack_takes_one_factorisation():
+    """Impulses pass through the whole stack in the sweeps that guess the free rows."""
+    m = 2000
+    a = sp.lil_array(tridiagonal(m, 2.0))
+    a[0, 0] = 1.0
+    b = np.zeros(m)
+    b[0] = 0.1
+    solution = lv.solve(lv.Problem.lcp(sp.csr_array(a), b), "direct", tol=1e-9)
+    assert solution.residual.relative <= 2.0 * solution.residual.floor
+    assert solution.work["factorisations"] == 1
+    np.testing.assert_allclose(solution.impulse, 0.1 * np.arange(m, 0, -1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("m", [5, 30, 120, 900])
+def test_singular_linear_systems_say_their_rank(m):
+    rng = np.random.default_rng(m)
+    if m == 900:
+        grid = laplacian(30)
+        a = sp.csr_array(sp.diags_array(np.full(900, 1.0)) @ grid)
+        a = a - sp.diags_array(a @ np.ones(900))  # a graph's Laplacian: rank m - 1
+        rank = m - 1
+    else:
+        rank = m // 2
+        g = rng.normal(size=(m, rank))
+        a = symmetric(g @ g.T)
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert f"rank {rank} of {m}" in solution.message
+    assert solution.work["rank"] == rank
+
+
+@pytest.mark.parametrize(
+    ("kind", "solver"), [("symmetric", "direct"), ("symmetric", "newton"), ("asymmetric", "direct")]
+)
+@given(seed=seeds, m=st.integers(2, 12))
+def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, solver, seed, m):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, m - 1))
+    a = symmetric(g @ g.T) if kind == "symmetric" else g @ rng.normal(size=(m - 1, m))
+    left = np.linalg.svd(a)[0][:, -1]
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m) + left)
+    assume(check_certificate(problem, left) is None)  # where not even this is a proof to rounding, nothing is
+    solution = lv.solve(problem, solver)
+    assert solution.status is lv.Status.INFEASIBLE, solution
+    assert check_certificate(problem, solution.certificate) is None
+
+
+@pytest.mark.parametrize("solver", ["direct", "lemke", "newton", "auto"])
+@given(seed=seeds, m=st.integers(2, 14))
+def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
+    problem = without_solution(seed, m)
+    solution = lv.solve(problem, solver)
+    assert solution.status is lv.Status.INFEASIBLE, solution
+    assert check_certificate(problem, solution.certificate) is None
+    assert solver != "lemke" or "ray" in solution.message or "row of A is zero" in solution.message
+
+
+def test_warm_starts_choose_among_solutions():
+    """Two equal contacts share a load: the answer stays at the split it is given."""
+    problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0])
+    for share in (0.25, 0.5, 0.9):
+        solution = lv.solve(problem, "direct", impulse=[share, 1.0 - share])
+        np.testing.assert_allclose(solution.impulse, [share, 1.0 - share], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("m", "density"), [(2, 1.0), (40, 1.0), (64, 0.1), (65, 1.0), (200, 1.0), (200, 0.02)]
+)
+@pytest.mark.parametrize("bounds", [(0.0, np.inf), (-0.3, 0.3), (-np.inf, np.inf)])
+def test_asymmetric_bounded_rows(m, density, bounds):
+    """Positive definite and not symmetric, as recorded problems are and more: compiled and LAPACK's LU, SuperLU."""
+    rng = np.random.default_rng(m)
+    a = sp.random_array((m, m), density=density, rng=rng, data_sampler=rng.standard_normal).toarray()
+    mass = 10.0 ** rng.uniform(-3.0, 3.0, m)  # rows of any unit: the factor is of D^-1/2 A D^-1/2
+    a = mass[:, None] * (a @ a.T / m + 0.1 * (a - a.T) + np.eye(m)) * mass
+    problem = lv.Problem.lcp(a, mass * rng.normal(size=m), *(x / mass for x in bounds))
+    assert not problem.is_symmetric
+    solution = lv.solve(problem, "direct")
+    assert good(solution), solution
+    assert solution.solver.form == "LU"
+    long = lv.solve(problem, "direct", max_iter=1000)  # never the one compiled call
+    # Both to rounding: D^-1/2 A D^-1/2 has a condition of 1.2 to 5.6, 1e-9 is a margin of six digits.
+    np.testing.assert_allclose(long.impulse, solution.impulse, rtol=1e-9, atol=1e-12 / mass.min())
+
+
+def test_asymmetric_rows_whose_exchanges_go_round_in_circles_are_stalled():
+    # No solution at all: w = -lambda_other - 1 < 0 whatever the impulse.
+    for more in (0, 80):
+        a = np.eye(2 + more)
+        a[:2, :2] = [[0.0, -1.0], [-2.0, 0.0]]
+        solution = lv.solve(lv.Problem.lcp(a, np.ones(2 + more)), "direct")
+        assert solution.status in (lv.Status.STALLED, lv.Status.NUMERICAL_ERROR)
+        assert not solution.contradicted
+    # Nearly skew, so that an exchange puts right as many rows as it puts wrong.
+    rng = np.random.default_rng(0)
+    circled = 0
+    for _ in range(20):
+        a = rng.normal(size=(8, 8))
+        solution = lv.solve(lv.Problem.lcp(a - a.T + 0.05 * np.eye(8), rng.normal(size=8)), "direct")
+        assert not solution.contradicted
+        assert solution.success or (solution.status is lv.Status.STALLED and "circles" in solution.message)
+        assert solution.residual.relative <= 1.0
+        circled += not solution.success
+    assert circled > 0
+
+
+def skew(seed, m=120, density=2.0):
+    """A sparse A = -A^T: a zero diagonal, and principal submatrices that are singular whatever their entries are."""
+    rng = np.random.default_rng(seed)
+    k = sp.random_array((m, m), density=density / m, rng=rng, data_sampler=rng.standard_normal)
+    return sp.csr_array(k - k.T), rng.standard_normal(m)
+
+
+def test_superlu_is_not_asked_where_no_entries_would_do():
+    """It writes outside its arrays there: a process that had 442 of these ended in a segmentation fault."""
+    a = sp.csr_array(([1.0, 1.0, 1.0], ([0, 1, 2], [0, 0, 0])), (3, 3))
+    with pytest.raises(RuntimeError, match="singular"):
+        sparse_lu(a)
+    assert sparse_lu(sp.csr_array([[0.0, 2.0], [4.0, 0.0]])).solve(np.array([2.0, 4.0])).tolist() == [
+        1.0,
+        1.0,
+    ]
+    for seed in range(20):
+        a, b = skew(seed)
+        solution = lv.solve(lv.Problem.lcp(a, b, -1.0, 1.0), "direct")
+        assert not solution.contradicted
+        assert solution.residual.relative <= 1.0
+        full = sp.csr_array(
+            a + sp.coo_array((np.ones(120), (np.arange(120), np.zeros(120, int))), (120, 120))
+        )
+        for solver in ("direct", "auto"):
+            assert not lv.solve(lv.Problem.linear(full, b), solver).contradicted
+
+
+@pytest.mark.parametrize("m", [2, 70])
+@pytest.mark.parametrize("make", [lv.Problem.lcp, lv.Problem.linear])
+def test_a_prepared_factorisation_follows_symmetry(make, m):
+    a = np.eye(m) + np.full((m, m), 0.5)
+    turned = a.copy()
+    turned[0, 1] = 0.25
+    for first, then in ((turned, a), (a, turned)):
+        prepared = lv.prepare(make(first, np.ones(m)), "direct")
+        prepared.solve()
+        after = prepared.solve(make(then, np.ones(m)))
+        fresh = lv.prepare(make(then, np.ones(m)), "direct").solve()
+        assert (after.solver.form, dict(after.work)) == (fresh.solver.form, dict(fresh.work))
+        assert after.impulse.tobytes() == fresh.impulse.tobytes()
+
+
+@pytest.mark.parametrize("m", [4, 70])
+def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
+    a = np.eye(m)
+    a[:2, :2] = [[-1e-10, 1.0], [0.0, -1e-10]]  # singular with a shift of 1e-10,
+    a[2:4, 2:4] = 1.0  # and without one
+    state = PivotState(lv.Problem.lcp(a, np.ones(m), -np.inf, 1e9))
+    state.rows.begin(np.zeros(m), 1e-13, 0)
+    assert [state.rows.turn(4) for _ in range(2)] == [SMALL, SMALL]
+    assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
+
+
+def test_the_first_lu_of_what_fills_is_expected_to_take_long():
+    a, b = skew(1, 3000, 3.0)
+    scattered = PivotState(lv.Problem.lcp(sp.csr_array(a + sp.eye_array(3000)), b))
+    band = sp.diags_array([np.ones(2999), np.full(3000, 3.0), np.full(2999, 0.5)], offsets=[-1, 0, 1])
+    narrow = PivotState(lv.Problem.lcp(sp.csr_array(band), b))
+    assert scattered.outside.seconds > 20.0 * narrow.outside.seconds
+
+
+def test_refusals_and_indefinite_matrices():
+    solution = lv.solve(lv.Problem.lcp([[1.0, 3.0], [3.0, 1.0]], [1.0, 1.0]), "direct")
+    assert not solution.contradicted
+    solution = lv.solve(lv.Problem.lcp(-np.eye(3), [1.0, 1.0, 1.0]), "direct")
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "indefinite" in solution.message
+    assert np.isfinite(solution.impulse).all()
+
+
+def test_budgets():
+    rng = np.random.default_rng(0)
+    g = rng.normal(size=(200, 100))
+    problem = lv.Problem.lcp(g @ g.T, rng.normal(size=200))
+    none = lv.solve(problem, "direct", max_iter=0)
+    assert (none.status, none.iterations) == (lv.Status.MAX_ITERATIONS, 0)
+    few = lv.solve(problem, "direct", max_iter=3)
+    assert few.iterations <= 3
+    assert few.residual.relative <= 1.0, "no worse than doing nothing"
+    short = lv.solve(problem, "direct", time_limit=1e-3)
+    assert short.status in (lv.Status.TIME_LIMIT, lv.Status.CONVERGED) and not short.contradicted
+
+
+def test_a_problem_of_tiny_numbers_is_not_taken_for_solved():
+    # b near 1e-210: squares of w vanish, so only the judge's scaled sums see what an exchange left over.
+    rng = np.random.default_rng(4315)
+    for _ in range(50):
+        m = 6
+        j = rng.normal(size=(m, m + 2))
+        a, b = j @ j.T, rng.normal(size=m)
+        one = lv.solve(lv.Problem.lcp(a, b, -0.3, 0.3), "direct")
+        box = 0.3 * 2.0**-30
+        tiny = lv.solve(lv.Problem.lcp(a * 2.0**-670, b * 2.0**-700, -box, box), "direct")
+        assert not tiny.contradicted
+        np.testing.assert_allclose(tiny.impulse, one.impulse * 2.0**-30, rtol=1e-12, atol=1e-24)
+
+
+def test_all_rows_free_is_tried_first_only_where_that_is_cheap():
+    """A narrow band is factored whole at once; where a row is not free, or the band is wide, sweeps guess."""
+    a, rng = tridiagonal(50), np.random.default_rng(1)
+    free = lv.solve(lv.Problem.lcp(a, a @ rng.uniform(0.5, 1.0, 50)), "direct")
+    assert (dict(free.work), free.iterations) == ({"factorisations": 1}, 1)
+    assert good(free)
+    mixed = lv.solve(lv.Problem.lcp(a, rng.normal(size=50)), "direct")
+    assert mixed.work["sweeps"] == 4
+    assert mixed.work["factorisations"] >= 2
+    assert good(mixed)
+    wide = lv.solve(lv.Problem.lcp(symmetric(spd(rng, 40)), rng.normal(size=40)), "direct")
+    assert wide.work["sweeps"] == 4
+    assert good(wide)
+
+
+def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
+    rng = np.random.default_rng(3)
+    y = rng.normal(size=(90, 100))
+    problem = lv.Problem.lcp(y @ y.T, rng.normal(size=90))  # more than the compiled factor takes
+    prepared = lv.prepare(problem, "direct")
+    pivot = prepared.state.pivot
+    pivot.outside.seconds = 1e9  # by which its first factor would be refused
+    refused = prepared.solve(time_limit=10.0)
+    assert refused.status is lv.Status.TIME_LIMIT
+    assert "factorisations" not in refused.work
+    assert prepared.solve(lv.Problem.lcp(y @ y.T, problem.b)).success
+
+
+@given(seed=seeds, m=st.integers(2, 40), part=st.integers(1, 9))
+def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
+    rng = np.random.default_rng(seed)
+    g = rng.normal(size=(m, max(1, m // 2))) * 10.0 ** rng.uniform(-2, 2, size=(m, 1))
+    problem = lv.Problem.lcp(g @ g.T, rng.normal(size=m), upper=rng.uniform(0.1, 2.0, size=m))
+    solver, claims = Direct(), []
+    whole = solver.run(solver.prepare(problem), np.zeros(m), 1000, 1e-9)
+    state, impulse = solver.prepare(problem), np.zeros(m)
+    while not claims or claims[-1].status is lv.Status.MAX_ITERATIONS:
+        claims.append(solver.run(state, impulse, part, 1e-9))
+        assert claims[-1].iterations <= part and len(claims) <= 1000
+    assert claims[-1].status is whole.status
+    rows = state.pivot.rows
+    assert sum(claim.iterations for claim in claims) == rows.n_rounds
+    assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_many_asymmetric_joints_take_one_factor_by_panels(seed):
+    rng = np.random.default_rng(seed)
+    n = 150
+    a = sp.csr_array(
+        laplacian(30) if seed % 2 else spd(rng, n) * (rng.random((n, n)) < 0.03) + 9.0 * np.eye(n)
+    )
+    a = sp.csr_array(a + a.T)
+    a.data *= 1.0 + 10.0 ** rng.uniform(-5.0, -0.5) * rng.normal(size=a.nnz)
+    x = rng.normal(size=a.shape[0])
+    problem = lv.Problem.linear(a, a @ x)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success and good(solution)
+    assert (solution.solver.form, solution.message) == ("LU", "A is not symmetric")
+    assert solution.work["factorisations"] == 1
+    assert lv.solve(problem, "auto").message.startswith("direct 1 factorisation")
+
+
+def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
+    """Without a diagonal rows must change places across panels."""
+    rng = np.random.default_rng(5)
+    n = 80
+    turn = sp.block_diag([np.array([[0.0, 1.0 + i], [-1.0 - i, 0.0]]) for i in range(n)])
+    lone = sp.csr_array(turn)[rng.permutation(2 * n)]
+    problem = lv.Problem.linear(lone, rng.normal(size=2 * n))
+    assert lv.solve(problem, "direct", tol=1e-9).success
+    far = np.r_[np.arange(n, 2 * n), np.arange(n)]
+    ring = sp.csr_array((np.ones(2 * n), (np.arange(2 * n), far)), shape=(2 * n, 2 * n))
+    near = sp.csr_array(ring + 1e-20 * sp.diags_array(rng.normal(size=2 * n)))
+    near.data[near.data == 1.0] += 1e-3 * rng.normal(size=2 * n)
+    problem = lv.Problem.linear(near, rng.normal(size=2 * n))
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert solution.work["factorisations"] <= 2
+
+
+def test_ctrl_c_between_two_rounds_gives_the_best_of_them(monkeypatch):
+    rng, m = np.random.default_rng(1), 150
+    g = rng.normal(size=(m, m // 2))
+    b, low, high = rng.normal(size=m), -np.abs(rng.normal(size=m)), np.abs(rng.normal(size=m))
+    problem = lv.Problem.lcp(g @ g.T, b, low, high)
+    factor, calls = DenseFactor.factor, []
+
+    def interrupted(self, *given):
+        calls.append(self)
+        if len(calls) == 90:
+            raise KeyboardInterrupt
+        return factor(self, *given)
+
+    monkeypatch.setattr(DenseFactor, "factor", interrupted)
+    solution = lv.solve(problem, "direct", tol=1e-14, impulse=10.0 * np.ones(m))
+    assert solution.status is lv.Status.INTERRUPTED and len(calls) == 90
+    assert solution.residual.relative < 0.01  # of the start 885
+
+
+def test_a_panel_that_lost_a_pivot_is_counted_and_named():
+    m = 100
+    a = 2.0 * np.eye(m)
+    a[:2, :2] = [[1.0, 1.0], [2.0, 2.0]]
+    solution = lv.solve(lv.Problem.linear(sp.csr_array(a), a @ np.ones(m)), "direct", tol=1e-9)
+    assert solution.success
+    assert solution.work["factorisations"] == 2  # panels and the LU that tells the rank
+    words = "A is not symmetric; LU by panels lost a pivot; A is singular, rank 99 of 100"
+    assert solution.message == words
+
+
+@pytest.mark.parametrize("m", [41, 71])
+def test_the_rank_in_work_is_that_of_the_message(m):
+    """A Cholesky factor of an indefinite A loses pivots that say nothing of its rank."""
+    a = np.zeros((m, m))
+    i = np.arange(0, m - 1, 2)
+    a[i, i + 1] = a[i + 1, i] = 1.0
+    solution = lv.solve(lv.Problem.linear(sp.csr_array(a), np.r_[np.ones(m - 1), 0.0]), "direct")
+    assert f"rank {m - 1} of {m}" in solution.message
+    assert solution.work.get("rank", m - 1) == m - 1
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_auto_does_not_begin_a_factor_that_fills(even):
+    """A graph without short separators: nearly all of its factor fills, while a few sweeps end it."""
+    rng = np.random.default_rng(0)
+    m = 3000
+    i, j = rng.integers(0, m, (2, 4 * m))
+    x, y = rng.normal(size=(2, 4 * m))
+    a = sp.coo_array((np.r_[x, x if even else y], (np.r_[i, j], np.r_[j, i])), shape=(m, m)).tocsr()
+    a = sp.csr_array(a + sp.diags_array(2.0 * np.abs(a).sum(axis=1) + 1.0))
+    problem = lv.Problem.linear(0.5 * (a + a.T) if even else a, rng.normal(size=m))
+    factor = SparsePanels(problem.csr.indptr, problem.csr.indices, not even)
+    assert factor.work > 1e8
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success and "factorisations" not in solution.work, solution
+
+
+@pytest.mark.parametrize("bound", [np.inf, 0.05])
+@pytest.mark.parametrize(("m", "half"), [(40, 39), (60, 1), (100, 5), (900, 20)])
+def test_a_sound_factor_leaves_nothing_to_refine(m, half, bound):
+    """Refinement would hide a wrong half of a factor's solve, at the price of its work."""
+    rng = np.random.default_rng(m)
+    diagonals = [rng.normal(size=m - abs(k)) for k in range(-half, half + 1)]
+    a = sp.diags_array(diagonals, offsets=list(range(-half, half + 1)))
+    a = sp.csr_array(a + a.T)
+    a = sp.csr_array(a + sp.diags_array(4.0 * np.abs(a).sum(axis=1)))
+    solution = lv.solve(lv.Problem.lcp(a, rng.normal(size=m), -bound, bound), "direct", tol=1e-12)
+    assert solution.residual.relative < 1e-14
+    assert "refinements" not in solution.work

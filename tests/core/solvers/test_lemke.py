@@ -1,0 +1,146 @@
+"""`lemke`: against enumeration, on every kind of row, degenerate and asymmetric; rays and certificates."""
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from enumeration import random_bounds
+from hypothesis import given
+from random_problems import good, random_lcp, seeds
+
+import lavender as lv
+from lavender import registry
+from lavender.judge.certificates import check_certificate
+from lavender.solvers.pivoting import PivotState
+from lavender_ext.pivot.lemke import DONE, PIVOTS, RAY, Lemke
+
+
+def paths_of(problem):
+    """The rows of a problem and the paths on them, begun at its start."""
+    rows = PivotState(problem).rows
+    paths = Lemke(rows)
+    paths.begin(problem.start())
+    return rows, paths
+
+
+def test_a_compiled_path_stops_at_its_pivots_and_at_a_ray_and_splits_free_rows_it_cannot_eliminate():
+    rows, paths = paths_of(lv.Problem.lcp(np.eye(2), [1.0, 2.0]))
+    assert (paths.run(1), paths.pivots) == (PIVOTS, 1)
+    assert paths.run(9) == DONE
+    np.testing.assert_allclose(rows.best.impulse, [1.0, 2.0])
+    assert paths.run(9) == DONE, "the last word is the last"
+    _, paths = paths_of(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]))
+    assert paths.run(9) == RAY
+    np.testing.assert_allclose(paths.ray[0], paths.ray[1])
+    low = [0.0, -np.inf]
+    rows, paths = paths_of(lv.Problem.lcp([[1.0, 1.0], [-1.0, 1e-14]], [1.0, -1.0], low, [np.inf, np.inf]))
+    assert paths.run(9) == DONE
+    np.testing.assert_allclose(rows.best.impulse, [1.0, 0.0], atol=1e-12)
+
+
+def test_a_saddle_point_needs_no_split():
+    """Free rows with a zero block are eliminated together with the rows they act on."""
+    rng = np.random.default_rng(1)
+    j = rng.normal(size=(3, 6))
+    a = np.block([[np.eye(6), j.T], [-j, np.zeros((3, 3))]])
+    low = np.append(np.zeros(6), np.full(3, -np.inf))
+    b = np.append(rng.normal(size=6) + 1.0, -j @ np.ones(6))
+    solution = lv.solve(lv.Problem.lcp(a, b, low), "lemke", tol=1e-9)
+    assert good(solution), solution
+    np.testing.assert_allclose(j @ solution.impulse[:6], j @ np.ones(6), atol=1e-10)
+
+
+def test_free_rows_that_no_pivot_reaches_are_split():
+    g = np.array([[1.0], [1.0], [2.0]])
+    problem = lv.Problem.lcp(g @ g.T, [1.0, 1.0, 2.0], [-np.inf, -np.inf, 0.0])
+    solution = lv.solve(problem, "lemke", tol=1e-9)
+    assert good(solution), solution
+
+
+@pytest.mark.parametrize("solver", ["lemke", "auto"])
+@pytest.mark.parametrize(("a", "b"), [([[-1.0]], [1.0]), ([[0.0, -1.0], [1.0, 0.0]], [1.0, -1.0])])
+def test_infeasible_without_symmetry(a, b, solver):
+    """w_1 < 0 whatever lambda is: y = e_1 has A^T y <= 0 and b.y > 0."""
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, solver)
+    assert solution.status is lv.Status.INFEASIBLE
+    assert check_certificate(problem, solution.certificate) is None
+
+
+def test_murtys_exponential_example_takes_all_its_pivots():
+    """2^n of them: shows that Lemke's path was followed, and that long paths end."""
+    n = 8
+    a = np.triu(np.full((n, n), 2.0), 1) + np.eye(n)
+    b = np.cumsum(2.0 ** np.arange(n)[::-1])[::-1]
+    solution = lv.solve(lv.Problem.lcp(a, b), "lemke", tol=1e-9)
+    assert solution.work["pivots"] == 2**n
+    np.testing.assert_array_equal(solution.impulse, np.append(np.zeros(n - 1), b[-1]))
+
+
+def test_budgets():
+    problem = random_lcp(3, m=60, rank=40)
+    few = lv.solve(problem, "lemke", max_iter=5)
+    assert (few.status, few.iterations) == (lv.Status.MAX_ITERATIONS, 5)
+    cut = [lv.solve(problem, "lemke", max_iter=n).residual.relative for n in range(1, 40, 2)]
+    assert max(cut) <= 1.0, "no worse than doing nothing"
+    assert min(cut) < 0.5, "where the path stands, not the start"
+    for cones, words in (
+        (lv.Cones.contacts(0.0, 0, count=5001), "5001: use"),
+        (lv.Cones.contacts(0.5, count=1667, shape="box"), r"5001, its friction as bounded rows \d+: use"),
+    ):
+        with pytest.raises(lv.CapabilityError, match=words):
+            lv.solve(lv.Problem(np.ones(5001), cones, sp.eye_array(5001, format="csr")), "lemke")
+
+
+@given(
+    seed=seeds, m=st.integers(1, 30), cuts=st.lists(st.integers(0, 40), max_size=8), singular=st.booleans()
+)
+def test_pivots_in_parts_are_those_of_one_call_to_the_bit(seed, m, cuts, singular):
+    rng = np.random.default_rng(seed)
+    g, skew = rng.normal(size=(2, m, m))
+    if singular:
+        g[:, : m // 2] = 0.0
+    low, high = random_bounds(rng, m)
+    problem = lv.Problem.lcp(g @ g.T + skew - skew.T, 2.0 * rng.normal(size=m), low, high)
+    ends = []
+    for parts in ([], cuts):
+        rows, paths = paths_of(problem)
+        codes = [paths.run(n) for n in [*parts, *9 * [10_000]]]  # rays end a call, too
+        ends.append((codes[-1], paths.pivots, paths.paths, rows.work, rows.best.impulse.tobytes()))
+    assert ends[0] == ends[1]
+    state, solver = PivotState(problem), registry.get("lemke").load()()
+    for _ in range(2):  # `run` begins anew
+        impulse = problem.start()
+        claim = solver.run(state, impulse, 10_000, 1e-9)
+        assert claim.iterations <= ends[0][1]  # less where a ray is a proof
+        assert claim.status is lv.Status.INFEASIBLE or impulse.tobytes() == ends[0][4]
+
+
+def test_a_factor_that_would_end_too_late_is_not_begun():
+    problem = random_lcp(3, 80)
+    solver, impulse = registry.get("lemke").load()(), problem.start()
+    rng = np.random.default_rng(0)
+    skew = rng.normal(size=(80, 80))
+    problem = lv.Problem.lcp(problem.dense() + skew - skew.T, problem.b)
+    state = PivotState(problem)
+    state.outside.seconds = 1e9
+    claim = solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert "factorisations" not in claim.work
+    state.outside.seconds = 0.0
+    assert solver.run(state, impulse, 10_000, 1e-9, time_limit=100.0).status is lv.Status.CONVERGED
+
+
+def test_a_dictionary_that_takes_longer_than_the_time_limit_is_not_formed():
+    problem = random_lcp(3, 120)
+    solution = lv.solve(problem, "lemke", time_limit=1e-5)
+    assert solution.status is lv.Status.TIME_LIMIT
+    assert "takes longer" in solution.message
+    assert not solution.work
+    assert lv.solve(problem, "lemke", time_limit=60.0).status is lv.Status.CONVERGED
+
+
+def test_a_prepared_solve_that_is_cut_keeps_no_path():
+    prepared = lv.prepare(random_lcp(3, 60), "lemke")
+    assert prepared.solve(max_iter=2).status is lv.Status.MAX_ITERATIONS
+    assert prepared.solve().iterations == lv.solve(random_lcp(3, 60), "lemke").iterations

@@ -1,0 +1,161 @@
+"""The registry: what a spec refuses to be, names and their nearest, plug-ins that fail, capabilities as data."""
+
+import dataclasses
+import importlib.metadata
+import warnings
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import registry
+
+SPEC = registry.get("pgs")
+TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
+
+
+def named(name, **more):
+    return dataclasses.replace(SPEC, name=name, **more)
+
+
+# -- specs ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"name": ""},
+        {"laws": frozenset()},
+        {"laws": frozenset({"lcp", "lpc"})},
+        {"operators": frozenset({"rows", "tensor"})},
+        {"operators": frozenset()},
+    ],
+    ids=["no name", "no law", "unknown law", "unknown operator", "no operator"],
+)
+def test_a_spec_that_makes_no_sense_is_refused(wrong):
+    with pytest.raises(lv.InputError, match=r"laws|operators"):
+        dataclasses.replace(SPEC, **wrong)
+
+
+def test_what_cannot_be_resumed_has_no_callback_and_no_history():
+    spec = dataclasses.replace(SPEC, resumable=False, callback=True, history=True)
+    assert (spec.callback, spec.history) == (False, False)
+
+
+def test_accepted_options_are_its_own_and_those_of_its_capabilities():
+    plain = dataclasses.replace(SPEC, order=False, seed=False, threads=False, options={"omega": "damping"})
+    assert plain.accepts == {"omega"}
+    assert dataclasses.replace(plain, order=True).accepts == {"omega", "order", "ground"}
+    assert dataclasses.replace(plain, seed=True, threads=True).accepts == {"omega", "seed", "threads"}
+
+
+def test_a_missing_package_is_named_with_what_installs_it():
+    spec = dataclasses.replace(SPEC, requires=("numpy", "no_such_module_1"), install="no-such-package")
+    assert spec.missing() == "needs no_such_module_1: pip install no-such-package"
+    assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
+
+
+def test_a_refusal_names_the_way_round():
+    contact = lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5])
+    lcp_only = dataclasses.replace(SPEC, laws=frozenset({"linear", "lcp"}))
+    cone_only = dataclasses.replace(SPEC, laws=frozenset({"linear", "lcp", "cone"}))
+    rows_only = dataclasses.replace(SPEC, operators=frozenset({"rows"}))
+    assert "problem.boxed" in lcp_only.refuses(contact)
+    assert "problem.relaxed('cone')" in cone_only.refuses(contact)
+    assert "from_rows" in rows_only.refuses(contact)
+    for name in ("gauss_seidel", "sor"):
+        assert "not 'lcp': 'pgs' is this method with bounds" in registry.get(name).refuses(TINY)
+    assert (
+        dataclasses.replace(SPEC, refusal=lambda p: f"{p.m} rows are unlucky").refuses(TINY)
+        == "2 rows are unlucky"
+    )
+
+
+# -- names ------------------------------------------------------------------------------------------
+
+
+def test_an_unknown_name_tells_the_nearest():
+    with pytest.raises(lv.UnknownName, match="did you mean 'newton'") as raised:
+        lv.get("newtn")
+    assert isinstance(raised.value, KeyError)
+    for senseless in ("", None, 7, ["pgs"]):
+        with pytest.raises(lv.UnknownName):
+            lv.get(senseless)
+    with pytest.raises(
+        lv.UnknownName, match="unknown option 'max_iters' of solver 'pgs'; did you mean 'max_iter'"
+    ):
+        lv.solve(lv.Problem.lcp(np.eye(2), [1.0, 1.0]), "pgs", max_iters=3)
+
+
+def test_capabilities_select():
+    ordered = lv.available(law="lcp", order=True)
+    assert "pgs" in ordered
+    assert "direct" not in ordered
+    assert set(ordered).isdisjoint(lv.available(law="lcp", order=False))
+    with pytest.raises(lv.InputError, match="unknown capability 'ordered'"):
+        lv.available(ordered=True)
+    with pytest.raises(lv.UnknownName, match="law"):
+        lv.available(law="lpc")
+
+
+# -- from outside -----------------------------------------------------------------------------------
+
+
+def test_register_takes_a_name_once_unless_told_to_replace(register):
+    lv.register(named("mine"))
+    assert lv.solve(TINY, "mine", tol=1e-9).solver.name == "mine"
+    with pytest.raises(lv.InputError, match="replace=True"):
+        lv.register(named("mine"))
+    lv.register(named("mine", summary="another"), replace=True)
+    assert lv.get("mine").summary == "another"
+    with pytest.raises(lv.InputError, match="SolverSpec"):
+        lv.register("mine")
+
+
+class Entry:
+    """An entry point as importlib.metadata gives them."""
+
+    value = "package:SPEC"
+
+    def __init__(self, name, load):
+        self.name, self.load = name, load
+
+
+def raises():
+    raise RuntimeError("needs a licence")
+
+
+@pytest.mark.parametrize(
+    ("load", "sign"),
+    [
+        (raises, "needs a licence"),
+        (lambda: raises, "needs a licence"),
+        (lambda: named("pgs"), "registered already"),
+        (lambda: lambda: 7, "SolverSpec"),
+    ],
+    ids=["import", "factory", "name of ours", "no spec"],
+)
+def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypatch):
+    entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
+    monkeypatch.setattr(registry, "registered", {})
+    registry.load.cache_clear()
+    try:
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            names = set(registry.specs())
+        assert {"pgs", "newton", "good_one"} <= names
+        (warning,) = told
+        assert "'broken'" in str(warning.message)
+        assert sign in str(warning.message)
+    finally:
+        registry.load.cache_clear()
+        monkeypatch.undo()
+        registry.specs()
+
+
+def test_entry_points_are_read_from_the_group_that_is_documented():
+    assert "lavender.solvers" in registry.__doc__
+    assert all(
+        e.group == "lavender.solvers" for e in importlib.metadata.entry_points(group="lavender.solvers")
+    )

@@ -1,0 +1,383 @@
+"""Problems of few rows take a compiled way: it must not show, but in time."""
+
+import _thread
+import pickle
+import re
+import sys
+import threading
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, side_by_side
+from random_trees import random_general
+from scipy.sparse import block_diag
+
+import lavender as lv
+from benchmarks.made import forms, fresh, stacks
+from lavender import registry
+from lavender.solvers.costs import newton_cost
+from lavender.solvers.registry import SMALL_ROWS
+from lavender.solvers.small import (
+    AUTO,
+    ISLAND,
+    SmallCall,
+    call_ends_within,
+    limits,
+    who,
+)
+from lavender_ext.small.many import solve_first
+
+SHORT = ("auto", "direct", "newton")
+TIMES = ("setup_time", "solve_time", "_rest")
+
+
+def long_way(problem, solver, **options):
+    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
+
+
+def facts(solution):
+    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
+    r = solution.residual
+    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
+    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
+    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
+    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
+
+
+def check(problem, solver, **options):
+    short = lv.solve(problem, solver, **options)
+    expected = facts(long_way(problem, solver, **options))
+    assert facts(short) == expected
+    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
+    return short
+
+
+def draw(kind, seed):
+    rng = np.random.default_rng(seed)
+    if kind == "lcp":
+        return random_lcp(seed, m=int(rng.integers(1, SMALL_ROWS)), rank=None if rng.random() < 0.7 else 3)
+    if kind == "linear":
+        g = rng.normal(size=(9, 9))
+        a = g @ g.T if rng.random() < 0.6 else g
+        return lv.Problem.linear(a, rng.normal(size=9))
+    if kind == "singular":
+        g = rng.normal(size=(9, 9 - seed % 4)) * 10.0 ** rng.uniform(0.0, seed % 3, (9, 1))
+        a = g @ g.T
+        return lv.Problem.linear(0.5 * (a + a.T), a @ rng.normal(size=9) if seed % 5 else rng.normal(size=9))
+    if kind == "one-sided":  # unsymmetric
+        return lv.Problem.lcp(
+            rng.normal(size=(6, 6)) + 6.0 * np.eye(6),
+            rng.normal(size=6),
+            friction=["coulomb", "cone"][seed % 2],
+        )
+    if kind.startswith("rows"):
+        return random_contact_problem(
+            seed, kind.split()[1], bodies=3, joints=int(rng.integers(0, 3)), contacts=int(rng.integers(0, 5))
+        )
+    if kind.startswith("matrix"):
+        return as_matrix(draw("rows " + kind.split()[1], seed))
+    law = kind.split()[1]
+    if kind.startswith("hollow"):
+        return hollow(random_general(seed, law, n=8, compliance=seed % 3 > 0), rng)
+    tangents = int(rng.integers(1, 6)) if law == "cone" else int(rng.integers(0, 3))
+    return random_general(
+        seed, law, n=int(rng.integers(2, 12)), compliance=seed % 3 > 0, contacts=4, tangents=tangents
+    )
+
+
+def hollow(problem, rng):
+    """Some of its rows of A all zero: rows of J, and the compliance of these."""
+    general, soft = problem.generalized, problem.compliance.copy()
+    jac = general.jac.toarray()
+    rows = rng.random(problem.m) < 0.3
+    jac[rows] = soft[rows] = 0.0
+    target = np.where(rows, rng.choice([-1.0, -1e-3, 0.0, 0.2], problem.m), problem.b)
+    return lv.Problem.from_jacobian(
+        jac, general.mass, general.v_free, target=target + jac @ general.v_free, cones=problem.cones,
+        compliance=soft, friction=problem.friction,
+    )  # fmt: skip
+
+
+KINDS = (
+    "lcp", "linear", "singular", "one-sided", "rows coulomb", "rows cone", "matrix coulomb", "matrix cone",
+    "general coulomb", "general cone", "hollow coulomb", "hollow cone",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(seed=seeds, tol=st.sampled_from([1e-3, 1e-6, 1e-9, 1e-13, 0.9]))
+@settings(max_examples=25)
+def test_the_short_way_and_the_long_way_are_one(kind, seed, tol):
+    problem = draw(kind, seed)
+    for solver in SHORT:
+        if registry.get(solver).refuses(problem) is not None:
+            continue
+        first = check(problem, solver, tol=tol)
+        check(problem, solver, tol=tol, impulse=first.impulse)
+        near = first.impulse * (1.0 + 1e-4 * np.random.default_rng(seed).normal(size=problem.m))
+        check(problem, solver, tol=tol, impulse=near)
+        check(problem, solver, tol=tol, impulse=np.zeros(problem.m))
+        check(replace(problem, guess=near, copy=False), solver, tol=tol)
+
+
+def test_rows_of_zeros_leave_a_small_problem_to_the_one_call():
+    """Bounded rows of a walking robot's plan: the first of each bound hangs on nothing that is to be found."""
+    solved = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        jac = np.vstack([np.zeros(6), rng.normal(size=(9, 6))])
+        problem = lv.Problem.from_jacobian(
+            jac, np.eye(6), rng.normal(size=6), target=np.r_[-0.1, -np.ones(9)],
+            cones=lv.Cones.bounded(np.zeros(10), np.full(10, np.inf)),
+        )  # fmt: skip
+        found = AUTO.solve(problem, None, 1e-6)
+        solved += found is not None
+        assert lv.solve(problem).success
+    assert solved == 20
+
+
+def test_most_of_them_do_take_the_short_way():
+    took = 0
+    for kind in KINDS:
+        for seed in range(6):
+            took += registry.get("auto").small.solve(draw(kind, seed), None, 1e-6) is not None
+    assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
+
+
+@pytest.mark.parametrize("solver", ["auto", "direct"])
+def test_small_joints_that_depend_on_each_other_are_one_shifted_factor_more(solver):
+    g = np.random.default_rng(4).normal(size=(12, 7))
+    a = g @ g.T
+    problem = lv.Problem.linear(0.5 * (a + a.T), a @ np.ones(12))
+    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
+    found = check(problem, solver, tol=1e-9)
+    assert found.success
+    assert found.work["rank"] == 7
+    assert (found.work["factorisations"], found.work["shifts"]) == (2, 1)
+
+
+@pytest.mark.parametrize("most", [200, 293, 294])
+def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
+    rng = np.random.default_rng(9)
+    _, skew = rng.normal(size=(2, 60, 60))
+    a = 0.01 * np.eye(60) + 3.0 * (skew - skew.T)
+    high = np.where(np.arange(60) % 2, np.inf, 1.0)
+    problem = lv.Problem.lcp(a, 3.0 * rng.normal(size=60), np.zeros(60), high)
+    assert lv.solve(problem).iterations == 294
+    solution = lv.solve(problem, max_iter=most)
+    assert solution.iterations <= most
+    assert solution.success or most < 294
+
+
+def test_a_late_solution_is_a_solution():
+    problem = draw("general cone", 3)
+    late = lv.solve(problem)
+    again = pickle.loads(pickle.dumps(lv.solve(problem)))
+    assert facts(again) == facts(late)
+    assert late.success and late.raise_for_status() is late
+    assert not any(x.flags.writeable for x in (late.impulse, late.slack, late.residual.error))
+    with pytest.raises(TypeError):
+        late.work["x"] = 1
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = lv.solve(problem).nothing
+    assert repr(lv.solve(problem)).startswith("<Solution auto: CONVERGED")
+
+
+def test_round_cones_are_never_solved_over_rows_of_a():
+    problem = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    with pytest.raises(lv.errors.CapabilityError, match="over velocities alone"):
+        lv.solve(problem, "newton", form="impulse")
+    assert "newton over rows" not in {stage.solver for stage in lv.explain(problem).stages}
+    # What it cannot take further ends as a result, not in a solver that reads past such a block.
+    hard = lv.prepare(problem, "auto").solve(tol=1e-15)
+    assert np.isfinite(hard.residual.relative) and not hard.contradicted
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_the_compiled_gate_is_the_count_of_newton(seed):
+    """One cost for the compiled loops, for `explain` and for the tree; at the limit it lets in, above it not."""
+    rng = np.random.default_rng(seed)
+    friction = ("coulomb", "cone")[seed % 2]
+    n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60)) if seed % 3 else 0
+    problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
+    state = registry.get("newton").load()().prepare(problem)
+    cost = newton_cost(state.count, problem.law)
+    assert limits(1.0).cost(problem.metric, state.count.work)[0] == pytest.approx(cost, rel=1e-12)
+
+    def lets_in(of):
+        return solve_first(problem.metric, None, np.inf, of) is not None
+
+    assert lets_in(limits(1.01 * cost)) and not lets_in(limits(0.99 * cost))
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("form", ["bodies", "matrix"])
+@pytest.mark.parametrize("equal", [True, False])
+@pytest.mark.parametrize("tol, corners", [(1e-3, 1), (1e-6, 1), (1e-10, 1), (1e-6, 4)])
+def test_islands_under_friction_are_one_call(friction, form, equal, tol, corners):
+    """Cut out of A, and of bodies where these have fewer unknowns: at four corners."""
+    problem = forms(stacks(40, 2, 0.4, equal, corners))[form].relaxed(friction)
+    found = check(problem, "auto", tol=tol)
+    first = "newton on " if corners > 1 and friction == "cone" else "anderson on 40 islands"
+    assert found.success and first in found.message and "islands" in found.message
+    near = found.impulse * (1.0 + 1e-4 * np.random.default_rng(1).normal(size=problem.m))
+    assert check(problem, "auto", tol=tol, impulse=near).success
+    assert check(problem, "auto", tol=tol, impulse=found.impulse).work == {}
+    each = found.impulse.reshape(40, -1)
+    assert np.array_equal(each, np.tile(each[0], (40, 1))) == equal
+
+
+@given(seed=seeds, law=st.sampled_from(["coulomb", "cone"]))
+@settings(max_examples=25)
+def test_random_islands_are_solved_whichever_comes_first(seed, law):
+    rng = np.random.default_rng(seed)
+    parts = [
+        as_matrix(random_contact_problem(seed + i, law, bodies=2, joints=0, contacts=int(rng.integers(1, 5))))
+        for i in range(24)
+    ]
+    there, back = side_by_side(parts), side_by_side(parts[::-1])
+    found, turned = lv.solve(there, tol=1e-8), lv.solve(back, tol=1e-8)
+    assert found.success == turned.success
+    if not found.success or not ("islands" in found.message and "islands" in turned.message):
+        return
+    # Each by itself, to its share: sums of the whole in another order move a share by a rounding, no answer.
+    at = np.cumsum([0, *(part.m for part in parts)])
+    pieces = np.split(found.impulse, at[1:-1])
+    np.testing.assert_array_equal(np.concatenate(pieces[::-1]), turned.impulse)
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize("seed", range(4))
+def test_islands_of_bodies_with_joints(law, seed):
+    """Pairs of bodies, each with a joint or none, in no order; with a wrong number in a cut no call would end."""
+    rng = np.random.default_rng(seed)
+    drawn = random_contact_problem(seed, law, bodies=20, joints=8, contacts=70, tangents=2, spin=False)
+
+    def pairs(n):
+        second = 2 * rng.integers(0, 10, n) + 1
+        return np.stack([np.where(rng.random(n) < 0.7, second - 1, -1), second], 1).astype(np.int32)
+
+    rows = replace(drawn.rows, contact_body=pairs(70), joint_body=pairs(8))
+    problem = replace(drawn, rows=rows, b=drawn.b)
+    assert problem.m > 6 * rows.n_bodies
+    found = check(problem, "auto", tol=1e-8)
+    assert found.success and "islands" in found.message
+
+
+def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
+    stack = forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone")
+    no_answer = lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone")
+    problem = side_by_side([stack, no_answer])
+    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is None
+    found = lv.solve(problem)
+    assert found.status.name == "INFEASIBLE" and found.certificate is not None
+
+
+def test_islands_are_no_one_call_where_that_may_take_too_long():
+    problem = forms(stacks(40, 2, 0.4, False))["matrix"]
+    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is not None
+    assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
+    pile = stacks(3, 1 + ISLAND // 12, 0.4, False)  # 12 rows for each cube
+    assert registry.get("auto").small.solve(pile, None, 1e-6) is None
+    assert registry.get("newton").small.solve(fresh(problem), None, 1e-6) is None
+
+
+def test_islands_where_doing_nothing_is_right_from_a_warm_start():
+    """Of nine islands one leaves the ground: nothing is to be done for it, and the solution says what was done."""
+    rng = np.random.default_rng(3)
+    g = rng.normal(size=(12, 6))
+    part, n = g @ g.T, 9
+    b = np.tile(part @ np.tile([1.0, 0.1, 0.1], 4), n)
+    problem = lv.Problem.contact(np.kron(np.eye(n), part), b, np.full(4 * n, 0.5))
+    start = lv.solve(problem).impulse
+    b[:12], b[:12:3] = 0.0, -0.01
+    found = check(problem.updated(b=b), "auto", impulse=start)
+    assert found.success and found.residual.relative <= found.tol
+    assert not found.impulse[:12].any()
+
+
+@pytest.mark.parametrize("form", ["islands", "cone", "singular"])
+def test_one_problem_in_two_threads_has_the_same_bits(form):
+    """What another thread has in hand is no attempt in vain."""
+    rng = np.random.default_rng(4)
+    if form == "islands":
+        parts = [g @ g.T for g in rng.normal(size=(12, 9, 6))]
+        problem = lv.Problem.contact(block_diag(parts), rng.normal(size=108), np.full(36, 0.3))
+    elif form == "cone":
+        g = rng.normal(size=(60, 63))
+        problem = lv.Problem.contact(g @ g.T, rng.normal(size=60), mu=0.5, friction="cone")
+    else:
+        g = rng.normal(size=(60, 30))
+        problem = lv.Problem.lcp(g @ g.T, g @ (g.T @ np.abs(rng.normal(size=60))))
+    expected = facts(lv.solve(problem))
+    for solution in lv.solve_many([problem] * 100, threads=2):
+        assert facts(solution) == expected
+    assert facts(lv.solve(problem)) == expected
+
+
+def test_many_islands_that_each_take_a_few_factors_are_one_call():
+    rng = np.random.default_rng(0)
+    turned = [np.linalg.qr(g)[0] for g in rng.normal(size=(70, 150, 150))]
+    parts = [(q * np.logspace(0.0, -6.0, 150)) @ q.T for q in turned]
+    whole = block_diag(parts, format="csr")
+    problem = lv.Problem.contact(whole, rng.normal(size=whole.shape[0]), np.full(whole.shape[0] // 3, 0.5))
+    solution = lv.solve(problem)
+    assert solution.message.startswith("anderson on 70 islands") and solution.work["factorisations"] > 140
+
+
+def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
+    """Somebody looks for it between two of them."""
+    rng = np.random.default_rng(0)
+    parts = [g @ g.T + 1e-3 * np.eye(90) for g in rng.normal(size=(100, 90, 40))]
+    problem = lv.Problem.contact(block_diag(parts, format="csr"), rng.normal(size=9000), np.full(3000, 0.5))
+    assert lv.explain(problem).small == who(problem) != ""
+    main = threading.get_ident()
+
+    def interrupt():
+        while sys._current_frames()[main].f_code is not SmallCall.solve.__code__:
+            pass
+        _thread.interrupt_main()
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    while (found := lv.solve(problem)).status is lv.Status.CONVERGED:
+        pass  # until the other thread had its turn in a call
+    thread.join()
+    assert found.status is lv.Status.INTERRUPTED
+    np.testing.assert_array_equal(found.impulse, problem.start())
+
+
+def test_one_call_has_steps_for_every_island_of_velocities():
+    """A hundred arms that touch nothing of each other: steps are told of all of them together."""
+    part = random_general(3, "cone", n=6, compliance=False, contacts=2)
+    many = 100
+    whole = lv.Generalized(
+        *(block_diag(many * [x], format="csr") for x in (part.generalized.jac, part.generalized.mass)),
+        np.tile(part.generalized.v_free, many),
+    )
+    cones = part.cones
+    for _ in range(many - 1):
+        cones = cones + part.cones
+    problem = lv.Problem(
+        np.tile(part.b, many),
+        cones,
+        generalized=whole,
+        compliance=np.tile(part.compliance, many),
+        friction=part.friction,
+    )
+    found = solve_first(problem.metric, None, 1e-6, AUTO.limits)
+    assert found and found[1][0] > many
+
+
+def test_the_one_call_keeps_to_what_newton_does_by_default():
+    """1,500 arms, of which some take two steps: more in all than `newton` has."""
+    rng = np.random.default_rng(1)
+    arms = [(rng.normal(size=(1, 3)), q @ q.T) for q in rng.normal(size=(1500, 3, 5))]
+    jac, mass = (block_diag(x, format="csr") for x in zip(*arms, strict=True))
+    v = 2.0 * rng.normal(size=4500)
+    problem = lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.contacts(0.0, tangents=0, count=1500))
+    assert check(problem, "newton").iterations <= registry.get("newton").max_iter

@@ -1,0 +1,168 @@
+"""The front door: what it refuses before anything runs, budgets, clocks, history, callbacks, Ctrl-C."""
+
+import copy
+import dataclasses
+import pickle
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from random_problems import FORMS, random_contact_problem
+
+import lavender as lv
+from lavender import registry
+from lavender.judge.solution import Claim, Status
+from lavender.solving import many
+
+TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+
+REFUSED = {
+    "no problem": (lambda: lv.solve(np.eye(2), "pgs"), lv.InputError, "Problem"),
+    "a matrix and a vector": (lambda: lv.solve(np.eye(2), [1.0, -1.0]), lv.InputError, "Problem.lcp"),
+    "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
+    "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
+    "an option of others": (lambda: lv.solve(TINY, "direct", order="reverse"), lv.CapabilityError, "order"),
+    "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
+    "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
+    "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
+    "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
+    "history of a finite solver": (
+        lambda: lv.solve(TINY, "direct", history=True),
+        lv.CapabilityError,
+        "history",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_senseless_request_is_refused_with_its_reason(name):
+    call, error, sign = REFUSED[name]
+    with pytest.raises(error, match=sign):
+        call()
+
+
+def test_nothing_ran_where_a_request_is_refused(register):
+    ran = []
+    spec = dataclasses.replace(registry.get("pgs"), factory=lambda **options: ran.append(options))
+    register(spec)
+    with pytest.raises(lv.LavenderError):
+        lv.solve(TINY, "pgs", nothing=1)
+    assert ran == []
+
+
+def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():
+    problem = lv.Problem.lcp(np.eye(2), [5.0, 5.0], lower=1.0, upper=9.0, guess=[2.0, 3.0])
+    at_start = lambda p, **more: lv.solve(p, "pgs", max_iter=0, tol=0.0, **more).impulse.tolist()  # noqa: E731
+    assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
+    assert at_start(problem) == [2.0, 3.0]
+    assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
+
+
+class Interrupted:
+    """Ctrl-C in the middle of the second call."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def prepare(self, problem):
+        return problem
+
+    def update(self, state, problem):
+        return problem
+
+    def run(self, state, impulse, n, tol, time_limit=None):
+        self.calls += 1
+        impulse += 1.0
+        if self.calls > 1:
+            raise KeyboardInterrupt
+        return Claim(Status.MAX_ITERATIONS, n)
+
+
+def test_ctrl_c_is_a_result(register):
+    spec = dataclasses.replace(registry.get("pgs"), name="interrupted", factory=Interrupted, options={})
+    register(spec)
+    problem = lv.Problem.lcp(np.eye(2), [50.0, 50.0])
+    solution = lv.solve(problem, "interrupted", tol=1e-9, max_iter=10**6)
+    assert solution.status is Status.INTERRUPTED
+    np.testing.assert_array_equal(solution.impulse, 2.0)  # what it had come to
+    assert not solution.success
+    with pytest.raises(lv.SolveFailed):
+        solution.raise_for_status()
+
+
+def test_what_was_done_is_printed_in_words():
+    problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+    assert ", 1 sweep, " in str(lv.solve(problem, "pgs"))
+    assert ", 3 sweeps, " in str(lv.prepare(problem, "pgs").solve(tol=0.0, max_iter=3))
+    assert lv.prepare(problem).solve().solver.name == "auto"
+
+
+def test_zero_iterations_judge_the_start():
+    solution = lv.solve(TINY, "pgs", max_iter=0)
+    assert solution.iterations == 0
+    assert solution.residual.relative == lv.residual(TINY, TINY.start()).relative == 1.0
+
+
+@pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])
+@pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_problem_that_replaced_the_prepared_one_stays(form, name, budget):
+    """Whichever way solves it: `auto` has a call of its own for small problems."""
+    first = FORMS[form](random_contact_problem(1, tangents=2, spin=False))
+    second = dataclasses.replace(first, b=1.7 * first.b + 0.1)
+    prepared = lv.prepare(first, name)
+    prepared.solve(second, tol=1e-8)
+    assert prepared.problem is second
+    solution = prepared.solve(tol=1e-8, **budget)
+    assert solution.residual.relative == lv.residual(second, solution.impulse).relative
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
+    prepared = lv.prepare(TINY, "jacobi", omega=0.6)
+    right = prepared.solve(tol=1e-9)
+    other = copied(prepared)
+    assert other.state is not prepared.state and other.options == prepared.options
+    np.testing.assert_array_equal(other.solve(tol=1e-9).impulse, right.impulse)
+
+
+@pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")
+@pytest.mark.parametrize("form", ["matrix", "J and M"])
+def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkeypatch):
+    """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
+    n, begun, solve, hand = 2000, [], many.solve, many.Hand
+
+    def interrupt():
+        begun.append(form)
+        if len(begun) == 1:
+            signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+        time.sleep(1e-3)
+
+    def slow(*args, **options):
+        interrupt()
+        return solve(*args, **options)
+
+    class SlowHand:
+        def __init__(self, worlds, stop):
+            self.hand, self.stop = hand(worlds, stop), stop
+
+        def solve(self, *args):
+            if form == "matrix":
+                return self.hand.solve(*args)
+            interrupt()
+            while not self.stop[0]:
+                time.sleep(1e-3)
+            return self.hand.solve(*args)
+
+    monkeypatch.setattr(many, "solve", slow)
+    monkeypatch.setattr(many, "Hand", SlowHand)
+    problem = (
+        TINY
+        if form == "matrix"
+        else lv.Problem.from_jacobian(np.eye(2), np.eye(2), -np.ones(2), cones=TINY.cones)
+    )
+    with pytest.raises(KeyboardInterrupt):
+        lv.solve_many([dataclasses.replace(problem, copy=False) for _ in range(n)], threads=2)
+    assert 1 <= len(begun) < n / 2

@@ -1,0 +1,138 @@
+"""Large piles: threads, written-out orders and neighbours in space change speed, never the answer."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from random_problems import random_contact_problem, sweeps
+
+import lavender as lv
+from benchmarks.made import lattice_pile
+from lavender.problem.ordering import block_order, body_ranks
+from lavender.solvers import layout, sweeping
+from lavender_ext.sweep.threaded import Team
+
+NAME = "sequential_impulses"
+ORDERS = ("reverse", "colored", "bottom_up", "top_down", "local")
+
+
+@pytest.fixture(scope="module")
+def pile():
+    return lattice_pile(600, shuffle=True)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_writing_out_changes_no_bit(order, pile, monkeypatch):
+    """Cold start: v = 0 in any numbering, and every block then reads the same values in the same order."""
+    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    plain = sweeps(pile, NAME, 7, order=order)
+    monkeypatch.setattr(layout, "LARGE", 1)
+    state = lv.prepare(pile, "sequential_impulses", order=order).state
+    assert state.layout is not None
+    np.testing.assert_array_equal(sweeps(pile, NAME, 7, order=order), plain)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
+    problem = random_contact_problem(seed, bodies=12, joints=5, contacts=30)
+    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    start = sweeps(problem, NAME, 3)
+    plain = {o: sweeps(problem, NAME, 20, order=o, impulse=start) for o in ORDERS}
+    monkeypatch.setattr(layout, "LARGE", 1)
+    for order, impulse in plain.items():
+        # v = M^-1 J^T lam of the warm start is summed in another order: rounding, carried through 20 sweeps.
+        np.testing.assert_allclose(
+            sweeps(problem, NAME, 20, order=order, impulse=start),
+            impulse,
+            rtol=0,
+            atol=1e-11 * np.abs(impulse).max(),
+        )
+
+
+def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
+    monkeypatch.setattr(layout, "LARGE", 1)
+    solver = lv.prepare(pile, "sequential_impulses", order="local")
+    solver.solve(tol=1e-30, max_iter=40)
+    relative, impulse = solver.state.best
+    assert lv.residual(pile, impulse).relative == pytest.approx(relative, rel=1e-9)
+
+
+def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
+    monkeypatch.setattr(layout, "LARGE", 1)
+    problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
+    blocks = np.arange(problem.n_blocks)[::-1]
+    state = lv.prepare(problem, "sequential_impulses", order=blocks).state
+    assert state.layout is None
+
+
+@pytest.mark.parametrize("name", lv.available(threads=True))
+@pytest.mark.parametrize("large", [1, 10**9])
+def test_threads_change_no_bit(name, large, pile, monkeypatch):
+    """Small problems fall back to one thread; here they may not."""
+    monkeypatch.setattr(layout, "LARGE", large)
+    monkeypatch.setattr(sweeping, "GRAIN", 0)
+    monkeypatch.setattr(sweeping, "LEAST", 0)
+    for problem in (pile, random_contact_problem(3, bodies=40, joints=20, contacts=200)):
+        results = [
+            lv.solve(problem, name, order="colored", threads=t, tol=1e-6, max_iter=60) for t in (1, 2, 3, 5)
+        ]
+        assert len({s.impulse.tobytes() for s in results}) == 1
+        assert len({(s.iterations, s.status) for s in results}) == 1
+
+
+def test_a_leader_needs_no_helper(pile):
+    """Helpers that never come, or come when all is done, change nothing."""
+    prepared = lv.prepare(pile, "sequential_impulses", order="colored")
+    state, lam = prepared.state, pile.start()
+    team = Team(state.sweeps, state.watch, lam, state.order.color_ptr, 8)
+    assert team.lead(5, 0.0) == (0, 5)
+    np.testing.assert_array_equal(lam, sweeps(pile, NAME, 5, order="colored"))
+    before = lam.copy()
+    for thread in (-1, 0, 1, 7, 8, 100):
+        team.help(thread)
+    np.testing.assert_array_equal(lam, before)
+
+
+def test_small_problems_stay_on_one_thread():
+    problem = lattice_pile(60)
+    solver = lv.prepare(problem, "sequential_impulses", order="colored", threads=2)
+    assert not solver.solver.uses_threads(solver.state)
+
+
+def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
+    """A lattice whose bodies and contacts were shuffled: the differences of numbers shrink by more than half."""
+    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    body = pile.rows.contact_body
+    moving = (body >= 0).all(axis=1)
+    rank = body_ranks(pile)
+    assert sorted(rank.tolist()) == list(range(pile.rows.n_bodies))
+    span = np.abs(np.diff(rank[body[moving]].astype(int))).mean()
+    assert span < 0.5 * np.abs(np.diff(body[moving].astype(int))).mean()
+    blocks = block_order(pile, "local").blocks
+    low = np.where(body < 0, len(rank), rank[body]).min(axis=1)[blocks]
+    assert (np.diff(low) >= 0).all()
+
+
+def test_local_takes_a_matrix_too(pile):
+    matrix = lv.Problem.contact(pile.delassus(), pile.b, pile.cones.mu)
+    blocks = block_order(matrix, "local").blocks
+    assert sorted(blocks.tolist()) == list(range(matrix.n_blocks))
+    assert lv.solve(matrix, "pgs", order="local", tol=1e-6, max_iter=5000).success
+
+
+@pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
+def test_update_keeps_what_comes_from_the_structure(order, pile, monkeypatch):
+    monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
+    monkeypatch.setattr(layout, "LARGE", 1)
+    other = replace(pile, b=pile.b * 1.25)
+    prepared = lv.prepare(pile, "sequential_impulses", order=order)
+    prepared.solve(tol=0.0, max_iter=3)
+    fresh = sweeps(other, NAME, 3, order=order)
+    found = []
+    for module, name in ((sweeping, "block_order"), (layout, "body_ranks")):
+        true = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *a, _true=true, **kw: found.append(_true) or _true(*a, **kw))
+    changed = prepared.solve(other, tol=0.0, max_iter=3)
+    assert changed.impulse.tobytes() == fresh.tobytes()
+    # An order that changes with every sweep begins anew; of the others nothing is looked for again.
+    assert len(found) == (order in ("random", "symmetric"))

@@ -1,0 +1,165 @@
+"""Campaigns: the same records by any number of workers, and none lost with a worker."""
+
+import json
+import math
+import os
+import signal
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import bench, report
+from lavender.lab.bench.record import to_json
+from lavender.lab.report import tables
+
+NAMES = bench.seeds(["random_spd(n=12, condition=100)", "granular(n=2)", "toy_stack"], 4)
+PLAN = bench.CampaignPlan(levels=(1e-3, 1e-6), budgets=(4, 8), orders=("random:1",))
+
+
+def lines(records):
+    return [json.dumps(to_json(r)) for r in records]
+
+
+def test_seeds_are_spread_over_cases_that_take_one():
+    assert bench.seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack"], 2) == [
+        "granular(n=2, seed=0)",
+        "granular(n=2, seed=1)",
+        "random_spd(seed=5)",
+        "toy_stack",
+    ]
+    assert bench.seeds(["granular(n=2)"], 2, first=7) == ["granular(n=2, seed=7)", "granular(n=2, seed=8)"]
+    with pytest.raises(lv.InputError):
+        bench.seeds(["2 +"], 2)
+
+
+def test_the_same_bits_by_one_worker_and_by_two_and_no_times():
+    one = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=1)
+    two = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=2)
+    assert lines(one) == lines(two)
+    assert [s.case for s in one.skips] == [s.case for s in two.skips]
+    assert len({r.case for r in one}) == len(NAMES) == 9
+    assert all(math.isnan(r.time_min) and math.isnan(r.setup_min) for r in one)
+    for r in one:
+        if r.case == NAMES[0] and r.solver == "pgs" and r.mode == "budget" and r.order == "given":
+            from lavender import suite
+
+            again = lv.solve(suite.case(NAMES[0]).problem, "pgs", tol=0.0, max_iter=r.max_iter)
+            assert again.residual.relative == r.relative
+
+
+def test_a_campaign_goes_on_where_it_was_killed(tmp_path):
+    path = tmp_path / "records.jsonl"
+    whole = bench.campaign(NAMES, ["pgs", "gauss_seidel"], PLAN, path, workers=1)
+    kept = path.read_bytes()[: int(0.6 * path.stat().st_size)]
+    path.write_bytes(kept)
+    events = []
+    again = bench.campaign(NAMES, ["pgs", "gauss_seidel"], PLAN, path, workers=1, watch=events.append)
+    assert lines(again) == lines(whole)
+    assert {(s.case, s.solver) for s in again.skips} == {(s.case, s.solver) for s in whole.skips}
+    assert 0 < len(events) < 2 * len(NAMES)
+
+
+def test_problems_and_files_travel_too(tmp_path):
+    from lavender import io
+
+    p = lv.Problem.lcp(np.array([[2.0, 1.0], [1.0, 2.0]]), np.ones(2), name="mine")
+    io.save(p, tmp_path / "file.npz")
+    (tmp_path / "bad.npz").write_bytes(b"broken")
+    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(), orders=())
+    records = bench.campaign([p, tmp_path / "file.npz", tmp_path / "bad.npz"], ["pgs"], plan, workers=2)
+    assert [(r.case, r.success) for r in records] == [("mine", True), ("file", True)]
+    assert ["did not load" in s.reason for s in records.skips] == [True]
+
+
+@pytest.mark.parametrize(
+    ("backend", "sign"),
+    [
+        ("nowhere", "'loky' runs processes"),
+        ("loky=here", "'loky' runs processes"),
+        ("dask=tcp://127.0.0.1:1", "no dask scheduler answers"),
+        ("dask", "DASK_SCHEDULER_ADDRESS"),
+    ],
+)
+def test_a_backend_that_is_not_there_is_an_input_error(backend, sign, monkeypatch):
+    if backend.startswith("dask"):
+        pytest.importorskip("distributed", reason="a cluster needs dask.distributed (extra: cluster)")
+        monkeypatch.setattr(sys.modules["lavender.lab.bench.running.campaign"], "CONNECT", 0.2)
+    with pytest.raises(lv.InputError, match=sign):
+        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("backend", "package"), [("dask", "lavender-contact\\[cluster\\]"), ("ray", "ray\\[default\\]")]
+)
+def test_a_cluster_without_its_package_says_what_to_install(backend, package, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed" if backend == "dask" else "ray", None)
+    with pytest.raises(lv.InputError, match=f"pip install '{package}'"):
+        bench.campaign(NAMES[:1], ["pgs"], PLAN, backend=backend)
+
+
+@pytest.mark.slow
+def test_ray_gives_the_same_bits():
+    ray = pytest.importorskip("ray", reason="a ray cluster needs ray")
+    expected = bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1)
+    ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False)
+    try:
+        assert lines(bench.campaign(NAMES[:2], ["pgs"], PLAN, workers=1, backend="ray")) == lines(expected)
+    finally:
+        ray.shutdown()
+
+
+def test_the_report_of_a_campaign_shows_shares_and_no_times(tmp_path):
+    records = bench.campaign(NAMES, ["pgs", "direct"], PLAN, workers=1)
+    rows = {(r.family, r.solver): r for r in tables.robustness(records)}
+    dense = rows["dense", "direct"]
+    assert (dense.cases, dense.reached[1e-6], dense.wrong, dense.died) == (4, 4, 0, 0)
+    budget = [
+        r.relative for r in records if "random_spd" in r.case and r.max_iter == 8 and r.order == "given"
+    ]
+    assert rows["dense", "pgs"].budgets[8] == (np.median(budget), max(budget))
+    text = report.write(records, tmp_path).read_text()
+    assert "Campaign" in text
+    assert "Which solver</h2>" not in text
+    assert not (tmp_path / "figures").exists()
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
+    distributed = pytest.importorskip(
+        "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
+    )
+    names = bench.seeds(["granular(n=2)"], 40)
+    plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
+    expected = bench.campaign(names, ["pgs", "jacobi"], plan, workers=1)
+    with (
+        distributed.LocalCluster(
+            n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        pids = list(client.run(os.getpid).values())
+        assert len(set(pids)) == 3
+        half = threading.Event()
+
+        def watch(event):
+            if event.done >= event.total // 3 and not half.is_set():
+                half.set()
+                os.kill(pids[0], signal.SIGKILL)
+
+        found = bench.campaign(names, ["pgs", "jacobi"], plan, backend="dask", watch=watch)
+        while pids[0] in client.run(os.getpid, on_error="ignore").values():  # until the cluster has noticed
+            time.sleep(0.1)
+    assert half.is_set()
+    assert lines(found) == lines(expected)
+
+
+def test_errors_travel_between_processes():
+    import pickle
+
+    error = lv.UnknownName("solver", "pgz", ["pgs"])
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again)) == (lv.UnknownName, str(error))

@@ -1,0 +1,131 @@
+"""Motions of problems that other rooms are tested on: ellipses, rolling, float32, derivatives."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from random_problems import dragged
+
+import lavender as lv
+from lavender.lab.motion.unique import uniqueness
+
+
+def test_several_motions_are_told():
+    # Painleve's kind: friction and normal couple so that a contact may stick or lift
+    p = lv.Problem.contact(np.array([[1.0, -2.5], [-2.5, 8.0]]), [1.0, -4.0], mu=[1.0])
+    found = lv.motions(p)
+    d = lv.derivative(p, found[0].impulse)
+    assert len(d.motions) == len(found) and d.motions.all == found.all
+
+
+def free(seed, contacts=3, friction="coulomb", mu=None):
+    return dragged(seed, contacts, mu, friction=friction)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: lv.Cones.contacts([(0.5, 0.0)]), r"contact 0 is \[0.5, 0.0\].*two numbers above 0"),
+        (lambda: lv.Cones.contacts([(0.5, 0.5), (1e-30, 0.5)]), "contact 1 is"),
+        (lambda: lv.Cones.contacts([(0.5, -0.2)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, np.nan)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, np.inf)]), "mu"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1, 0.2)]), "one for each tangent"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], 1), "bounds no spin"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], patch_radius=0.1), "bounds no spin"),
+        (lambda: lv.Cones.contacts([(0.5, 0.1)], rolling=0.1), "no rolling"),
+        (lambda: lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.1)], 0.1), "bounds no spin"),
+        (lambda: lv.Cones([0, 2], [7], np.zeros(2), np.ones(2), [0.5], [1.0]), "ellipse of 2 rows"),
+        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [0.5], [0.0]), "mu_2 / mu_1 = 0"),
+        (lambda: lv.Cones([0, 3], [7], np.zeros(3), np.ones(3), [1e300], [1e12]), "mu_2 must be finite"),
+        (lambda: lv.motions(free(0)), "problem.disk"),
+        (lambda: free(0).to_findex(), "bounds its tangents together"),
+        (lambda: free(0).save("x.hdf5"), "ellipses"),
+    ],
+)
+def test_what_is_no_ellipse_or_takes_none_is_told(make, words):
+    with pytest.raises(lv.LavenderError, match=words):
+        make()
+
+
+def test_our_solvers_are_held_to_the_floor_of_float64_whatever_the_data_were():
+    rng = np.random.default_rng(0)
+    b = rng.normal(size=(40, 40))
+    p = lv.Problem.lcp(b @ b.T / 40 + 0.3 * np.eye(40), rng.normal(size=40) + 1.0, precision="float32")
+    exact = lv.solve(p, tol=1e-13)
+    early = lv.solve(p, "pgs", tol=1e-13, impulse=exact.impulse.astype(np.float32), max_iter=1)
+    assert lv.residual(p, early.impulse).at_floor  # of an answer made in float32
+    assert early.status is lv.Status.MAX_ITERATIONS
+    assert not early.residual.at_floor
+    assert not lv.motion.adopt(p, early.impulse).accepted
+    for solution in (exact, lv.solve(p, max_iter=1000)):  # by a compiled call, and step by step
+        assert solution.residual.precision == "float64"
+
+
+@pytest.mark.parametrize("light", [1.0, 1e16])
+def test_an_asymmetry_is_seen_beside_lighter_bodies(light):
+    """Entries of heavy bodies are rounding beside those of light ones; they are none beside each other."""
+    heavy = [[1.0, 0.9], [-0.9, 1.0]]
+    problem = lv.Problem.lcp(sp.block_diag([[[light]], heavy]).toarray(), [1.0, 1.0, -0.5])
+    assert not problem.is_symmetric and not problem.is_semidefinite
+    assert problem.asymmetry == pytest.approx(1.8)
+    assert "osqp" not in lv.available(problem)
+    assert lv.motion_error(problem, np.zeros(3)).bound is None
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(40, 60)) * 10.0 ** rng.uniform(-9.0, 9.0, (40, 1))
+    a = root @ root.T
+    assert lv.Problem.linear(a * (1.0 + 1e-15 * rng.normal(size=a.shape)), np.ones(40)).is_symmetric
+
+
+def test_where_one_motion_is_proven_starts_find_no_other():
+    """Small friction and a small moment: one motion by the criterion; with much of both each one found is one."""
+    rng = np.random.default_rng(3)
+    g = rng.normal(size=(10, 12))
+    a, b = g @ g.T + 2.0 * np.eye(10), rng.normal(size=10)
+    few = lv.Problem(b, lv.Cones.contacts(0.01, rolling=0.01, count=2), a)
+    assert uniqueness(few)
+    assert not uniqueness(lv.Problem(b, lv.Cones.contacts(0.01, rolling=5.0, count=2), a))
+    assert len(lv.motions(few)) == 1
+    for motion in lv.motions(lv.Problem(b, lv.Cones.contacts(2.0, rolling=3.0, count=2), a)):
+        assert motion.reference.residual.relative <= 1e-9
+
+
+TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+
+
+def test_what_is_found_can_be_compared_and_kept_in_a_set():
+    for found in (
+        lambda: lv.solve(TINY, "pgs", history=True),
+        lambda: lv.solve(TINY, "pgs", history=True).history,
+        lambda: lv.solve(TINY).residual,
+        lambda: lv.redundancy(TINY),
+        lambda: lv.motion_error(dataclasses.replace(TINY), [0.0, 0.0]),
+        lambda: lv.Simulation("stack").scene.bodies[1],
+    ):
+        one, two = found(), found()
+        assert one == one and one != two and len({one, two}) == 2
+
+
+def test_the_motion_of_a_step_is_the_motion_error_of_its_problem():
+    sim = lv.Simulation(lv.Scene("stack", friction=0.0, solver_iterations=4, substeps=1), report_motion=True)
+    for _ in range(20):
+        problem = sim.constraint_problem()
+        *_, info = sim.step()
+    error = lv.solve(problem, "sequential_impulses", tol=0, max_iter=4).motion_error()
+    # 1e-10: both references are solved to 1e-12 and better, from two starts and so by other sweeps.
+    for key in ("relative", "speed", "bound"):
+        assert info["motion"][key] == pytest.approx(getattr(error, key), rel=1e-10)
+    # The plane is body 0 of the scene and no body of the rows.
+    assert info["motion"]["body"] == sim.scene.bodies[1 + error.body].name
+    assert info["motion"]["open"] == 0.0
+
+
+def test_under_friction_a_step_is_near_one_of_its_motions():
+    sim = lv.Simulation(lv.Scene("stack", solver_iterations=16), report_motion=True)
+    for _ in range(10):
+        *_, info = sim.step()
+    motion = info["motion"]
+    assert 0.0 < motion["relative"] < 0.5
+    assert motion["bound"] is None
+    assert motion["open"] >= 0.0

@@ -1,0 +1,242 @@
+"""`lavender.prove`: what is proven is so, for every law, kind of contact and form; what is not says why."""
+
+import sys
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import lavender as lv
+from lavender import suite
+from lavender.lab import proof
+from tests import proof_twin
+from tests.random_problems import random_contact_problem
+
+flint = pytest.importorskip("flint", reason="python-flint (extra proof) is not installed")
+
+
+def planted(seed, friction="coulomb"):
+    """(problem, exact solution): whole numbers throughout, so that b = A x - w is exact; slides go along (3, 4) / 5."""
+    rng = np.random.default_rng(seed)
+    contacts, bounded = int(rng.integers(1, 4)), int(rng.integers(0, 4))
+    m = bounded + 3 * contacts
+    root = rng.integers(-3, 4, (m, m)).astype(float)
+    a = root @ root.T + np.eye(m) * 4.0
+    x, w = np.zeros(m), np.zeros(m)
+    lower, upper = np.zeros(bounded), np.full(bounded, 64.0)
+    for i in range(bounded):
+        case = rng.integers(0, 3)
+        x[i] = (float(rng.integers(1, 60)), 0.0, 64.0)[case]
+        w[i] = (0.0, 1.0, -1.0)[case] * rng.integers(1, 9)
+    for i in range(bounded, m, 3):
+        case = rng.integers(0, 3)
+        if case == 0:  # open
+            w[i : i + 3] = rng.integers(8, 16), *rng.integers(-3, 4, 2)
+        elif case == 1:  # sticks
+            x[i : i + 3] = rng.integers(20, 40), *rng.integers(-5, 6, 2)
+        else:  # slides: |x_t| = x_n / 2 against w_t
+            size, speed = 10.0 * rng.integers(1, 5), 5.0 * rng.integers(1, 5)
+            turn = np.array([3.0, 4.0]) * rng.choice([-1, 1], 2)
+            x[i], x[i + 1 : i + 3] = size, -0.5 * size * turn / 5.0
+            w[i], w[i + 1 : i + 3] = (0.5 * speed if friction == "cone" else 0.0), speed * turn / 5.0
+    cones = lv.Cones.bounded(lower, upper) + lv.Cones.contacts(0.5, count=contacts)
+    return lv.Problem(a @ x - w, cones, a, friction=friction), x
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_a_planted_solution_lies_inside(friction):
+    """And no answer that is off by s is proven with a radius below s."""
+    proven = 0
+    for seed in range(150):
+        problem, exact = planted(seed, friction)
+        rng = np.random.default_rng(seed)
+        given = exact.copy()
+        given[rng.integers(problem.m)] += 10.0 ** rng.integers(-12, -3)
+        off = abs(given - exact).max()  # exact: they are near each other
+        found = lv.prove(problem, given)
+        if found.proven:
+            proven += 1
+            # Coulomb's law may have another solution nearer: then this one is outside, and the radius is still true.
+            if friction == "cone" or found.unique or np.allclose(found.impulse, exact, atol=1e-6):
+                assert off <= found.impulse_radius <= off * (1 + 1e-9) + 1e-30
+                assert np.allclose(found.impulse, exact, rtol=1e-15, atol=1e-25)
+        else:
+            assert found.impulse_radius == np.inf and found.reason
+    assert proven >= 148
+
+
+def test_a_linear_problem_beside_rational_numbers():
+    """lambda = A^-1 b by fractions is within what was proven, for well and badly conditioned A."""
+    for condition in ("10", "1e6", "1e12"):
+        problem = suite.case(f"random_spd(n=12, condition={condition})").problem
+        a = [[Fraction(x) for x in row] for row in problem.dense().tolist()]
+        b = [Fraction(x) for x in problem.b.tolist()]
+        for k in range(12):  # Gauss-Jordan
+            scale = 1 / a[k][k]
+            a[k], b[k] = [x * scale for x in a[k]], b[k] * scale
+            for i in set(range(12)) - {k}:
+                f = a[i][k]
+                a[i], b[i] = [x - f * y for x, y in zip(a[i], a[k], strict=True)], b[i] - f * b[k]
+        solution = lv.solve(problem, "direct", tol=1e-12)
+        found = lv.prove(problem, solution)
+        off = max(abs(Fraction(x) - y) for x, y in zip(solution.impulse.tolist(), b, strict=True))
+        assert found.proven and off <= Fraction(found.impulse_radius) <= off * 2 + Fraction(1, 10**25)
+
+
+CASES = (
+    "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)", "four_bar",
+    "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_cases_of_the_suite_are_proven_where_rows_depend_on_each_other_too(name):
+    problem = suite.case(name).problem
+    found = lv.prove(problem, lv.solve(problem, tol=1e-12))
+    assert found.proven, found
+    # What is enclosed is a solution for the judge as well; bodies at 10 m/s and 1 kg, to 1e-9 of them.
+    assert lv.residual(problem, found.impulse).relative < 1e-12
+    assert found.velocity_radius < 1e-8
+
+
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+@pytest.mark.parametrize("rolling", [False, True])
+def test_every_kind_of_contact_and_form(friction, rolling):
+    """Bodies, their A as a dense and as a sparse matrix, and J and M: one solution, by each of them."""
+    proven = 0
+    for seed in range(12):
+        problem = random_contact_problem(seed, friction, bodies=6, joints=2, contacts=3, rolling=rolling)
+        solution = lv.solve(problem, "newton", tol=1e-13)
+        found = lv.prove(problem, solution)
+        proven += found.proven
+        if not found.proven:
+            continue
+        assert found.velocity_radius <= 1e-9
+        dense = lv.Problem(problem.b, problem.cones, problem.dense(), friction=friction)
+        csr = lv.Problem(problem.b, problem.cones, sp.csr_array(problem.dense()), friction=friction)
+        for other in (dense, csr):
+            again = lv.prove(other, solution)
+            # A was rounded: another problem, whose solution is off by some 1e-16 times the condition.
+            assert again.proven and np.allclose(again.impulse, found.impulse, atol=1e-9)
+    assert proven >= 10
+
+
+@pytest.mark.parametrize("shape", ["box", "disk"])
+def test_ellipses_and_boxes(shape):
+    cones = lv.Cones.contacts([(0.2, 0.7)] * 2, shape=shape)
+    a = np.eye(6) * 2.0 + 0.25
+    for friction in ("coulomb", "cone"):
+        for b in ([3.0, 1.0, 4.0, 2.0, 0.1, 0.1], [3.0, -5.0, 4.0, -2.0, 0.3, 0.0]):
+            problem = lv.Problem(b, cones, a, friction=friction)
+            found = lv.prove(problem, lv.solve(problem, tol=1e-13))
+            assert found.proven and found.velocity_radius < 1e-11, found
+            assert lv.residual(problem, found.impulse).relative < 1e-14
+
+
+def test_generalised_coordinates():
+    rng = np.random.default_rng(0)
+    j, m = rng.normal(size=(9, 12)), np.eye(12) * 3.0 + 0.5
+    problem = lv.Problem.from_jacobian(j, m, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3))
+    found = lv.prove(problem, lv.solve(problem, tol=1e-13))
+    assert found.proven and found.velocity_radius < 1e-12
+
+
+def test_a_border_is_named():
+    """A block pushed exactly as hard as friction holds: between sticking and sliding, for any arithmetic."""
+    found = lv.prove((problem := suite.case("threshold").problem), lv.solve(problem, tol=1e-12))
+    assert not found.proven and found.borders == ("contact 0, normal",) and "contact 0" in str(found)
+
+
+def test_what_has_no_solution_is_not_proven():
+    for name in ("infeasible(kind=squeeze)", "infeasible(kind=joints)"):
+        problem = suite.case(name).problem
+        found = lv.prove(problem, np.ones(problem.m))
+        assert not found.proven and found.reason and found.impulse is None
+
+
+def test_doing_nothing_and_empty_problems():
+    problem = lv.Problem.lcp(np.eye(2), [-1.0, -2.0])
+    found = lv.prove(problem, np.zeros(2))
+    assert found.proven and found.impulse_radius == 0.0 == found.velocity_radius
+    assert lv.prove(lv.Problem.lcp(np.zeros((0, 0)), []), np.zeros(0)).proven
+
+
+def test_without_python_flint_it_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "flint", None)
+    with pytest.raises(lv.SolverUnavailable, match=r"\[proof\]"):
+        lv.prove(lv.Problem.lcp(np.eye(1), [1.0]), [1.0])
+
+
+@pytest.mark.parametrize("first", range(0, 200, 50))
+def test_a_twin_in_rational_numbers_finds_nothing_false(first):
+    tried = [proof_twin.attack(seed) for seed in range(first, first + 50)]
+    assert not [wrong for _, _, wrong in tried if wrong]
+    near = [held for label, held, _ in tried if label in ("strict exact", "strict near", "strict noise")]
+    assert sum(near) >= 0.9 * len(near) > 0
+
+
+def hair(h):
+    """Row 0 is pushed by h: a hair that balls of 256 bits cannot tell from nothing beside 1."""
+    a = [[2.0, -h, 1.0], [-h, 1.0, 0.0], [1.0, 0.0, 1.0]]
+    return lv.Problem(np.ones(3), lv.Cones.bounded([0.0], [np.inf]) + lv.Cones.free(2), np.array(a))
+
+
+def told_of_hairs():
+    """What is proven of row 0, which carries h / (1 - h^2) where that is positive, else nothing."""
+    pushed, pulled = (lv.prove(hair(h), [0.0, 1.0, 1.0]) for h in (2.0**-300, -(2.0**-300)))
+    return (
+        pushed.proven
+        and pushed.impulse_radius >= 2.0**-300
+        and pulled.proven
+        and pulled.impulse_radius == 0.0
+    )
+
+
+def test_hairs_are_told_in_rational_numbers():
+    assert told_of_hairs()
+
+
+def lower_end(x):
+    return float(abs(x).lower())
+
+
+def sign_of_upper_end(x):
+    return 1 if (x.upper() if isinstance(x, flint.arb) else x) >= 0 else -1
+
+
+@pytest.mark.parametrize(("name", "turned"), [("upper_end", lower_end), ("sign_of", sign_of_upper_end)])
+def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, turned):
+    monkeypatch.setattr(proof, name, turned)
+    assert not told_of_hairs() or any(proof_twin.attack(seed)[2] for seed in range(50))
+
+
+def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
+    a = np.array([[1.0, 1.0 + 2.0**-52], [1.0 + 2.0**-52, 1.0]])
+    problem = lv.Problem.lcp(a, [1.0, 1.0])
+    for given in ([1.0, 0.0], [0.0, 1.0]):  # two solutions
+        found = lv.prove(problem, given)
+        assert found.proven and found.impulse.tolist() == given and not found.unique
+
+
+def test_a_ball_about_zero_counts():
+    """w of a row that another moves by at most 1: [-1, 1] holds it."""
+    operator = proof.Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
+    w = operator.slack(proof.Balls(flint), [flint.arb(0, 1), flint.arb(0)])
+    assert w[1].contains(0.75) and w[0].contains(-1.5)
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        lv.Problem.lcp([[0.0]], [1.0]),
+        lv.Problem.linear([[0.0]], [1.0]),
+        lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]),
+        lv.Problem.lcp([[0.0, 1.0], [-1.75, 0.0]], [1.25, 0.5]),
+    ],
+)
+def test_an_infinite_impulse_is_no_solution(problem):
+    """0 lambda >= 1: an infinite impulse had met it."""
+    for x in (np.zeros(problem.m), np.ones(problem.m)):
+        found = lv.prove(problem, x)
+        assert not found.proven and found.impulse is None

@@ -1,0 +1,176 @@
+"""A limit is the caller's clock, on built-in problems of all sizes."""
+
+import sys
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from benchmarks.made import fresh
+from lavender import registry, suite
+from lavender.base import deadline
+from lavender.judge import residuals
+from lavender.judge.residuals import judging_time
+from lavender.solvers.auto import Tree
+from lavender.solvers.steps import Direct, Newton, setup_time
+from lavender_ext.small import checked_sweeps
+
+OWN = [name for name, spec in registry.specs().items() if spec.own and not spec.external and name != "auto"]
+
+
+LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
+
+
+class Clock:
+    """Stands still but for counted work."""
+
+    now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    made = Clock()
+    monkeypatch.setattr(deadline, "perf_counter", made)
+    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
+    return made
+
+
+def dense(m, law, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(m, m // 2))
+    a, b = half @ half.T / m + 0.01 * np.eye(m), rng.normal(size=m)
+    return lv.Problem.lcp(a, b) if law == "lcp" else lv.Problem.contact(a, b, 0.5, friction=law)
+
+
+def over_velocities(m, nv, seed=0):
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(nv, nv))
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2)
+    mass = half @ half.T / nv + np.eye(nv)
+    return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
+
+
+PROBLEMS = {
+    "J and M, dense": lambda: over_velocities(300, 100),
+    "matrix, cone": lambda: dense(300, "cone"),
+    "matrix, coulomb": lambda: dense(300, "coulomb"),
+    "matrix, lcp": lambda: dense(400, "lcp"),
+    "bodies, coulomb": lambda: suite.case("pyramidF(k=6)").problem,
+    "bodies, lcp": lambda: suite.case("stack(n=400)").problem,
+    "bodies, linear": lambda: suite.case("chain(n=60)").problem,
+}
+
+
+def play(monkeypatch, clock, pace, problem):
+    """The clock goes by what sweeps, steps that factor and analyses of `auto` are counted for, times `pace`."""
+    sweep, newton = checked_sweeps.run, registry.get("newton").load()
+    prepare, quiet = newton.prepare, []
+
+    def swept(over, watch, lam, n, *more):
+        found = sweep(over, watch, lam, n, *more)
+        clock.now += 1e-9 * pace * found[1] * problem.metric.work
+        return found
+
+    def turned(kind):
+        turn = kind.turn
+
+        def played(self, n):
+            claim = turn(self, n)
+            quiet.append(1)
+            each = Tree(problem).newton / Tree(problem).states["newton"].steps
+            quiet.clear()
+            clock.now += 1e-9 * pace * max(claim.iterations, 1) * each
+            return claim
+
+        return played
+
+    def prepared(self, of):
+        clock.now += 0.0 if quiet else pace * setup_time("newton", of)
+        return prepare(self, of)
+
+    monkeypatch.setattr(checked_sweeps, "run", swept)
+    monkeypatch.setattr(Newton, "turn", turned(Newton))
+    monkeypatch.setattr(Direct, "turn", turned(Direct))
+    monkeypatch.setattr(newton, "prepare", prepared)
+
+
+@pytest.mark.parametrize("pace", [0.3, 1.0, 3.0])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
+    problem, found = PROBLEMS[name](), []
+    play(monkeypatch, clock, pace, problem)
+    for limit in LIMITS:
+        clock.now = 0.0
+        found.append(lv.solve(fresh(problem), tol=1e-9, time_limit=limit).residual.relative)
+    # Below tol, and at the floor, who is better is no matter.
+    least = np.maximum(found, 1e-9)
+    assert (np.diff(least) <= 1e-12 * least[:-1]).all(), found
+    assert found[-1] < found[0]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_what_does_not_fit_is_not_begun(name, clock, monkeypatch):
+    """Nobody else solves under its name: the better of the start and of doing nothing goes back."""
+    spec = registry.get(name)
+    asked = 0
+    for make in PROBLEMS.values():
+        problem = make()
+        if spec.refuses(problem):
+            continue
+        close = 0.9 * lv.solve(fresh(problem), tol=1e-3).impulse
+        for start in (close, -1e3 * np.ones(problem.m)):
+            least = min(lv.residual(problem, x).relative for x in (start, problem.start()))
+            counted = spec.load()().setup_time(problem)
+            if counted == 0.0:
+                continue
+            asked += 1
+            with monkeypatch.context() as patch:
+                patch.setattr(spec.load(), "prepare", None)
+                limit = 2.0 * judging_time(problem) + 0.9 * counted
+                solution = lv.solve(problem, name, impulse=start, time_limit=limit)
+            assert solution.status is lv.Status.TIME_LIMIT and "set up" in solution.message
+            assert solution.solver.name == name and not solution.work
+            assert solution.residual.relative == least
+    assert asked or name in ("sequential_impulses", "anderson", "nncg", "block_gauss_seidel")
+
+
+@pytest.mark.parametrize("name", [*OWN, "auto"])
+@pytest.mark.parametrize("limit", [1e-6, 1e-4, 1e-3])
+def test_an_answer_is_no_worse_than_its_start(name, limit):
+    spec = registry.get(name)
+    for seed, make in enumerate(PROBLEMS.values()):
+        problem = make()
+        if spec.refuses(problem):
+            continue
+        solved = lv.solve(problem, tol=1e-6).impulse
+        rng = np.random.default_rng(seed)
+        for size in (1e-4, 0.3, 30.0):
+            start = solved + size * np.abs(solved).mean() * rng.normal(size=problem.m)
+            least = min(lv.residual(problem, x).relative for x in (start, problem.start()))
+            solution = lv.solve(fresh(problem), name, impulse=start, time_limit=limit, tol=1e-12)
+            if "unjudged" in solution.message:
+                assert np.array_equal(solution.impulse, start)
+            elif solution.status is lv.Status.TIME_LIMIT:
+                assert solution.residual.relative <= least * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("name", ["J and M, dense", "matrix, lcp", "bodies, coulomb"])
+def test_the_judge_begins_only_what_he_can_end(name, clock, monkeypatch):
+    """What he sets up fits, his pass behind it does not."""
+    problem = fresh(PROBLEMS[name]())
+    limit = residuals.setup_time(problem) + 0.9 * judging_time(problem)
+    solution = lv.solve(problem, "newton", time_limit=limit)
+    assert solution.status is lv.Status.TIME_LIMIT and "metric" not in vars(problem)
+    assert "unjudged" in solution.message and np.array_equal(solution.impulse, problem.start())
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel"])
+def test_what_sweeps_over_j_and_m_waits_for_no_a(name, clock):
+    """A was counted, and so nothing begun, for sweeps that never read it."""
+    problem = PROBLEMS["J and M, dense"]()
+    residuals.reference(problem)
+    assert lv.solve(problem, name, time_limit=2.0 * judging_time(problem), max_iter=3).iterations == 3
+    assert "_compressed" not in vars(problem)

@@ -1,0 +1,102 @@
+"""Backends of other packages on built-in problems: redundant, large, slow."""
+
+import numpy as np
+import pytest
+from random_problems import spd
+
+import lavender as lv
+from lavender import registry, suite
+from lavender.external import qp_solver
+
+BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
+
+
+DEFINITE = {"quadprog", "ecos", "pyqpmad"}
+
+
+def installed(*names):
+    """Backends by name, skipped where they are not."""
+    absent = pytest.mark.skipif(True, reason="not installed")
+    return [name if name in BACKENDS else pytest.param(name, marks=absent) for name in names]
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("mass_ratio", [1.0, 1e4])
+def test_redundant_contacts_in_the_form_that_suits_them(name, mass_ratio):
+    # Singular A, and at 1e4 ill-conditioned: the velocity form is definite, so quadprog takes it too.
+    problem = suite.box_stack(10, mass_ratio).problem
+    solution = lv.solve(problem, name)
+    assert solution.solver.form == ("velocity" if mass_ratio > 1.0 or name in DEFINITE else "impulse")
+    assert solution.success, str(solution)
+    # The boxes come to rest: A is singular, so the velocities are what is unique.
+    speed = np.abs(problem.velocity(solution.impulse)).max()
+    assert speed <= 1e-5 * 9.81 / 60.0
+
+
+@pytest.mark.parametrize("name", installed("quadprog", "ecos"))
+def test_singular_a_in_the_impulse_form_is_an_honest_failure(name):
+    problem = suite.box_stack(3).problem
+    start = np.full(problem.m, 0.01)
+    solution = lv.solve(problem, name, form="impulse", impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "not positive definite" in solution.message
+    assert np.array_equal(solution.impulse, start)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_backends_are_silent(name, capfd):
+    for problem in (lv.Problem.linear(*spd(6)), lv.Problem.lcp(*spd(6)), suite.box_stack(2).problem):
+        if registry.get(name).refuses(problem) is None:
+            lv.solve(problem, name)
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err == ""
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name, monkeypatch):
+    """A program was formed outside the clock: 10 ms of 8,000 rows under a limit of one."""
+    problem = suite.case("granular(n=6)").problem
+    lv.residual(problem, problem.start())
+    with monkeypatch.context() as patch:
+        patch.setattr(qp_solver.QPSolver, "prepare", None)
+        late = lv.solve(problem, name, time_limit=1e-3)
+    assert late.status is lv.Status.TIME_LIMIT and "set up" in late.message
+    assert late.setup_time < 1e-3 and not late.work
+    assert late.impulse.tobytes() == problem.start().tobytes()
+
+
+def test_a_backend_that_looks_at_the_clock_too_late_is_ended():
+    """DAQP looks at it rarely: on these rows it took seconds under a limit of a millisecond."""
+    if "daqp" not in BACKENDS:
+        pytest.skip("daqp is not installed")
+    problem = suite.case("granular(n=7)").problem
+    late = lv.solve(problem, "daqp", form="impulse", time_limit=0.02)
+    assert late.status is lv.Status.TIME_LIMIT and "ended at the time limit" in late.message
+
+
+@pytest.mark.parametrize("name", installed("osqp", "scs", "qpalm"))
+def test_time_limit_stops_a_backend(name):
+    # Far below what the first-order methods can reach: only the clock ends this.
+    problem = suite.box_stack(30, 1e6).problem
+    solution = lv.solve(problem, name, tol=1e-13, form="impulse", max_iter=10**8, time_limit=0.2)
+    assert solution.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR, lv.Status.STALLED), str(solution)
+
+
+@pytest.mark.parametrize(
+    "name", installed("osqp", "clarabel", "piqp", "qpalm", "scs", "proxqp", "clarabel_cone")
+)
+def test_the_iteration_budget_reaches_the_backend(name):
+    problem = suite.box_stack(10, 1e4).problem
+    solution = lv.solve(problem, name, max_iter=2, form="impulse")
+    assert solution.work["iterations"] <= 3  # qpalm counts the step it stops in
+    assert solution.status is not lv.Status.CONVERGED or solution.success
+    none = lv.solve(problem, name, max_iter=0)
+    assert none.status is lv.Status.MAX_ITERATIONS
+    assert none.work == {"backend_calls": 0}
+
+
+def test_unit_diagonal_is_a_choice():
+    problem = suite.box_stack(4).problem
+    for unit in (True, False):
+        assert lv.solve(problem, "osqp", form="impulse", unit_diagonal=unit).success

@@ -1,0 +1,277 @@
+"""`newton`, `admm` and `auto` on built-in problems, whose structure these properties need."""
+
+from dataclasses import replace
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from random_problems import as_matrix, good, seeds
+
+import lavender as lv
+from benchmarks.drawn import wild
+from lavender import registry, suite
+from lavender.base.deadline import Deadline
+from lavender.lab.suite import box_stack
+from lavender.lab.suite.build import FALL
+from lavender.solvers.newton import SPEC, Newton
+from lavender.solvers.newton_systems import systems
+from lavender.solvers.newton_systems.systems import make_system
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
+def test_heavy_box_on_light_ones(ratio):
+    problem = box_stack(6, ratio).problem
+    solution = lv.solve(problem, "admm", tol=1e-9)
+    assert solution.success or solution.residual.relative <= 2 * solution.residual.floor
+    # Four points carry what lies above them; velocities vanish.
+    above = np.r_[np.full(5, 1.0), ratio][::-1].cumsum()[::-1] * FALL
+    np.testing.assert_allclose(solution.impulse.reshape(6, 4).sum(1), above, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("ratio", "speed"), [(1.0, 0.5), (1e3, 0.0), (1e3, 0.5), (1e6, 0.5)])
+def test_coulomb_with_mass_ratios(ratio, speed):
+    # Sweeps do not get below 1e-2 here in 20,000.
+    problem = box_stack(4, ratio, "coulomb", speed).problem
+    solution = lv.solve(problem, "admm", tol=1e-7, max_iter=20_000)
+    assert solution.success, solution
+
+
+def test_iterations_do_not_grow_with_the_mass_ratio_as_sweeps_do():
+    counts = [lv.solve(box_stack(6, ratio).problem, "admm", tol=1e-8).iterations for ratio in (1.0, 1e2, 1e4)]
+    assert max(counts) < 500  # Gauss-Seidel: contraction R / (1 + R), 200,000 sweeps at 1e4
+
+
+def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
+    problem = box_stack(20, 10.0, "coulomb").problem
+    prepared = lv.prepare(problem, "admm")
+    solver, state = prepared.solver, prepared.state
+    impulse, made = problem.start(), state.factorisations
+    state.factor = None  # as of a problem whose first factor is large
+    solver.until(state, Deadline(-1.0))
+    claim = solver.run(state, impulse, 50, 1e-6)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert claim.iterations == 0
+    assert state.factorisations == made
+    assert "factorisation" in claim.message
+    # With time it goes on from there.
+    solver.until(state, Deadline())
+    assert solver.run(state, impulse, 500, 1e-6).work["factorisations"] > 0
+
+
+def test_a_large_factor_is_left_to_run_with_the_same_bits(monkeypatch):
+    problem = box_stack(8, 10.0).problem
+    before = lv.solve(problem, "admm", max_iter=200, tol=1e-8)
+    monkeypatch.setattr("lavender.solvers.admm.AT_ONCE", -1.0)
+    prepared = lv.prepare(problem, "admm")
+    assert prepared.state.factor is None
+    after = prepared.solve(max_iter=200, tol=1e-8)
+    assert after.impulse.tobytes() == before.impulse.tobytes()
+    assert after.work == before.work
+
+
+@pytest.mark.parametrize(
+    "problem",
+    [
+        lambda: suite.stack(n=200).problem,
+        lambda: suite.hang(n=24).problem,
+        lambda: suite.granular(n=4).problem,
+        lambda: suite.granular(n=3, friction="coulomb").problem,
+        lambda: suite.granular(n=3, friction="coulomb").problem.relaxed("cone"),
+        lambda: suite.pyramid(k=6, mass_ratio=1e6).problem,
+        lambda: suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem,
+        lambda: wild(seed=7921).problem,
+    ],
+)
+def test_turns_say_what_ran_and_what_came_of_it(problem):
+    problem = problem()
+    solution = lv.solve(problem, "auto", tol=1e-6)
+    assert solution.success, solution
+    work: dict[str, int] = {}
+    for turn in solution.turns:
+        name = turn.solver.removeprefix("relaxation: ").partition(" on ")[0]
+        assert name in registry.specs() and turn.solver in solution.message
+        assert not turn.after > turn.before  # the least so far; nan where nobody looked
+        for kind, count in turn.work.items():
+            work[kind] = work.get(kind, 0) + count
+    assert {kind: count for kind, count in work.items() if count} == {
+        kind: count for kind, count in solution.work.items() if count
+    }
+    assert solution.turns[-1].after == solution.residual.relative
+    begun = lv.residual(problem, problem.start()).relative
+    assert solution.turns[0].before == pytest.approx(begun, rel=1e-12)
+    assert lv.solve(problem, "newton").turns == ()
+
+
+def test_budget_and_warm_start():
+    problem = suite.pyramid(k=6, friction="coulomb", sliding=0.5).problem
+    none = lv.solve(problem, "auto", tol=1e-9, max_iter=0)
+    assert none.status is lv.Status.MAX_ITERATIONS
+    assert np.array_equal(none.impulse, problem.start())
+    full = lv.solve(problem, "auto", tol=1e-8)
+    assert full.success, full
+    again = lv.solve(problem, "auto", tol=1e-7, impulse=full.impulse)
+    assert again.message == "the start is a solution"
+    assert again.iterations == 0
+
+
+def test_ctrl_c_inside_a_solver_ends_the_chain(interrupted_newton):
+    """A chosen solver that was interrupted is the last one, and its iterate comes back."""
+    problem = lv.suite.case("pyramidF(k=4, mass_ratio=1e3)").problem
+    looks = interrupted_newton
+    solution = lv.solve(problem, "auto", tol=1e-12)
+    assert len(looks) == 5
+    assert solution.status is lv.Status.INTERRUPTED
+    assert solution.residual.relative <= min(looks)
+
+
+def test_a_looser_tolerance_costs_no_more():
+    # Whether the relaxation was left for good hung on where a check of its own fell: 50 times the sweeps.
+    problem = suite.granular(n=7, friction="coulomb", seed=8).problem
+    found = [lv.solve(problem, tol=tol) for tol in (1e-3, 1e-4, 1e-6)]
+    assert all(solution.success for solution in found), found
+    sweeps = [solution.work["sweeps"] for solution in found]
+    # Turns are as long as what is expected at that tolerance: in a shorter one the relaxation may begin later.
+    assert sweeps[0] <= 2.0 * sweeps[1], sweeps
+    assert sweeps[1] <= 2.0 * sweeps[2], sweeps
+
+
+def dense_h(problem):
+    s = 1.0 / np.sqrt(problem.d)
+    return problem.dense() * s[:, None] * s[None, :]
+
+
+def system_in(problem, form):
+    """The system of a problem; "sparse": the impulse form factored by panels whatever it costs."""
+    if form != "sparse":
+        return make_system(problem, form)
+    with mock.patch.multiple(systems, DENSE_ROWS=0, DENSE_FILL=2.0, EARLY_FILL=2.0):
+        system = make_system(problem, "impulse")
+    assert not system.dense
+    return system
+
+
+@given(seed=seeds)
+@settings(max_examples=20)
+def test_an_exchange_is_newtons_step_on_the_natural_map(seed):
+    problem = suite.stack(n=9, mass_ratio=5.0).problem
+    z = np.random.default_rng(seed).normal(size=problem.m)
+    h, g = dense_h(problem), problem.b / np.sqrt(problem.d)
+    free = z - (h @ z - g) >= 0.0
+    rows = np.where(free[:, None], h, np.eye(problem.m))
+    expected = np.linalg.solve(rows, np.where(free, g, 0.0))
+    for form in ("velocity", "impulse", "sparse"):
+        finite, found, relative, changed = system_in(problem, form).solve.exchange(z)
+        assert finite
+        # Nine bodies: H has a condition number of some hundreds, the normal matrix 1e9 times that before refinement.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7 * np.abs(expected).max() + 1e-14)
+        assert changed == np.count_nonzero(free != (found - (h @ found - g) >= 0.0))
+        truth = lv.residual(problem, found / np.sqrt(problem.d)).relative
+        assert relative == pytest.approx(truth, rel=1e-6, abs=1e-12)
+
+
+def test_a_narrow_matrix_is_factored_by_panels_that_do_not_fill():
+    problem = as_matrix(suite.box_stack(n=40).problem)
+    system = make_system(problem, "impulse")
+    assert not system.dense
+    assert system.sparse.work <= problem.m * 8**2  # two boxes, four points each
+    # Redundant points: A is singular, to rounding of either sign.
+    assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
+
+
+BOXES = {
+    "pyramid": lambda ratio: suite.pyramid(k=5, mass_ratio=ratio),
+    "boxes": lambda ratio: suite.box_stack(n=8, mass_ratio=ratio),
+    "with friction": lambda ratio: suite.pyramid(k=4, mass_ratio=ratio, friction="coulomb"),
+    "sliding": lambda ratio: suite.pyramid(k=6, mass_ratio=ratio, friction="coulomb", sliding=0.5),
+    "slow": lambda ratio: suite.box_stack(n=5, mass_ratio=ratio, friction="coulomb", sliding=0.05),
+}
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e3, 1e6])
+@pytest.mark.parametrize("form", ["velocity", "impulse", "cone", "matrix", "auto"])
+@pytest.mark.parametrize("name", BOXES)
+def test_redundant_boxes_cold_at_every_mass_ratio(name, form, ratio):
+    problem = BOXES[name](ratio).problem
+    if form == "cone" or form == "matrix":
+        problem = problem.relaxed("cone") if form == "cone" else as_matrix(problem)
+    asked = {"form": form} if form in ("velocity", "impulse") else {}
+    solution = lv.solve(problem, "auto" if form == "auto" else "newton", tol=1e-8, **asked)
+    assert good(solution, 1e-8), solution
+    if asked and problem.law == "lcp":
+        assert solution.work["factorisations"] <= 30 and solution.solver.form == form
+
+
+def test_sliding_boxes_obey_coulomb_and_not_the_relaxation():
+    problem = suite.box_stack(n=4, friction="coulomb", sliding=0.5).problem
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    assert good(solution, 1e-10), solution
+    other = lv.solve(problem.relaxed("cone"), "newton", tol=1e-10)
+    assert good(other, 1e-10), other
+    # The relaxation lifts what slides; the two velocities differ by far more than the tolerance.
+    gap = np.abs(problem.velocity(solution.impulse) - problem.velocity(other.impulse)).max()
+    assert gap > 1e-3
+
+
+def test_budget_and_floor_are_what_they_say():
+    problem = suite.pyramid(k=5, mass_ratio=1e6).problem
+    few = lv.solve(problem, "newton", tol=1e-12, max_iter=2)
+    assert few.status is lv.Status.MAX_ITERATIONS
+    assert few.work["factorisations"] <= 2 + 1  # an interior point start counts one
+    assert few.residual.relative <= lv.residual(problem, problem.start()).relative
+    floor = lv.solve(problem, "newton", tol=1e-16)
+    assert floor.status is lv.Status.FLOOR
+    assert not floor.contradicted
+
+
+def test_time_limit_is_kept():
+    # Thousands of factorisations of 1 ms and more, and no end.
+    problem = suite.pyramid(k=20, mass_ratio=1e6, friction="coulomb", sliding=0.5).problem
+    counted = lv.solve(problem, "newton", tol=0.0, max_iter=200)
+    assert counted.status is lv.Status.MAX_ITERATIONS
+    solution = lv.solve(problem, "newton", tol=0.0, max_iter=10**6, time_limit=0.01)
+    assert solution.status is lv.Status.TIME_LIMIT
+    # Ended by the clock and not by its own means: counted, since how much fits into 10 ms is the machine's affair.
+    assert solution.work.get("factorisations", 0) < counted.work["factorisations"]
+    assert np.isfinite(solution.impulse).all()
+
+
+def test_ctrl_c_returns_the_best_iterate(interrupted_newton):
+    """Interrupted after the fifth turn: what was found until then is kept."""
+    problem = lv.suite.case("pyramidF(k=4)").problem
+    looks = interrupted_newton
+    solution = lv.solve(problem, "newton", tol=1e-12)
+    assert solution.status is lv.Status.INTERRUPTED
+    assert len(looks) == 5
+    assert solution.residual.relative <= min(looks) < 1.0
+
+
+def test_faces_under_the_cone_law_where_the_first_interior_point_stops_short():
+    problem = suite.pyramid(k=30, friction="coulomb").problem.relaxed("cone")
+    solution = lv.solve(problem, "newton", tol=1e-9)
+    assert good(solution, 1e-9), solution
+    assert solution.work["factorisations"] <= 300, solution
+
+
+def test_rounds_that_gain_nothing_give_way_to_interior_points():
+    """Heavy boxes on light ones at rest: no residual below the first comes from Newton steps on the natural map.
+
+    Two rounds of 20 such steps before an interior point took 58 factorisations; the interior point takes 12.
+    """
+    problem = suite.box_stack(n=12, mass_ratio=1e6, friction="coulomb").problem
+    solution = lv.solve(problem, "newton", impulse=np.zeros(problem.m), tol=1e-6)
+    assert good(solution, 1e-6) and "De Saxce steps" in solution.message
+    assert solution.work["factorisations"] < 40
+
+
+def test_a_turn_after_the_last_of_all_steps_is_an_end(monkeypatch):
+    problem = suite.pyramid(k=5, mass_ratio=1e6, friction="coulomb").problem
+    newton = Newton()
+    monkeypatch.setattr("lavender.solvers.newton.SPEC", replace(SPEC, max_iter=4))
+    state, lam = newton.prepare(problem), problem.start()
+    assert newton.turn(state, lam, 2, 1e-15).status is lv.Status.MAX_ITERATIONS
+    for _ in range(3):
+        claim = newton.turn(state, lam, 2, 1e-15)
+        if claim.status is not lv.Status.MAX_ITERATIONS:
+            break
+    assert claim.status is lv.Status.STALLED

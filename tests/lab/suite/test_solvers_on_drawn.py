@@ -1,0 +1,296 @@
+"""Solvers on problems of structures drawn by lot (`benchmarks.drawn`)."""
+
+import re
+from dataclasses import fields, replace
+from unittest import mock
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, good
+
+import lavender as lv
+from benchmarks.drawn import wild
+from lavender import registry
+from lavender.judge.certificates import check_certificate
+from lavender.solvers.certify import certify
+from lavender.solvers.newton_systems import general, systems
+from lavender.solvers.newton_systems.systems import make_system
+from lavender.solvers.small import AUTO
+from lavender.solvers.solve_log import SolveLog
+from lavender_ext.driver.driver import Driver
+from lavender_ext.small.many import solve_first
+
+
+@pytest.mark.parametrize("limit", [None, 60.0])
+def test_many_islands_are_not_cut_between_two_looks_at_the_clock(limit, monkeypatch):
+    problem = wild(seed=5192).problem  # 152 islands
+    cut = lv.solve(problem, "newton", time_limit=limit, tol=1e-9)
+    assert cut.success and cut.iterations > general.CLOCK
+    monkeypatch.setattr(general, "CLOCK", 10**6)
+    whole = lv.solve(problem, "newton", time_limit=60.0, tol=1e-9)
+    assert whole.work == cut.work and np.array_equal(whole.impulse, cut.impulse)
+
+
+def test_under_a_limit_nothing_long_is_begun_in_setting_up():
+    """A of J and M is not formed, and a matrix of many entries not analysed, where that would end too late."""
+    problem = wild(seed=109, rows=3000).problem
+    assert problem.operator == "generalized"
+    late = lv.solve(problem, "admm", time_limit=1e-4)
+    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and not late.work
+    assert not {"csr", "csr_data"} & set(problem.__dict__)
+    assert late.impulse.tobytes() == problem.start().tobytes()
+    prepared = lv.prepare(problem, "admm")
+    assert prepared.solve(time_limit=1e-4).status is lv.Status.TIME_LIMIT
+    after, whole = prepared.solve(max_iter=5), lv.solve(problem, "admm", max_iter=5)
+    assert after.work == whole.work and after.impulse.tobytes() == whole.impulse.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("seed", "law", "first"),
+    [
+        (67, "coulomb", "anderson"),  # 667 spheres in one heap: a dense factor of N costs seconds
+        (57, "coulomb", "newton"),  # 36 rows on 60 velocities
+        (57, "cone", "newton"),
+    ],
+)
+def test_islands_of_generalized_velocities_go_to_newton_where_they_are_small(seed, law, first):
+    problem = wild(seed=seed).problem.relaxed(law)
+    assert problem.generalized is not None
+    solution = lv.solve(problem, tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.message.startswith(first)
+
+
+def test_a_step_that_would_end_after_the_deadline_is_refused(monkeypatch):
+    problem = wild(seed=7).problem
+    kernel = general.prepare(problem)
+    monkeypatch.setattr(general, "FLOP", 1e-6)  # a machine ten thousand times slower: 40 s a step
+    claim = general.run(problem, kernel, problem.start(), 100, 1e-9, 1.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert claim.iterations == 0
+
+
+def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
+    problem = wild(seed=7).problem  # a step of it: 0.4 s at 1e-8 s a multiply-add
+    clock, asked = [0.0], []
+
+    class Kernel:
+        islands, largest, ends = 1, general.prepare(problem).largest, general.ENDS["spent"]
+
+        def run(self, impulse, tol, steps, again):
+            asked.append(steps)
+            clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
+            return self.ends, np.array([steps, 0, 0, 0])
+
+    monkeypatch.setattr(general, "FLOP", 1e-8)
+    monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])
+    claim = general.run(problem, Kernel(), problem.start(), 1000, 1e-9, 1.0)
+    assert claim.status is lv.Status.TIME_LIMIT
+    assert set(asked) == {1} and clock[0] <= 1.0 + 0.4
+
+
+def test_an_island_without_a_solution_is_proof_enough():
+    """Bounds above elsewhere are in nobody's way; what the linear program finds is proven for the whole."""
+    a = np.zeros((4, 4))
+    a[:2, :2] = [[1.0, -1.0], [-1.0, 1.0]]  # y = (1, 1): A^T y = 0, b.y = 2
+    a[2:, 2:] = [[2.0, 0.5], [0.1, 2.0]]
+    problem = lv.Problem.lcp(a, [1.0, 1.0, -1.0, 3.0], 0.0, [np.inf, np.inf, 1.0, 1.0])
+    log = SolveLog(problem, 1e-6, 100)
+    log.offer(problem.start())
+    certify(log)
+    assert log.certificate is not None
+    assert not log.certificate[2:].any()
+    assert log.message == "linear program 1 certificate" and log.work == {"certificates": 1}
+    large = lv.solve(wild(seed=141).problem, tol=1e-6)  # 2,133 asymmetric rows in 108 islands
+    assert large.status is lv.Status.INFEASIBLE and not large.contradicted
+
+
+def test_more_sweeps_guess_the_free_rows_where_a_factor_costs_as_much():
+    narrow = lv.solve(wild(seed=3131).problem, "direct", tol=1e-6)
+    assert narrow.solver.form == "band" and narrow.work["sweeps"] == 4
+    sparse = lv.solve(wild(seed=3170).problem, "direct", tol=1e-6)  # 480 rows
+    assert sparse.solver.form == "sparse" and sparse.work["sweeps"] == 48
+    assert sparse.work["factorisations"] <= 3  # 6 after 4 sweeps
+
+
+MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
+
+
+def driven(problem, tol=1e-9, budget=1500, work=10**6):
+    """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
+    lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
+    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
+    if not driver.start(impulse):
+        return None
+    how = MORE
+    while how in (MORE, CERTIFICATE):
+        how, done, relative, proof = driver.step(work, impulse)
+        if proof is not None and check_certificate(problem, proof) is None:
+            driver.prove()
+    return how, done, relative, impulse
+
+
+def test_generalised_coordinates_are_driven_by_the_same_names():
+    for seed in (44017, 44027, 44030):
+        problem = wild(seed=seed).problem
+        assert problem.generalized is not None
+        how, done, _, impulse = driven(problem, 1e-8)
+        assert how == REACHED and done > 0
+        assert lv.residual(problem, impulse).relative <= 1e-8
+
+
+def test_what_the_method_does_not_take_is_said_at_once():
+    problem = lv.Problem.contact(np.eye(3), np.ones(3), [0.5])
+    assert driven(problem) is not None
+    assert driven(wild(seed=44017).problem) is not None
+    cone = lv.Problem(np.ones(5), lv.Cones.contacts([0.5], 4), np.eye(5), friction="cone")
+    assert driven(cone) is None
+
+
+def test_many_bodies_on_one_leave_half_of_the_rows():
+    # 26 % of A is nonzero; of 228 rows, half of them of bodies that touch nothing else, elimination leaves a quarter of
+    # the entries of a full factor and an eighth of its work. Bounded rows as full as that stay full.
+    bounded = wild(seed=7566).problem
+    assert bounded.law == "lcp" and bounded.csr.nnz / bounded.m**2 < systems.DENSE_FILL
+    assert make_system(bounded, "impulse").dense
+    problem = wild(seed=7012).problem
+    assert problem.matrix is not None
+    assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
+    system = make_system(problem, "impulse")
+    assert not system.dense
+    assert system.sparse.work < 0.2 * problem.m**3 / 3.0
+    sparse_one = lv.solve(problem, "newton", tol=1e-9)
+    with mock.patch.multiple(systems, DENSE_FILL=0.25):
+        assert make_system(problem, "impulse").dense
+        full = lv.solve(problem, "newton", tol=1e-9)
+    assert sparse_one.success
+    assert full.success
+    np.testing.assert_allclose(
+        problem.csr @ sparse_one.impulse, problem.csr @ full.impulse, atol=1e-6 * np.abs(problem.b).max()
+    )
+
+
+@pytest.mark.parametrize("seed", [6, 70, 239, 3146])
+def test_exchanges_from_swept_impulses_take_few_factorisations(seed):
+    problem = as_matrix(wild(seed=seed).problem)
+    swept = lv.solve(problem, "anderson", tol=0.0, max_iter=60).impulse
+    solution = lv.solve(problem, "newton", impulse=swept, tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.work["factorisations"] <= 4  # from nothing: 8 to 18
+    assert "sweeps" not in solution.work
+
+
+@pytest.mark.parametrize("seed, most", [(5080, 2), (5229, 2), (177, 2), (5122, 2), (242, 1)])
+def test_joints_that_nearly_depend_on_each_other_take_two_factorisations(seed, most):
+    solution = lv.solve(wild(seed=seed).problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert solution.work["factorisations"] <= most  # interior points: 23 to 35
+
+
+def test_exchanges_that_go_in_circles_are_given_up():
+    problem = wild(seed=3).problem  # rows depend on each other
+    solution = lv.solve(problem, "newton", tol=1e-6)
+    assert good(solution, 1e-6)
+    assert "exchanges" in solution.message and "interior point steps" in solution.message
+    assert solution.work["factorisations"] <= 28
+
+
+def test_spheres_turned_by_rounding_alone_have_three_unknowns_each():
+    problem = wild(seed=239).problem
+    rows = problem.rows
+    assert rows is not None and rows.inv_inertia.any()
+    system = make_system(problem, "velocity")
+    solution = lv.solve(problem, "newton", tol=1e-10)
+    assert system.layout.s == 3
+    assert good(solution, 1e-10), solution
+
+
+def test_from_a_start_that_leads_nowhere_newton_begins_from_nothing_in_the_end():
+    """An asymmetric matrix after 64 sweeps: from there it takes 170 factorisations, from nothing 6."""
+    problem = wild(seed=807, rows=120).problem
+    near = lv.solve(problem, "anderson", tol=0.0, max_iter=64).impulse
+    for impulse, most in ((None, 40), (near, 400)):
+        solution = lv.solve(problem, "newton", impulse=impulse, tol=1e-6)
+        assert good(solution, 1e-6) and solution.work["factorisations"] < most, solution
+
+
+TIMES = ("setup_time", "solve_time", "_rest")
+
+
+def long_way(problem, solver, **options):
+    return lv.prepare(replace(problem, copy=False), solver).solve(**options)
+
+
+def facts(solution):
+    """Everything a solution says but its times, arrays by their bits, numbers by their words: NaN is NaN."""
+    r = solution.residual
+    told = {f.name: getattr(solution, f.name) for f in fields(solution) if f.name not in (*TIMES, "residual")}
+    told |= {f"residual {f.name}": getattr(r, f.name) for f in fields(r) if f.name != "_problem"}
+    told["line"] = re.sub(r", [\d.e+-]+ (s|ms|us)(;|$)", "", str(solution))
+    words = {k: repr(v) if isinstance(v, float) else v for k, v in told.items()}
+    return {k: v.tobytes() if isinstance(v, np.ndarray) else v for k, v in words.items()}
+
+
+def check(problem, solver, **options):
+    short = lv.solve(problem, solver, **options)
+    expected = facts(long_way(problem, solver, **options))
+    assert facts(short) == expected
+    assert facts(lv.solve(problem, solver, **options)) == expected  # what is kept was left as it was found
+    return short
+
+
+@pytest.mark.parametrize("solver", ["auto", "direct"])
+@pytest.mark.parametrize("seed", [5793, 6452, 7592])
+def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed):
+    problem = wild(seed=seed).problem
+    found = check(problem, solver, tol=1e-9)
+    assert found.success
+    assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
+    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
+
+
+@pytest.mark.parametrize("tol", [1e-3, 1e-9])
+@pytest.mark.parametrize("seed", [7530, 7845, 4691, 7514])  # asymmetric, long, with joints, symmetric
+def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, tol):
+    problem = wild(seed=seed).problem
+    found = check(problem, "auto", tol=tol)
+    assert found.success
+    said = re.fullmatch(
+        r"direct 4 sweeps, \d+ factorisations, (\d+) pivots -> lemke (\d+) pivots", found.message
+    )
+    assert said, found.message
+    assert found.work["pivots"] == int(said[1]) + int(said[2])
+    assert found.iterations > int(said[2])
+    assert registry.get("direct").small.solve(problem, None, tol) is None  # which is exchanges alone
+
+
+def test_small_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
+    problem = wild(seed=7375).problem
+    found = check(problem, "auto", tol=1e-6)
+    assert found.success and found.residual.relative > 1e-13
+    assert found.message.startswith("direct") and "->" not in found.message
+
+
+@pytest.mark.parametrize("seed", [6662, 7021, 7597])
+def test_what_newton_leaves_of_few_velocities_goes_on_the_same_way_everywhere(seed):
+    """Forests under Coulomb's law that the one call ends, that sweeps end after it, that is not asked of it first."""
+    problem = wild(seed=seed).problem
+    assert problem.generalized is not None
+    short = check(problem, "auto", tol=1e-6)
+    assert short.success and "newton" in short.message
+    told = sum(int(count) for count in re.findall(r"(\d+) sweeps", short.message))
+    assert told == short.work.get("sweeps", 0), "sweeps that go on are counted once"
+    (together,) = lv.solve_many([replace(problem, copy=False)])
+    assert facts(together) == facts(short)
+    limited = lv.solve(replace(problem, copy=False), time_limit=10.0)
+    assert facts(limited) == facts(short), "a limit chooses nothing"
+
+
+@pytest.mark.parametrize("seed", [1224, 1351])  # of 48 and 105 rows, where newton is stuck
+def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_call(seed):
+    problem = wild(seed=seed).problem
+    assert solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.limits) is None
+    fresh = replace(problem, copy=False)
+    assert registry.get("auto").small.solve(fresh, None, 1e-6) is None
+    assert fresh.derived.vain is not None
+    check(problem, "auto", tol=1e-6)

@@ -1,0 +1,299 @@
+"""The suite: every case is what its name says, its reference is a solution, and names make the same bits."""
+
+import itertools
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from judge_twin import Problem, spec_of
+from kkt_truth import Exact
+
+import lavender as lv
+from lavender import suite
+from lavender.judge.certificates import check_certificate
+from lavender.lab.suite import build, exact, hard
+
+DEFAULT = suite.SETS["default"]
+EVERY = sorted({*DEFAULT, *hard.SET})
+LARGE = {"hang(n=10000)"}  # seconds
+
+
+# -- names ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_name_makes_the_same_case_again(name):
+    one = suite.case(name)
+    assert one.name == one.problem.name == name  # spelled in the one way
+    assert one.reason
+    assert "\n" not in one.reason
+    if name in LARGE:
+        return
+    two = suite.case(name)
+    assert one.problem == two.problem
+    assert one.problem.b.tobytes() == two.problem.b.tobytes()
+    assert one.parameters == two.parameters
+
+
+def test_a_function_and_its_name_agree():
+    case = suite.pyramid(4, mass_ratio=1e6, friction="coulomb", sliding=0.5)
+    assert case.name == "pyramidF(k=4, mass_ratio=1e6, sliding=0.5)"
+    assert suite.case(case.name).problem == case.problem
+    assert suite.case("pyramid(k=4, friction=coulomb, sliding=.5, mass_ratio=1_000_000)").name == case.name
+    assert suite.case("pyramid(friction='cone', k=2)").name == "pyramid(k=2, friction=cone)"
+    assert suite.case("stack(n=1e1)").name == "stack(n=10)"
+    assert suite.case("two_particles").name == "two_particles"
+    assert suite.stack().name == "stack"
+    assert suite.case("near_parallel(angle=1e-09)").name == "near_parallel(angle=1e-9)"
+    assert suite.case("stack(mass_ratio=1000)").name == "stack(mass_ratio=1e3)"
+    assert suite.case("two_particles(m2=0.1)").name == "two_particles(m2=0.1)"
+    assert suite.case("two_particles(drift=-1e-3)").parameters["drift"] == -1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "sign"),
+    [
+        ("pyramd(k=3)", lv.UnknownName, "did you mean 'pyramid'"),
+        ("pyramid(mas_ratio=1e6)", lv.UnknownName, "did you mean 'mass_ratio'"),
+        ("pyramidF(friction=cone)", lv.UnknownName, "friction"),
+        ("defualt", lv.UnknownName, "did you mean 'default'"),
+        ("pyramid(", lv.InputError, "is not a case"),
+        ("pyramid(3)", lv.InputError, "is not a case"),
+        ("pyramid(k=3, k=4)", lv.InputError, "is not a case"),
+        ("pyramid(**k)", lv.InputError, "is not a case"),
+        ("pyramid(k=[3])", lv.InputError, "is not a case"),
+        ("pyramid(k=True)", lv.InputError, "is not a case"),
+        ("__import__('os')(k=3)", lv.InputError, "is not a case"),
+        ("pyramid(k=open('x'))", lv.InputError, "is not a case"),
+        ("", lv.InputError, "is not a case"),
+        ("(" * 500, lv.InputError, "is not a case"),
+        ("pyramid(k=2.5)", lv.InputError, "a whole number"),
+        ("pyramid(k=-1)", lv.InputError, "a whole number"),
+        ("pyramid(k=0)", lv.InputError, "at least 1"),
+        ("pyramid(k=1e99)", lv.InputError, "a whole number"),
+        ("pyramid(k=abc)", lv.InputError, "a number"),
+        ("pyramid(mass_ratio=1e999)", lv.InputError, "a finite number"),
+        ("pyramid(mass_ratio=0)", lv.InputError, "above 0"),
+        ("pyramid(friction=3)", lv.InputError, "a word"),
+        ("pyramid(friction=glue)", lv.InputError, "none, coulomb, cone"),
+        ("boxed_friction(scene=glue)", lv.InputError, "box_stack, pyramid, granular"),
+        ("toy_stack(kick=-1)", lv.InputError, "upwards"),
+        ("toy_stack(friction=glue)", lv.InputError, "none, box"),
+        ("random_spd(condition=0.5)", lv.InputError, "1 or more"),
+    ],
+)
+def test_a_wrong_name_says_what_was_meant(text, error, sign):
+    with pytest.raises(error, match=sign):
+        suite.case(text)
+    with pytest.raises(error, match=sign):
+        suite.cases(text)
+
+
+def test_sets_and_families_are_listed():
+    assert [c.name for c in suite.cases("default")] == [c.name for c in suite.default()] == list(DEFAULT)
+    assert [c.name for c in suite.cases("stack(n=3)")] == ["stack(n=3)"]
+    listed = suite.families()
+    assert all(summary.strip() for summary in listed.values())
+    for name in listed:
+        assert suite.case(name).problem.m > 0  # the listing is itself a valid name
+
+
+# -- geometry -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "stackF(n=4)",
+        "box_stackF(n=3, mass_ratio=50, sliding=0.5)",
+        "pyramidF(k=3, bottom_ratio=9)",
+        "granularF(n=3)",
+    ],
+)
+def test_problems_are_those_of_their_bodies_and_points(name):
+    problem = suite.case(name).problem
+    twin = Problem(spec_of(problem))
+    b = -twin.jac @ problem.rows.v_free.ravel()
+    assert np.allclose(problem.dense(), twin.A.astype(float), rtol=1e-13, atol=1e-13 * np.abs(twin.A).max())
+    assert np.allclose(problem.b, b.astype(float), rtol=0, atol=1e-14)
+
+
+def test_boxed_friction_has_the_rows_of_the_contacts_and_bounds_of_their_loads():
+    boxed = suite.case("boxed_friction(n=3, scene=pyramid, mass_ratio=20, sliding=0.5)").problem
+    disks = suite.case("pyramidF(k=3, mass_ratio=20, sliding=0.5)").problem
+    assert boxed.law == "lcp"
+    assert np.allclose(boxed.dense(), disks.dense(), rtol=0, atol=1e-12)
+    assert np.allclose(boxed.b, disks.b, rtol=0, atol=1e-14)
+    upper = boxed.cones.upper.reshape(-1, 3)
+    assert np.all(np.isinf(upper[:, 0]))
+    assert np.array_equal(upper[:, 1], upper[:, 2])
+    assert np.array_equal(boxed.cones.lower.reshape(-1, 3)[:, 1:], -upper[:, 1:])
+    # The loads of the ground contacts carry the weight of all boxes: 5 of mass 1 and one of 20, in one step.
+    ground = disks.rows.contact_body[:, 0] < 0
+    assert upper[ground, 1].sum() == pytest.approx(0.5 * 25 * build.FALL, rel=1e-14)
+
+
+def test_sizes_of_the_families_that_others_measured():
+    for n, m in ((4, 299), (9, 3402)):
+        assert suite.granular(n).problem.m == m
+        assert suite.granular(n, "cone").problem.m == 3 * m
+    assert suite.pyramid(10).problem.m == 400
+    assert suite.pyramid(20).problem.m == 1600
+    assert suite.box_stack(10).problem.m == 40
+    assert suite.chain(333).problem.m == 999
+
+
+def test_one_cube_on_four_points_has_rank_three_and_six():
+    for friction, rank in (("none", 3), ("coulomb", 6)):
+        a = suite.box_stack(1, friction=friction).problem.dense()
+        assert np.linalg.matrix_rank(a, tol=1e-12 * np.abs(a).max()) == rank
+
+
+def test_mass_ratio_and_sliding_do_what_they_say():
+    inv_mass = suite.pyramid(4, mass_ratio=1e6, bottom_ratio=100.0).problem.rows.inv_mass
+    assert inv_mass.tolist() == [0.01] * 4 + [1.0] * 5 + [1e-6]
+    still, moving = (suite.stack(5, friction="coulomb", sliding=s).problem.rows.v_free for s in (0.0, 0.5))
+    pushed = moving - still
+    assert np.allclose(np.hypot(pushed[:, 0], pushed[:, 1]), 0.5, rtol=1e-15)
+    assert len(np.unique(pushed[:, 0])) == 5
+    assert not np.any(pushed[:, 2:])
+
+
+def test_a_frictional_twin_slides():
+    """With 0.5 m/s nearly all contacts that carry load slip at the solution."""
+    problem = suite.case("pyramidF(k=4, sliding=0.5)").problem
+    solution = lv.solve(problem, "pgs", tol=1e-8, max_iter=20_000)
+    assert solution.success, str(solution)
+    lam = solution.impulse.reshape(-1, 3)
+    carrying = lam[:, 0] > 1e-6 * lam[:, 0].max()
+    slipping = np.hypot(lam[:, 1], lam[:, 2]) > (1 - 1e-6) * 0.5 * lam[:, 0]
+    assert np.mean(slipping[carrying]) > 0.9
+
+
+def test_chains_are_banded_and_hold_their_weight():
+    for case in (suite.chain(6, 100.0), suite.hang(6, 100.0)):
+        a = case.problem.csr.tocoo()
+        assert np.abs(a.coords[0] - a.coords[1]).max() <= 5
+        after = case.problem.velocity(case.reference.impulse)
+        # Anchors stay together: with the first held, J v = 0 to rounding of the impulses.
+        assert np.abs(case.problem.jacobian @ after.ravel()).max() <= 1e-12
+    hung = suite.hang(6, 100.0)
+    assert hung.reference.impulse[2] == pytest.approx(
+        105.0 * build.FALL, rel=2e-2
+    )  # the top joint carries it all
+    assert np.linalg.cond(suite.hang(30).problem.dense()) > 10 * np.linalg.cond(
+        suite.chain(30).problem.dense()
+    )
+
+
+# -- references -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *sorted(set(EVERY) - LARGE - {"granular(n=9)"}),  # half a second
+        "stack(n=300, mass_ratio=1e6)",
+        "stackF(n=20, mass_ratio=7)",
+        "box_stack(n=5, mass_ratio=1e8)",
+        "toy_stack(kick=0.1)",
+        "toy_stack(kick=0)",
+        "toy_stack(friction=box)",
+        "boxed_friction(n=5)",
+        "boxed_friction(n=4, scene=pyramid)",
+        "hang(n=20, tip_mass=1e6)",
+        "random_spd(n=60, condition=1e10)",
+        *(
+            f"slider(mu={mu}, speed={v}, friction={law})"
+            for mu in (0, 0.1, 10)
+            for v in (0.01, 6)
+            for law in ("coulomb", "cone")
+        ),
+        *(f"anisotropic(ratio={ratio}, speed={v})" for ratio in (0.1, 100, 1e6) for v in (0.1, 100)),
+    ],
+)
+def test_a_reference_is_a_solution(name):
+    case = suite.case(name)
+    reference = case.reference
+    if reference is None:
+        assert case.problem.law in ("coulomb", "cone")
+        return
+    assert reference.source
+    if reference.impulse is None:
+        assert check_certificate(case.problem, reference.certificate) is None
+        assert reference.compare == "nothing"
+        return
+    judged = lv.residual(case.problem, reference.impulse)
+    # 1e-14: the sums of the judge itself, of up to a hundred terms, where the floor is as low as 1e-16.
+    least = 1e-14 if name in hard.SET else 1e-15
+    assert judged.relative <= max(least, 2.0 * judged.floor), str(judged)
+    assert reference.compare in ("impulse", "slack", "error")
+
+
+def test_only_what_slides_at_large_ratios_has_no_reference():
+    without = [name for name in set(hard.SET) - LARGE if suite.case(name).reference is None]
+    assert all("sliding=0.5" in name or name == "box_stackF(n=10, mass_ratio=1e6)" for name in without)
+
+
+def test_the_toy_stack_is_solved_by_trying_all_active_sets_in_fractions():
+    problem = suite.toy_stack().problem
+    a = [[Fraction(x) for x in row] for row in problem.dense().tolist()]
+    b = [Fraction(x) for x in problem.b.tolist()]
+    found = []
+    for active in itertools.product((False, True), repeat=8):
+        rows = [i for i in range(8) if active[i]]
+        x = Exact.solve([[a[i][j] for j in rows] for i in rows], [b[i] for i in rows])
+        lam = [Fraction(0)] * 8
+        for i, value in zip(rows, x, strict=True):
+            lam[i] = value
+        w = [sum(a[i][j] * lam[j] for j in range(8)) - b[i] for i in range(8)]
+        if min(lam) >= 0 and all(w[i] >= 0 for i in range(8) if not active[i]):
+            found.append(np.array([float(x) for x in lam]))
+    assert len(found) >= 1
+    for lam in found:
+        assert np.allclose(lam, suite.toy_stack().reference.impulse, rtol=0, atol=1e-15)
+    clamped = np.maximum(np.linalg.solve(problem.dense(), problem.b), 0.0)
+    assert lv.residual(problem, clamped).relative > 0.1  # solving, then clamping once, is another answer
+
+
+def test_two_particles_follow_the_formula_of_the_docstring():
+    case = suite.two_particles(m1=3.0, m2=0.5, drift=0.02)
+    v = case.problem.rows.v_free
+    n = np.array([0.6, 0.0, 0.8])
+    assert case.problem.dense()[0, 0] == pytest.approx(1 / 3 + 2, rel=1e-15)
+    assert case.problem.b[0] == pytest.approx(-2.0 - n @ (v[1, :3] - v[0, :3]), rel=1e-15)
+    after = case.problem.velocity(case.reference.impulse)[:, :3]
+    assert n @ (after[1] - after[0]) == pytest.approx(-2.0, rel=1e-14)
+    assert 3.0 * after[0] + 0.5 * after[1] == pytest.approx(3.0 * v[0, :3] + 0.5 * v[1, :3], rel=1e-14)
+    assert case.problem.row_name(0) == "rod"
+
+
+def test_random_spd_has_the_condition_it_names():
+    for condition in (1.0, 1e3, 1e8):
+        a = suite.random_spd(30, condition).problem.dense()
+        assert np.linalg.cond(a) == pytest.approx(condition, rel=1e-6)
+        assert np.array_equal(a, a.T)
+
+
+def test_extended_precision_beats_float64_and_refuses_what_it_cannot_solve():
+    case = suite.random_spd(40, 1e10)
+    a, b = case.problem.dense(), case.problem.b
+    wide = exact.solve_linear(case.problem)
+    plain = np.linalg.solve(a, b)
+    rows = [[Fraction(x) for x in row] for row in a.tolist()]
+    truth = np.array([float(x) for x in Exact.solve(rows, [Fraction(x) for x in b.tolist()])])
+    assert np.array_equal(wide, truth)  # both are the exact solution, rounded once
+    assert np.abs(plain - truth).max() > 1e-12
+    with pytest.raises(lv.InputError, match="singular"):
+        exact.solve_linear(lv.Problem.linear([[1.0, 1.0], [1.0, 1.0]], [1.0, 2.0]))
+
+
+def test_a_boxed_solution_is_proved_or_refused():
+    problem = suite.pyramid(4, mass_ratio=1e3).problem
+    rough = lv.solve(problem, "pgs", tol=1e-6, max_iter=200_000)
+    assert rough.success
+    proved = exact.solve_boxed(problem, rough.impulse)
+    judged = lv.residual(problem, proved)
+    assert judged.relative <= 2.0 * judged.floor, str(judged)
+    with pytest.raises(lv.InputError, match="active set"):
+        exact.solve_boxed(problem, np.zeros(problem.m))

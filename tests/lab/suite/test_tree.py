@@ -1,0 +1,349 @@
+"""The tree of `auto`: each line is reached and named, counts are what Newton does, the best of all goes back."""
+
+import json
+from itertools import islice
+
+import numpy as np
+import pytest
+from random_problems import random_lcp
+from random_trees import random_general
+
+import lavender as lv
+from benchmarks.drawn import wild
+from lavender import registry, suite
+from lavender.base.deadline import Deadline
+from lavender.judge.residuals import reference
+from lavender.lab.suite.build import Bodies, Contacts, contact_problem
+from lavender.problem import OPERATORS
+from lavender.solvers import costs
+from lavender.solvers.auto import LAST, MOST, SHARE, Stage, Tree, solve
+from lavender.solvers.certify import certify
+from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.steps import Iterations, Newton, Step, Sweeps
+from lavender_ext.small import checked_sweeps
+
+
+@pytest.fixture(autouse=True)
+def rates(monkeypatch):
+    """Those of one fit: which line comes first is a matter of rates, how lines follow is not."""
+    work = {"bodies": 0.2, "dense": 0.025, "panels": 0.5, "velocities": 0.05}
+    count = {"rows": 7.0, "cone": 14.0, "coulomb": 12.0}
+    made = {"start": 84e3, "row": 300.0, "entry": 0.45, "work": work, "count": count}
+    monkeypatch.setattr(costs, "RATES", made | {"sweep row": 12.0, "sweep cone": 1.7})
+
+
+def over_velocities(friction, m=120, nv=60):
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(nv, nv))
+    cones = lv.Cones.contacts(np.full(m // 3, 0.5), 2) if friction else lv.Cones.free(m // 4)
+    jac = rng.normal(size=(m if friction else m // 4, nv))
+    mass = half @ half.T / nv + np.eye(nv)
+    more = {"friction": friction} if friction else {}
+    return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, compliance=0.1, **more)
+
+
+def as_matrix(problem):
+    return lv.Problem(problem.b, problem.cones, problem.delassus(), friction=problem.friction)
+
+
+# What the first lines of the tree are, of a problem of each kind.
+FIRST = {
+    "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
+    "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
+    "linear, J and M": (lambda: over_velocities(None), ["newton"]),
+    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton over rows", "newton"]),
+    "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
+    "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
+    "the cone law": (
+        lambda: suite.granular(n=4, friction="coulomb").problem.relaxed("cone"), ["anderson", "newton"],
+    ),
+    "a loose pile": (
+        lambda: suite.granular(n=4, friction="coulomb").problem,
+        ["anderson", "relaxation", "nncg", "anderson", "newton"],
+    ),
+    "a tight pile": (
+        lambda: suite.pyramid(k=6, friction="coulomb").problem, ["anderson", "anderson", "newton"],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_each_line_is_reached_and_named(name):
+    make, expected = FIRST[name]
+    stages = lv.explain(make()).stages
+    assert [stage.solver for stage in stages[: len(expected)]] == expected
+    assert all(stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in stages)
+    found = lv.prepare(make(), "auto").solve(tol=1e-6)
+    assert found.success
+    names = {"relaxation: anderson" if name == "relaxation" else name.partition(" ")[0] for name in expected}
+    compiled = {"lemke", "direct", "anderson", "newton"} if make().m <= registry.SMALL_ROWS else set()
+    assert {turn.solver for turn in found.turns} <= names | compiled
+
+
+@pytest.mark.parametrize("name", FIRST)
+def test_the_tail_doubles(name):
+    tree = Tree(FIRST[name][0]())
+    reference(tree.problem)
+    stages = list(tree)
+    in_turn = stages[next(i for i, stage in enumerate(stages) if stage.why.startswith("in turn")) :]
+    assert tree.begun + MOST * tree.newton + sum(stage.cost for stage in in_turn) <= LAST * tree.newton
+    last = {}
+    for stage in in_turn:
+        if stage.solver in last:
+            assert stage.iterations == pytest.approx(2.0 * last[stage.solver])
+        last[stage.solver] = stage.iterations
+    assert {"anderson", "newton"} <= set(last)
+
+
+def test_sweeps_first_have_a_share_of_the_counted_cost():
+    problem = suite.stack(n=200).problem
+    tree = Tree(problem)
+    reference(problem)
+    one, two, newton = islice(tree, 3)
+    assert (one.cost + two.cost) == pytest.approx(SHARE * tree.newton)
+    assert tree.least <= tree.newton and newton.cost == pytest.approx(MOST * tree.newton)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_counts_are_what_newton_does(seed):
+    """Multiply-adds of the factor and entries that are there; a dense one has m^3/3, none in a band has less than m."""
+    problem = random_general(seed, ("coulomb", "cone")[seed % 2], n=20, compliance=True, contacts=12)
+    state = registry.get("newton").load()().prepare(problem)
+    nv = problem.generalized.nv
+    # Every island full, at most; passing over a column is counted for as much as eight multiply-adds.
+    assert 0.0 < state.count.work <= 8.0 * nv**2 + nv**3 / (3.0 if seed % 2 == 0 else 6.0)
+    assert state.count.entries == problem.metric.work
+    rows = registry.get("newton").load()(form="impulse").prepare(problem)
+    assert rows.count.form == "dense" and rows.count.work == problem.m**3 / 3.0
+    sparse = registry.get("newton").load()().prepare(as_matrix(suite.stack(n=400).problem))
+    assert sparse.count.form == "panels" and 400.0 <= sparse.count.work < 400.0**3 / 3.0
+
+
+@pytest.mark.parametrize(
+    "name", ["stack(n=200)", "granularF(n=4)", "pyramidF(k=6)", "wild(seed=24)", "wild(seed=3)"]
+)
+def test_the_least_is_below_what_is_counted(name):
+    problem = suite.case(name).problem
+    reference(problem)
+    tree = Tree(problem)
+    if problem.generalized is None:
+        assert tree.least <= tree.newton * (1.0 + 1e-12)
+
+
+def test_explain_counts_nothing_anew_and_refuses_what_is_none():
+    problem = suite.granular(n=3, friction="coulomb").problem
+    first, second = lv.explain(problem), lv.explain(suite.granular(n=3, friction="coulomb").problem)
+    assert first == second and json.loads(json.dumps(first.data()))["rows"] == problem.m
+    with pytest.raises(lv.InputError, match="Problem is needed"):
+        lv.explain(3)
+    with pytest.raises(lv.InputError, match="no rows"):
+        lv.explain(lv.Problem.lcp(np.zeros((0, 0)), np.zeros(0)))
+    for tol in (0.0, -1.0, np.inf):
+        with pytest.raises(lv.InputError, match="tol is"):
+            lv.explain(problem, tol=tol)
+    with pytest.raises(lv.LavenderError, match="plan"):
+        lv.solve(problem, plan=first)
+
+
+@pytest.mark.parametrize(
+    ("make", "names"),
+    [
+        (lambda: random_lcp(1, m=12), ("direct", "lemke")),
+        (lambda: as_matrix(suite.pyramid(k=2, friction="coulomb").problem), ("anderson", "newton")),
+        (lambda: random_general(1, "cone", n=6, compliance=True, contacts=3), ("newton",)),
+    ],
+)
+def test_a_small_problem_is_told_by_who_solves_it(make, names):
+    problem = make()
+    told = lv.explain(problem).small
+    assert told and all(name in told for name in names), told
+    solution = lv.solve(problem)
+    assert solution.success and all(turn.solver.partition(" ")[0] in names for turn in solution.turns)
+
+
+def test_there_are_twelve_rates():
+    def numbers(rates):
+        return sum(numbers(value) if isinstance(value, dict) else 1 for value in rates.values())
+
+    assert numbers(costs.RATES) <= 12
+
+
+class Made(Step):
+    """A step that is told what to find."""
+
+    def turn(self, n):
+        self.impulse = self.log.problem.start() + self.found.pop(0)
+        self.asked.append(n)
+        self.offer()
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n)
+
+
+def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
+    problem = suite.stack(n=200).problem
+    solved = lv.solve(problem, tol=1e-9).impulse
+    found = [0.5, 0.99, 0.9, 0.7, 0.999, 1.0 - 1e-9]
+    reference(problem)
+    log = SolveLog(problem, 1e-7, 10**6)
+    log.offer(problem.start())
+    made, tree = {}, Tree(problem)
+    Made.found, Made.asked = [share * solved for share in found], []
+    monkeypatch.setattr(
+        "lavender.solvers.auto.make", lambda name, log, tree: made.setdefault(name, Made(name, log))
+    )
+    solve(log, tree)
+    assert not Made.found and set(made) == {"anderson", "newton"}, "one of each, asked again and again"
+    np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
+    after = [turn.after for turn in log.turns]
+    assert (np.diff(after) <= 0.0).all() and len(after) == len(found)
+
+
+@pytest.mark.parametrize("kind", ["anderson", "nncg", "newton"])
+def test_a_step_in_parts_is_the_step_at_once(kind):
+    problem = suite.pyramid(k=4, friction="coulomb").problem
+    reference(problem)
+    got = []
+    for parts in ([40.0], [10.0, 10.0, 20.0]):
+        log = SolveLog(problem, 1e-13, 10**6)
+        log.offer(problem.start())
+        if kind == "anderson":
+            step = Sweeps(problem)
+            step.begin(log)
+        elif kind == "newton":
+            step = Newton("newton", log)
+            step.state = Tree(problem).states["newton"]
+        else:
+            step = Iterations(kind, log)
+        for n in parts:
+            if not step.over:
+                step.run(n)
+        got.append(log.best)
+    assert max(got) < 1e-2, got
+
+
+def test_sweeps_that_promise_little_give_way():
+    problem = suite.case("pyramidF(k=8, mass_ratio=1e6)").problem
+    reference(problem)
+    log = SolveLog(problem, 1e-12, 10**6)
+    log.offer(problem.start())
+    sweeps = Sweeps(problem)
+    sweeps.begin(log)
+    sweeps.least = 10.0
+    sweeps.run(1e5)
+    assert not sweeps.over and log.iterations < 1000
+
+
+@pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
+def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
+    """With the least of time sweeps have all of it."""
+    problem = suite.case(name).problem
+    reference(problem)
+    tree = Tree(problem, Deadline(1e-4))
+    sweeps = Sweeps(problem, tree.deadline)
+    assert tree.is_late and not tree.states
+    log = SolveLog(problem, 1e-12, 10**6, deadline=Deadline(1e-4))
+    log.offer(problem.start())
+    solve(log, tree, sweeps)
+    assert log.end is not None
+    log.end()
+    assert log.iterations > 0
+    assert [turn.solver for turn in log.turns] == ["anderson"]
+
+
+@pytest.mark.parametrize("pace", [0.1, 1.0, 2.0])
+def test_sweeps_that_cost_more_than_counted_end_in_time(pace, monkeypatch):
+    """The clock stands but for them; past the limit is one of them at most."""
+    problem = suite.case("granularF(n=4)").problem
+    reference(problem)
+    sweeps, now = Sweeps(problem), [0.0]
+    monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: now[0])
+    original, each = checked_sweeps.run, pace * sweeps.each
+
+    def run(data, watch, impulse, n, *more):
+        now[0] += n * each
+        return original(data, watch, impulse, n, *more)
+
+    monkeypatch.setattr(checked_sweeps, "run", run)
+    log = SolveLog(problem, 1e-300, 10**6, deadline=Deadline(1e-3))
+    log.offer(problem.start())
+    sweeps.begin(log)
+    sweeps.finish()
+    log.end()
+    assert 0.8e-3 <= now[0] <= 1e-3 + each
+    assert log.turns[-1].after == lv.residual(problem, log.impulse).relative
+    assert log.status in (lv.Status.TIME_LIMIT, lv.Status.FLOOR)
+
+
+def test_checks_read_what_is_swept_and_below_tol_the_judge_has_the_last_word():
+    """Of J and M where A is swept a check by A costs a sweep, one by J and M ten."""
+    problem = random_general(5, contacts=6)
+    reference(problem)
+    made = checked_sweeps.CheckedSweeps(problem.metric, problem.data, problem.law == "cone", 0)
+    impulse = problem.start()
+    made.run(impulse, 1.0, 4, 1e-300, 4, 32, np.inf)
+    assert made.now.data is problem.data is not problem.metric
+    made.run(impulse, made.now.relative, 4, 2.0 * made.now.relative, 4, 32, np.inf)
+    assert made.now.data is problem.metric
+    assert made.now.relative == lv.residual(problem, made.now.impulse).relative
+
+
+def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
+    problem = suite.case("infeasible").problem
+    log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
+    log.offer(problem.start())
+    monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
+    certify(log)
+    assert not log.turns
+
+
+@pytest.mark.parametrize("form", OPERATORS[:2])
+def test_where_contacts_roll_the_tree_has_no_step_that_cannot_roll(form):
+    rng = np.random.default_rng(3)
+    position = np.array([[1.0 * (k % 4), 0.0, 0.5 + k // 4] for k in range(12)])
+    pairs = [(k - 4 if k >= 4 else -1, k) for k in range(12)]
+    contacts = Contacts(pairs, position - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])
+    bodies = Bodies(position, 1.0, 0.4)
+    bodies.v_free += 0.2 * rng.standard_normal(bodies.v_free.shape)
+    problem = contact_problem(bodies, contacts, "coulomb", rolling=0.02)
+    problem = as_matrix(problem) if form == "matrix" else problem
+    for stage in lv.explain(problem).stages:
+        spec = registry.get("anderson" if stage.solver == "relaxation" else stage.solver)
+        assert spec.refuses(problem) is None
+    assert lv.solve(problem, tol=1e-9).success
+
+
+def test_cones_that_sweeps_do_not_take_have_steps_that_do():
+    general = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
+    assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "nncg"}
+    matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
+    assert {stage.solver for stage in lv.explain(matrix).stages} == {"nncg"}
+    assert lv.solve(matrix, tol=1e-4).solver.name == "auto"
+
+
+def test_sweeps_go_on_from_a_stale_guess_that_doing_nothing_is_better_than():
+    """Not from one that is lost; the result is never worse than doing nothing."""
+    problem = suite.granular(n=5, friction="coulomb").problem
+    solved = lv.solve(problem, tol=1e-9).impulse
+    rng = np.random.default_rng(1)
+    direction = rng.standard_normal(problem.m) * np.abs(solved).mean()
+    sizes = [
+        s for s in 10.0 ** np.arange(0.0, 9.0) if lv.residual(problem, solved + s * direction).relative > 1
+    ]
+    near, far = solved + sizes[0] * direction, solved + 1e9 * sizes[0] * direction
+    begun = []
+    original = Sweeps.begin
+
+    def begin(self, log):
+        original(self, log)
+        begun.append(self.impulse.copy())
+
+    for guess, kept in ((near, True), (far, False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Sweeps, "begin", begin)
+            found = lv.solve(problem, impulse=guess, tol=1e-6, max_iter=20)
+        assert np.array_equal(begun[-1], guess) == kept
+        assert found.residual.relative <= 1.0
+
+
+def test_a_stage_is_plain():
+    stage = next(iter(Tree(wild(seed=24).problem)))
+    assert isinstance(stage, Stage)

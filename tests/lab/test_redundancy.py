@@ -1,0 +1,331 @@
+"""`redundancy`: ranks known by hand, names, uniqueness, and representatives against other optimisers."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from hypothesis import given
+from kkt_truth import eliminate
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_trees import random_general
+from scipy.optimize import minimize
+
+import lavender as lv
+from lavender.lab.redundancy import redundancy
+from lavender.problem import operators
+
+
+def box_on_corners(mu=None, points=4, load=None):
+    """A unit cube, 1 kg, on the corners of its base."""
+    xy = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]])[:points]
+    arm = np.column_stack([xy, np.full(len(xy), -0.5)])
+    falls = [[0.0, 0.0, -0.1, 0.0, 0.0, 0.0]]
+    rows = touching([[-1, 0]] * len(arm), inv_inertia=[6.0 * np.eye(3)], v_free=falls, arm_b=arm)
+    if mu is None:
+        return lv.Problem.from_rows(rows)
+    return lv.Problem.from_rows(rows, mu=mu, tangents=2, friction="cone")
+
+
+@pytest.mark.parametrize("as_given", [lambda p: p, as_matrix])
+def test_a_cube_on_four_points(as_given):
+    """Rank 3 of the normals; 6 with friction: a rigid body has six motions."""
+    found = redundancy(as_given(box_on_corners()))
+    assert found.rank == 3
+    assert found.row_names == ("contact 3, normal",)
+    assert found.block_names == ("contact 3",)
+    assert not found.impulse_is_unique.any(), "the four share the load in any balanced way"
+    assert found.unique == ("slack", "body velocities", "objective")
+    assert redundancy(as_given(box_on_corners(0.5))).rank == 6
+
+
+def test_nothing_redundant():
+    found = redundancy(box_on_corners(points=3))
+    assert found.rank == 3
+    assert found.rows == ()
+    assert found.impulse_is_unique.all()
+    assert "impulse" in found.unique
+    assert "no row" in str(found)
+
+
+def test_the_second_of_two_equal_hinges_is_named():
+    rng = np.random.default_rng(3)
+    jac = rng.normal(size=(5, 12))
+    rows = lv.Rows(
+        inv_mass=[1.0, 0.5, 2.0], inv_inertia=np.tile(np.eye(3), (3, 1, 1)), v_free=rng.normal(size=(3, 6)),
+        jac=np.vstack([jac, jac, rng.normal(size=(2, 12))]), joint_ptr=[0, 5, 10, 12],
+        joint_body=[[0, 1], [0, 1], [1, 2]],
+    )  # fmt: skip
+    problem = lv.Problem.from_rows(rows, names=["hinge", "spare hinge", "rod"])
+    found = redundancy(problem)
+    assert found.rank == 7
+    assert found.block_names == ("spare hinge",)
+    assert found.rows == (5, 6, 7, 8, 9)
+    assert found.impulse_is_unique.tolist() == 10 * [False] + 2 * [True]
+    assert "spare hinge" in str(found)
+
+
+@given(seed=seeds)
+def test_rank_is_that_of_numpy(seed):
+    rng = np.random.default_rng(seed)
+    m, r = int(rng.integers(2, 30)), int(rng.integers(1, 12))
+    g = rng.normal(size=(m, r))
+    for a in (0.5 * (g @ g.T + (g @ g.T).T), g @ rng.normal(size=(r, m))):
+        assert redundancy(lv.Problem.linear(a, np.zeros(m))).rank == np.linalg.matrix_rank(
+            a, tol=1e-9 * np.linalg.norm(a, 2)
+        )
+
+
+def test_a_row_that_adds_little_is_one_also_where_a_is_not_symmetric():
+    new = 1e-8  # 2e-8 of A_ii, far above tol
+    for skew in (0.0, 1e-12):
+        assert (
+            redundancy(lv.Problem.linear([[1.0, 1.0 - new], [1.0 - new + skew, 1.0]], [1.0, 1.0])).rank == 2
+        )
+
+
+@pytest.mark.parametrize("kind", ["asymmetric", "indefinite"])
+def test_the_rank_of_a_matrix_is_that_of_exact_numbers_whatever_the_units_of_its_rows(kind):
+    rng = np.random.default_rng(7)
+    for _ in range(50):
+        m, r = rng.integers(1, 9, 2)
+        g = rng.integers(-3, 4, (m, r)).astype(float)
+        h = rng.integers(-2, 3, (r, m)) if kind == "asymmetric" else rng.choice([-1.0, 1.0], r)[:, None] * g.T
+        size = 2.0 ** rng.integers(-20, 21, m)
+        a = size[:, None] * (g @ h) * (1.0 if kind == "asymmetric" else size)
+        truth = len(eliminate([[Fraction(x) for x in row] for row in a.tolist()], m))
+        assert redundancy(lv.Problem.linear(a, np.zeros(m))).rank == truth, a
+
+
+@given(seed=seeds)
+def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
+    rng = np.random.default_rng(seed)
+    m, r = int(rng.integers(2, 12)), int(rng.integers(2, 12))
+    g, signs = rng.normal(size=(m, r)), rng.permutation([1.0, -1.0, *rng.choice([1.0, -1.0], r - 2)])
+    a = g * signs @ g.T
+    a = np.block(
+        [[0.5 * (a + a.T), np.zeros((m, 2))], [np.zeros((2, m)), np.array([[0.0, 1.0], [1.0, 0.0]])]]
+    )
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m + 2))
+    found = redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(a, tol=1e-9 * np.linalg.norm(a, 2))
+    assert not found.slack_is_unique and found.unique == ()
+    kept = np.setdiff1d(np.arange(m + 2), found.rows)
+    assert np.linalg.matrix_rank(a[kept], tol=1e-9 * np.linalg.norm(a, 2)) == found.rank
+    previous = rng.normal(size=m + 2)
+    near = found.nearest_to(previous)
+    for null in np.linalg.svd(a)[2][found.rank :]:
+        assert (
+            abs(null @ (problem.d * (near - previous))) < 1e-5 * np.abs(problem.d).max() * np.abs(near).max()
+        )
+    with pytest.raises(lv.CapabilityError, match="semidefinite"):
+        redundancy(lv.Problem.lcp(a, problem.b)).least_norm()
+
+
+@given(seed=seeds)
+def test_without_the_redundant_rows_the_rank_is_the_same(seed):
+    problem = as_matrix(random_contact_problem(seed, tangents=0, spin=False, bodies=2, contacts=12))
+    a = problem.dense()
+    found = redundancy(lv.Problem.linear(a, problem.b))
+    kept = np.setdiff1d(np.arange(problem.m), found.rows)
+    assert len(kept) == found.rank
+    again = redundancy(lv.Problem.linear(a[np.ix_(kept, kept)], problem.b[kept]))
+    assert again.rows == ()
+
+
+def test_a_large_island_is_decomposed_as_sparse():
+    m = 2500
+    grid = sp.diags_array([-np.ones(m - 1), 2.0 * np.ones(m), -np.ones(m - 1)], offsets=[-1, 0, 1]).tolil()
+    grid[0, 0] = grid[m - 1, m - 1] = 1.0  # a free chain: one null vector
+    found = redundancy(lv.Problem.linear(sp.csr_array(grid), np.zeros(m)))
+    assert found.rank == m - 1
+    assert found.tol == pytest.approx(1e-12 * m)
+    assert "LDL^T" in found.method
+
+
+@given(seed=seeds)
+def test_linear_representatives_are_projections(seed):
+    rng = np.random.default_rng(seed)
+    m = 9
+    g = rng.normal(size=(m, 4))
+    a = 0.5 * (g @ g.T + (g @ g.T).T)
+    problem = lv.Problem.linear(a, a @ rng.normal(size=m))
+    previous = rng.normal(size=m)
+    scale = np.sqrt(problem.d)
+    s = a / np.outer(scale, scale)
+    for wanted, got in (
+        (previous, redundancy(problem).nearest_to(previous)),
+        (np.zeros(m), redundancy(problem).least_norm()),
+    ):
+        # z = sqrt(d) (lambda - wanted) of least norm with S z = D^-1/2 (b - A wanted)
+        z = np.linalg.pinv(s, rcond=1e-10) @ ((problem.b - a @ wanted) / scale)
+        np.testing.assert_allclose(got, wanted + z / scale, atol=1e-7 * max(1.0, np.abs(z).max()))
+
+
+def test_four_legs_share_evenly():
+    even = redundancy(box_on_corners()).least_norm()
+    np.testing.assert_allclose(even, 0.025, rtol=1e-9)
+    found = redundancy(box_on_corners())
+    np.testing.assert_allclose(
+        found.nearest_to([0.04, 0.01, 0.04, 0.01]), [0.04, 0.01, 0.04, 0.01], atol=1e-9
+    )
+    # Asked for more on one diagonal than there is: the other diagonal is let go.
+    np.testing.assert_allclose(found.nearest_to([1.0, 0.0, 1.0, 0.0]), [0.05, 0.0, 0.05, 0.0], atol=1e-9)
+
+
+@given(seed=seeds)
+def test_lcp_representatives_are_nearest_on_the_optimal_face(seed):
+    """Against SLSQP on min sum d (lambda - previous)^2, A lambda = A lambda*, bounds."""
+    rng = np.random.default_rng(seed)
+    problem = random_lcp(seed, m=6, rank=3)
+    solution = lv.solve(problem, "direct", tol=1e-10)
+    assert solution.success
+    previous = solution.impulse + rng.normal(size=6)
+    got = redundancy(problem).nearest_to(previous)
+    r = lv.residual(problem, got)
+    assert r.relative <= max(1e-9, 2.0 * r.floor)
+    np.testing.assert_allclose(r.slack, solution.slack, atol=1e-6)
+    d, a = problem.d, problem.dense()
+    keep = np.linalg.svd(a)[2][:3]
+    # Rows off w = 0 stay at their bound.
+    low, high = problem.cones.lower.copy(), problem.cones.upper.copy()
+    high[solution.slack > 1e-7] = low[solution.slack > 1e-7]
+    low[solution.slack < -1e-7] = high[solution.slack < -1e-7]
+    best = minimize(
+        lambda x: 0.5 * d @ (x - previous) ** 2, solution.impulse, jac=lambda x: d * (x - previous),
+        bounds=list(zip(low, high, strict=True)), method="SLSQP", options={"ftol": 1e-14, "maxiter": 500},
+        constraints={"type": "eq", "fun": lambda x: keep @ (x - solution.impulse), "jac": lambda x: keep},
+    )  # fmt: skip
+    distance = 0.5 * d @ (got - previous) ** 2
+    # SLSQP meets its constraints to about 1e-7: it may seem that much nearer.
+    if best.success:
+        assert distance <= best.fun * (1.0 + 1e-5) + 1e-6
+
+
+def test_cone_representatives():
+    problem = box_on_corners(0.5)
+    even = redundancy(problem).least_norm()
+    np.testing.assert_allclose(even.reshape(4, 3)[:, 0], 0.025, atol=1e-6)
+    assert lv.residual(problem, even).relative <= 1e-6
+
+
+def test_what_has_no_representative_is_refused():
+    problem = box_on_corners(0.5).relaxed("coulomb")
+    found = redundancy(problem)
+    assert found.unique == ()
+    with pytest.raises(lv.CapabilityError, match="relaxed"):
+        found.least_norm()
+    with pytest.raises(lv.InputError, match="tol"):
+        redundancy(problem, tol=2.0)
+    with pytest.raises(lv.InputError, match="previous"):
+        redundancy(box_on_corners()).nearest_to([1.0])
+
+
+def test_no_rows():
+    assert redundancy(lv.Problem.linear(np.zeros((0, 0)), [])).rank == 0
+
+
+# -- rows and bodies of very different size -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
+@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 140])
+def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
+    """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
+    rng = np.random.default_rng(spread)
+    seen = set()
+    for _ in range(25):
+        m, n = rng.integers(2, 6, 2)
+        jac = rng.integers(-2, 3, (m, n)).astype(float)
+        if m > 2 and rng.random() < 0.5:
+            jac[-1] = jac[0] + jac[1]
+        if not jac.any(axis=1).all():
+            continue
+        truth = len(eliminate([[Fraction(x) for x in row] for row in jac.tolist()], n))
+        size = 2.0 ** (spread * rng.integers(0, 2, n if form == "masses" else m))
+        if form == "matrix":
+            jac = np.sqrt(2.0 ** (2 * (np.log2(size) // 2)))[:, None] * jac
+            problem = lv.Problem.linear(jac @ jac.T, np.zeros(m))
+        else:
+            mass = np.diag(size) if form == "masses" else np.eye(n)
+            jac = jac if form == "masses" else size[:, None] * jac
+            problem = lv.Problem.from_jacobian(jac, mass, np.zeros(n), cones=lv.Cones.free(m))
+        found = lv.redundancy(problem)
+        assert found.rank == truth, (jac, size, str(found))
+        assert len(found.rows) == m - truth
+        seen.add(m - truth)
+    assert len(seen) > 1
+
+
+def test_a_rank_that_masses_hide_is_told():
+    jac = np.array([[1.0, 1.0], [1.0, -1.0]])
+    found = lv.redundancy(
+        lv.Problem.from_jacobian(jac, np.diag([1.0, 1e14]), np.zeros(2), cones=lv.Cones.free(2))
+    )
+    assert found.rank == 2
+    assert "1 by the masses and 2 without them" in str(found)
+
+
+def test_beside_a_diagonal_1e26_times_larger_a_row_is_still_a_row():
+    found = lv.redundancy(lv.Problem.linear([[1.0, 1e12], [1e12, 1e26]], [1.0, 1.0]))
+    assert found.rank == 2
+    problem = lv.Problem.linear([[1.0, 2.0**43], [2.0**43, 2.0**86]], [1.0, 2.0**43])
+    repeated = lv.redundancy(problem)
+    assert repeated.rank == 1
+    assert lv.residual(problem, repeated.least_norm()).relative <= 1e-9
+
+
+def test_a_diagonal_that_is_rounding_is_not_scaled_by():
+    # 1e-27 beside 1e-13: semidefinite to rounding alone, and so no size of the row.
+    found = lv.redundancy(lv.Problem.linear([[1e-27, 1e-13], [1e-13, 1.0]], [0.0, 0.0]))
+    assert found.rank == 1
+
+
+def test_an_island_is_decomposed_on_its_own_velocities(monkeypatch):
+    """Of 300 boxes side by side each is small; with the columns of all, memory and time grow as their square."""
+    seen, qr = [], scipy.linalg.qr
+    monkeypatch.setattr(scipy.linalg, "qr", lambda a, **more: (seen.append(a.shape), qr(a, **more))[1])
+    one = np.random.default_rng(2).normal(size=(9, 4))
+    many = lv.Problem.from_jacobian(
+        np.kron(np.eye(300), one), np.eye(1200), np.ones(1200), cones=lv.Cones.free(2700)
+    )
+    assert lv.redundancy(many).rank == 1200
+    assert max(seen)[0] <= 5
+
+
+def test_other_forms_know_the_operator():
+    problem = random_general(2, "coulomb", compliance=False)
+    assert problem.relaxed("cone").generalized is problem.generalized
+    boxed = problem.boxed(0.7)
+    assert boxed.law == "lcp"
+    assert boxed.generalized is problem.generalized
+    form = problem.velocity_form()
+    scale = np.outer(form.scale, form.scale)
+    np.testing.assert_allclose(
+        (form.jacobian @ form.jacobian.T).toarray(), problem.dense() * scale, atol=1e-13
+    )
+    found = lv.redundancy(problem)
+    assert found.rank == np.linalg.matrix_rank(problem.dense())
+    assert found.rank < problem.m
+    assert lv.solve(problem, "pgs", order="colored", max_iter=3, tol=0.0).iterations == 3
+
+
+def test_entries_of_a_are_counted_once(monkeypatch):
+    """Rows that share all velocities of a tree meet once, not once for each of them."""
+    rng = np.random.default_rng(5)
+    jac = np.zeros((40, 30))
+    jac[:, -1] = rng.normal(size=40)  # M^-1 J^T is full
+    mass = np.eye(30) + 0.4 * (np.eye(30, k=1) + np.eye(30, k=-1))
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40 + 1)
+    free = lv.Cones.free(40)
+    problem = lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free)
+    assert np.allclose(problem.dense(), jac @ np.linalg.inv(mass) @ jac.T)
+    assert lv.redundancy(problem).rank == 1
+    twins = lv.Problem.from_jacobian(
+        np.hstack([jac, -jac]), np.kron(np.eye(2), mass), np.ones(60), cones=free
+    )
+    assert twins.metric.entries_of_a == 40 * 40  # rows on two trees, too
+    monkeypatch.setattr(operators, "MOST_ENTRIES", 40 * 40)
+    with pytest.raises(lv.InputError, match="J and M as they are"):
+        lv.Problem.from_jacobian(jac, mass, np.ones(30), cones=free).delassus()

@@ -1,0 +1,333 @@
+"""Absurd input is told, and what is meant so is not."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from random_problems import as_matrix, general, touching
+from worked import ROOT, after
+
+import lavender as lv
+from benchmarks.planted import planted, scenes, shares
+from lavender import suite
+from lavender.judge.certificates import fighting
+
+SCENES = {
+    "stack": after(2, "stack", n=12, size=0.5, mass=60.0).constraint_problem(),
+    "bridge": after(40, "bridge").constraint_problem(),
+    "pit": after(60, "pile", n=60, size=0.3).constraint_problem(),
+}
+
+
+def given(problem):
+    """Rows as somebody would give them, and b's target."""
+    rows = {f.name: np.array(getattr(problem.rows, f.name)) for f in fields(problem.rows) if f.name != "copy"}
+    return rows, problem.b + problem.jacobian @ problem.rows.v_free.ravel()
+
+
+def made(problem, rows, target):
+    c, kj = problem.cones, problem.rows.n_joints
+    mj = len(rows["jac"])
+    return lv.Problem.from_rows(
+        lv.Rows(**rows),
+        target,
+        lower=c.lower[:mj],
+        upper=c.upper[:mj],
+        mu=c.mu[kj:],
+        tangents=c.n_tangents[kj:],
+    )
+
+
+def kinds(problem, impulse=None):
+    return {s.kind for s in lv.diagnose(problem, impulse)}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_sound_step_is_silent(name):
+    problem = SCENES[name]
+    assert lv.diagnose(problem) == ()
+    assert lv.diagnose(made(problem, *given(problem))) == ()
+
+
+def test_the_built_in_suite_is_silent():
+    assert [c.name for c in suite.cases("default") if lv.diagnose(c.problem)] == []
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_flipped_normals_are_told(name):
+    rows, target = given(SCENES[name])
+    rows["normal"] *= -1.0
+    assert "normals" in kinds(made(SCENES[name], rows, target))
+    rows["normal"][1:] *= -1.0  # one alone, which opposes the others of its pair
+    found = lv.diagnose(made(SCENES[name], rows, target))
+    assert ("normals", (SCENES[name].rows.n_joints,)) in [(s.kind, s.blocks) for s in found]
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_swapped_bodies_are_told(name):
+    rows, target = given(SCENES[name])
+    rows["contact_body"] = rows["contact_body"][:, ::-1]
+    assert "normals" in kinds(made(SCENES[name], rows, target))
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_opposed_and_repeated_contacts_are_told(name):
+    problem = SCENES[name]
+    rows, _ = given(problem)
+    for sign, kind in ((1.0, "duplicate rows"), (-1.0, "opposed normals")):
+        twice = dict(rows)
+        for key in ("contact_body", "tangent", "arm_a", "arm_b"):
+            twice[key] = np.concatenate([rows[key], rows[key][-1:]])
+        twice["normal"] = np.concatenate([rows["normal"], sign * rows["normal"][-1:]])
+        assert kind in kinds(lv.Problem.from_rows(lv.Rows(**twice), mu=0.5))
+
+
+@pytest.mark.parametrize("name", ["stack", "pit"])
+def test_a_contact_of_another_body_is_told(name):
+    problem = SCENES[name]
+    rows, target = given(problem)
+    pair = rows["contact_body"]
+    count = np.bincount(pair[pair.min(axis=1) >= 0].ravel(), minlength=problem.rows.n_bodies)
+    # a contact whose bodies, and the one beside, are held by others
+    i = next(
+        i for i, (a, b) in enumerate(pair)
+        if a >= 0 and 0 <= b < len(count) - 1 and b + 1 != a and min(count[[a, b, b + 1]]) > 3
+    )  # fmt: skip
+    rows["contact_body"][i, 1] += 1
+    found = {s.kind: s for s in lv.diagnose(made(problem, rows, target))}
+    assert found["bodies"].blocks == (problem.rows.n_joints + i,)
+
+
+def test_joint_targets_behind_those_of_contacts_are_told():
+    problem = SCENES["bridge"]
+    rows, target = given(problem)
+    mj = len(rows["jac"])
+    target[np.abs(target) < 1e-12] = 0.0
+    target[:mj:3] = 0.6  # m/s: they close gaps of a centimetre
+    assert kinds(made(problem, rows, target)) == set()
+    assert kinds(made(problem, rows, np.roll(target, -mj))) == {"targets"}
+
+
+def test_masses_for_their_inverses_are_told():
+    for name in ("stack", "pit"):  # the bridge's planks have 1 kg and 1 m, where both readings are ordinary
+        rows, target = given(SCENES[name])
+        rows["inv_mass"], rows["inv_inertia"] = 1.0 / rows["inv_mass"], np.linalg.inv(rows["inv_inertia"])
+        assert "masses" in kinds(made(SCENES[name], rows, target)), name
+    rows, target = given(SCENES["stack"])
+    assert "masses" in kinds(made(SCENES["stack"], rows | {"inv_mass": 1.0 / rows["inv_mass"]}, target))
+    still = rows["inv_mass"].copy()
+    still[3] = 0.0
+    found = lv.diagnose(made(SCENES["stack"], rows | {"inv_mass": still}, target))
+    assert "finite inertia" in found[0].reason
+    assert found[0].data["bodies"] == [3]
+
+
+def test_a_depth_with_the_wrong_sign_is_told():
+    rows, _ = given(SCENES["stack"])
+    rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)
+    target = np.zeros(SCENES["stack"].m)
+    for depth, wanted in ((0.01, set()), (-0.01, {"targets"})):
+        target[::3] = depth * 60
+        assert kinds(made(SCENES["stack"], rows, target)) == wanted
+
+
+def test_friction_keys_and_forces_are_told():
+    problem = SCENES["stack"]
+    doubled = np.array(problem.key)
+    doubled[5] = doubled[7]
+    assert kinds(replace(problem, key=doubled)) == {"duplicate keys"}
+    assert lv.diagnose(replace(problem, key=doubled))[0].blocks == (5, 7)
+    solved = lv.solve(problem, tol=1e-9).impulse
+    assert kinds(problem, solved) == set()
+    assert kinds(problem, 240.0 * solved) == {"impulses"}
+    assert kinds(replace(problem, guess=240.0 * solved)) == {"impulses"}
+    wild = replace(problem, cones=lv.Cones.contacts(12.0, count=problem.n_blocks))
+    assert kinds(wild) == {"friction"}
+
+
+@pytest.fixture(scope="module")
+def found():
+    return shares()
+
+
+def test_the_page_has_the_shares_of_planted_mistakes_that_are_found(found):
+    page = (ROOT / "docs" / "failures.md").read_text(encoding="utf-8")
+    for mistake in found["bodies"]:
+        cells = " | ".join("{} of {}".format(*of[mistake]) for of in found.values())
+        assert f"| {mistake} | {cells} |" in page
+
+
+def test_rows_of_j_that_are_no_normals_are_told_as_those_of_bodies(found):
+    """Nothing is told of what is right; signs and order of rows are told wherever contacts are of rigid bodies."""
+    for of in found.values():
+        assert of["none"] == (0, 30)
+        assert of["normals flipped"] == of["tangents first"] == of["mu in degrees"] == (30, 30)
+        for mistake in (
+            "gap or depth of the wrong sign",
+            "targets divided by dt twice",
+            "v* = v + a, without dt",
+        ):
+            assert of[mistake][0] >= 10
+
+
+@pytest.mark.parametrize("spin_of", ["a ball", "a box"])
+def test_a_kinematic_tree_is_not_taken_for_rigid_bodies(spin_of):
+    """A base that hangs below the feet it stands on is no mistake, if there are joints in between."""
+    given = next(x for name, x in scenes() if name.startswith("stack"))
+    mass = given.mass.copy()
+    if spin_of == "a ball":
+        mass[3, 3] = mass[4, 4] = mass[5, 5]
+    turned = replace(given, rows=None, mass=mass).turned((0, 1, 2), -1.0)
+    assert "normals" in kinds(turned.problem)
+    joint = np.zeros((len(mass) + 1, len(mass) + 1))
+    joint[:-1, :-1], joint[-1, -1], joint[-1, 3] = mass, 0.1, 0.01
+    joint[3, -1] = joint[-1, 3]
+    wider = np.hstack([turned.jac, np.zeros((len(turned.jac), 1))])
+    wider[:3, -1] = 0.3
+    more = {"before": np.append(turned.before, 0.0), "change": np.append(turned.change, 0.0)}
+    assert kinds(replace(turned, jac=wider, mass=joint, v_free=None, **more).problem) == set()
+
+
+def test_speeds_of_another_unit_are_silent_and_a_conveyor_is():
+    given = replace(next(x for name, x in scenes() if name.startswith("ramp")), rows=None)
+    moved = given.target.copy()
+    moved[given.contacts[:, 0]], moved[given.contacts[:, 1]] = 0.0, 0.8
+    assert kinds(replace(given, target=moved).problem) == set()
+    moved[given.contacts[0, 1]] = 0.7
+    assert "tangents first" in kinds(replace(given, target=moved).problem)
+    for length, told in ((1.0, {"v_free"}), (1e6, set())):  # m, micrometres
+        wrong = dict(planted(given))["v* = v + a, without dt"]
+        at_rest = replace(wrong, target=0.0 * wrong.target, v_free=length * wrong.v_free)
+        assert kinds(at_rest.problem) == told
+
+
+def boxes(n=3):
+    """Boxes side by side on the ground in generalised coordinates: J (12 n, 6 n), M, v*."""
+    problem = after(1, "stack", n=1, size=0.5, mass=60.0).constraint_problem()
+    j = problem.jacobian.toarray()
+    mass = np.linalg.inv(problem.rows.inverse_mass_matrix().toarray())
+    return np.kron(np.eye(n), j), np.kron(np.eye(n), mass), np.tile(problem.rows.v_free.ravel(), n)
+
+
+def test_generalised_coordinates_out_of_order_are_told():
+    j, mass, v = boxes()
+    cones = lv.Cones.contacts(0.5, count=12)
+
+    def problem(j, mass=mass):
+        return lv.Problem.from_jacobian(j, mass, v, cones=cones)
+
+    assert kinds(problem(j)) == set()
+    last = np.arange(36).reshape(-1, 3)[:, [1, 2, 0]].ravel()
+    assert kinds(problem(j[last])) == {"tangents first"}
+    grouped = np.arange(36).reshape(-1, 3).T.ravel()
+    assert kinds(problem(j[grouped])) == {"all normals first"}
+    assert kinds(problem(j, np.linalg.inv(mass))) == {"masses"}
+    assert (
+        kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()
+    )  # one of twelve: collision detection does that
+    assert kinds(problem(np.concatenate([j[:18], j[:18]]))) == {"duplicate rows"}
+    flat = j[:6, :6]  # two contacts of one box: as many rows as velocities
+    pair = lv.Cones.contacts(0.5, count=2)
+    assert kinds(lv.Problem.from_jacobian(flat, mass[:6, :6], v[:6], cones=pair)) == set()
+    assert "J transposed" in kinds(lv.Problem.from_jacobian(flat.T, mass[:6, :6], v[:6], cones=pair))
+
+
+def test_a_matrix_with_opposed_rows_is_told():
+    a = np.eye(6)
+    a[3:, :3] = a[:3, 3:] = np.diag([-1.0, 1.0, 1.0])
+    problem = lv.Problem.contact(a, [0.3, 0.0, 0.0, 0.1, 0.0, 0.0], mu=[0.5, 0.5])
+    assert "opposed normals" in kinds(problem)
+    assert kinds(lv.Problem.contact(a, [0.3, 0.0, 0.0, -0.4, 0.0, 0.0], mu=[0.5, 0.5])) == set()
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-320, 1e-160, 1e160, 1e300])
+@pytest.mark.parametrize("what", ["arm_a", "arm_b", "inv_mass", "inv_inertia", "v_free"])
+def test_numbers_at_the_edge_of_float64_are_looked_at(what, size):
+    for name in SCENES:
+        rows, target = given(SCENES[name])
+        try:
+            problem = made(SCENES[name], rows | {what: size * rows[what]}, target)
+        except lv.InputError:  # b is not finite
+            continue
+        assert all(isinstance(s.reason, str) for s in lv.diagnose(problem, np.full(problem.m, 1e300)))
+
+
+STATE = {
+    "gap or depth of the wrong sign": "targets",
+    "targets times dt once more": "targets",
+    "targets divided by dt twice": "targets",
+    "v* = v + a, without dt": "v_free",
+    "v* = v, without a": "v_free",
+}
+
+
+def test_the_state_before_the_step_tells_what_the_problem_alone_does_not():
+    for name, sound in list(scenes())[::5]:
+        for x in (sound, replace(sound, rows=None)):
+            assert lv.diagnose(x.problem, **x.state) == (), name
+            for mistake, wrong in planted(x):
+                kinds = {s.kind for s in lv.diagnose(wrong.problem, **wrong.state)}
+                assert STATE.get(mistake) is None or STATE[mistake] in kinds, (name, mistake)
+    problem = SCENES["stack"]
+    with pytest.raises(lv.InputError, match="give dt"):
+        lv.diagnose(problem, gap=np.zeros(problem.rows.n_contacts))
+    with pytest.raises(lv.InputError, match="shape"):
+        lv.diagnose(problem, velocity=np.zeros(3))
+    with pytest.raises(lv.InputError, match="a matrix does not have"):
+        lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
+
+
+def test_what_is_no_problem_is_refused():
+    with pytest.raises(lv.InputError, match=r"lavender\.Problem is needed"):
+        lv.diagnose(np.eye(3))
+    with pytest.raises(lv.InputError, match="shape"):
+        lv.diagnose(SCENES["stack"], np.zeros(3))
+
+
+def pressed(law, form):
+    """A ball that contact 0 pushes up by 0.1 m/s and a joint of one row holds; contact 1 has no part in it.
+
+    y = 1 on both: w.y = 0 whatever the impulses, b.y = 0.1.
+    """
+    rows = touching([[-1, 0], [-1, 1]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]))
+    jac = np.zeros((1, 12))
+    jac[0, 8] = -1.0
+    rows = replace(rows, jac=jac, joint_ptr=np.array([0, 1]), joint_body=np.array([[-1, 0]]))
+    friction = {"friction": law, "tangents": 2, "mu": 0.5} if law in ("coulomb", "cone") else {"tangents": 0}
+    ends = {"lower": -np.inf, "upper": np.inf}
+    target = np.zeros(1 + 2 * (1 + friction["tangents"]))
+    target[1] = 0.1
+    problem = lv.Problem.from_rows(rows, target=target, **ends, **friction)
+    return {"bodies": problem, "J and M": general(problem), "A": as_matrix(problem)}[form]
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+@pytest.mark.parametrize("name", ["auto", "newton"])
+def test_who_fights_is_named(name, law, form):
+    problem = pressed(law, form)
+    solution = lv.solve(problem, "auto" if law == "coulomb" else name)
+    assert solution.status is lv.Status.INFEASIBLE
+    joints, contacts = fighting(problem, solution.certificate)
+    assert joints == (0,) and contacts == (1,)  # blocks
+    assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
+    found = [s for s in lv.diagnose(problem) if s.kind == "conflict"]
+    assert len(found) == 1 and found[0].blocks == (0, 1)
+
+
+@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
+@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
+def test_the_compliance_that_is_advised_gives_an_answer(law, form):
+    problem = pressed(law, form)
+    (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")
+    soft = np.zeros(problem.m)
+    for i in range(problem.m):
+        if problem.row_name(i) in found.data["soft_rows"]:
+            soft[i] = found.data["compliance"]
+    assert np.count_nonzero(soft) == 1 and f"{found.data['compliance']:.1g} 1/kg" in found.reason
+    if form == "A":
+        softer = replace(problem, matrix=problem.dense() + np.diag(soft))
+    else:
+        softer = replace(problem, compliance=problem.compliance + soft)
+    assert lv.solve(softer).success
+    assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]

@@ -1,0 +1,59 @@
+"""The exported library, through its header alone, gives the bits of the extension: here, on AArch64, in WebAssembly."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lavender import out as export
+from lavender.base.errors import LavenderError
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[2]
+sys.path.insert(0, str(HERE))
+
+from export import record  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+
+def why_not():
+    if shutil.which("gcc") is None:
+        return "gcc is not installed"
+    pytest.importorskip("ziglang", reason="ziglang is not installed (extra: wasm): no compiler for AArch64")
+    return "" if shutil.which("qemu-aarch64-static") else "no qemu-aarch64-static (Debian: qemu-user-static)"
+
+
+def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen():
+    if why_not():
+        pytest.skip(why_not())
+    done = subprocess.run(
+        [sys.executable, str(ROOT / ".ci" / "parity"), "--quick", "--steps", "40"],
+        capture_output=True, text=True, check=False, cwd=ROOT,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line for line in done.stdout.splitlines() if line.startswith("| ")]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == ["x86_64", "aarch64", "aarch64"]
+    assert [row.split(" | ")[-1].strip("| ") == "same" for row in rows] == [True, True, False]
+    assert "differ, as it must, and lav_self_test says so" in rows[2]
+
+
+def test_webassembly_has_the_bits_of_the_extension(tmp_path):
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    try:
+        export.write("npm", tmp_path)
+    except LavenderError as reason:
+        pytest.skip(str(reason))
+    _, count = record(tmp_path, scenes=())
+    check = ["node", str(HERE / "check_vectors.mjs"), str(tmp_path), str(tmp_path / "vectors.bin")]
+    done = subprocess.run(check, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert f"{count} of {count} vectors the same" in done.stdout and count > 1000
+    data = bytearray((tmp_path / "vectors.bin").read_bytes())
+    data[-8] ^= 1  # the last bit of the last number
+    (tmp_path / "vectors.bin").write_bytes(data)
+    done = subprocess.run(check, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.count("DIFFERS") == 1

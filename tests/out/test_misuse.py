@@ -1,0 +1,458 @@
+"""What is wrong comes back as a number with a text, and nothing is written where it must not be."""
+
+import ctypes as ct
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from clib import Options, Problem, Result, Verdict
+from hypothesis import given as drawn
+from hypothesis import settings
+from hypothesis import strategies as st
+from random_problems import as_matrix, random_contact_problem, random_lcp, seeds
+from tower import self_test_problem
+
+import lavender as lv
+from lavender import out as export
+from lavender.out import HEADER
+from lavender.out.header import constants
+from lavender.out.view import ARRAYS, METHODS
+
+ERRORS = {
+    value: name for name, value in constants(HEADER.read_text()).items() if name.startswith("LAV_ERROR")
+}
+CANARY = 0xA5
+
+
+class Guarded:
+    """A solver in memory of just so many bytes, with marks before and behind."""
+
+    def __init__(self, library, problem, options, bytes_):
+        self.c, self.bytes = library.c, bytes_
+        self.memory = (ct.c_ubyte * (bytes_ + 256))(*([CANARY] * (bytes_ + 256)))
+        self.at = ct.c_void_p()
+        begin = ct.addressof(self.memory) + 128
+        self.code = self.c.lav_open(
+            ct.c_void_p(begin), ct.c_uint64(bytes_), ct.byref(problem), ct.byref(options), ct.byref(self.at)
+        )
+
+    def whole(self):
+        return set(self.memory[:128]) == set(self.memory[128 + self.bytes :]) == {CANARY}
+
+
+def opened(library, method="sequential_impulses"):
+    problem, options = library.problem(self_test_problem()), library.options(method)
+    room = ct.c_uint64()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    solver = Guarded(library, problem, options, room.value)
+    assert solver.code == 0
+    return solver, problem
+
+
+def changed(key, at, value):
+    def apply(problem):
+        array = problem.keep[key].copy()
+        array.reshape(-1)[at] = value
+        problem.keep[key] = array
+        setattr(problem, key, array.ctypes.data)
+
+    apply.array, apply.index = key, at
+    return apply
+
+
+def put(key, value):
+    return lambda problem: setattr(problem, key, value)
+
+
+def put_array(key, values):
+    def apply(problem):
+        problem.keep[key] = np.array(values)
+        setattr(problem, key, problem.keep[key].ctypes.data)
+
+    return apply
+
+
+MISTAKES = {
+    "struct of another version": (put("size", 8), "VERSION"),
+    "form": (put("form", 9), "OPTION"),
+    "law": (put("law", 5), "OPTION"),
+    "rows below 0": (put("n_rows", -3), "COUNT"),
+    "fewer rows than blocks": (put("n_rows", 3), "COUNT"),
+    "entries below 0": (put("n_entries", -1), "COUNT"),
+    "more joints than blocks": (put("n_joints", 99), "COUNT"),
+    "joints that are contacts": (put("n_joints", 2), "BLOCKS"),
+    "blocks that do not end": (changed("block_ptr", -1, 35), "BLOCKS"),
+    "blocks that go back": (changed("block_ptr", 3, 1), "BLOCKS"),
+    "a block far away": (changed("block_ptr", 4, 2**30), "BLOCKS"),
+    "no such kind": (changed("kind", 2, 7), "BLOCKS"),
+    "friction below 0": (changed("mu", 1, -0.1), "FRICTION"),
+    "friction not a number": (changed("mu", 1, np.nan), "FRICTION"),
+    "a body that is not there": (changed("contact_body", 5, 3), "INDEX"),
+    "a body below the world": (changed("contact_body", 5, -2), "INDEX"),
+    "NaN in b": (changed("b", 0, np.nan), "NUMBER"),
+    "an infinite normal": (changed("normal", 4, np.inf), "NUMBER"),
+    "NaN in an inertia": (changed("inv_inertia", 9, np.nan), "NUMBER"),
+    "a mass below 0": (changed("inv_mass", 1, -1.0), "MASS"),
+    "a compliance below 0": (changed("compliance", 3, -1.0), "MASS"),
+    "an inertia below 0": (changed("inv_inertia", 13, -1.0), "MASS"),
+    "an inertia that is not symmetric": (changed("inv_inertia", 11, 0.5), "MASS"),
+    "a normal of length 0": (changed("normal", 14, 0.0), "FRAME"),
+    "a normal of length 2": (changed("normal", 14, 2.0), "FRAME"),
+    "a tangent along the normal": (changed("tangent", 14, 0.6), "FRAME"),
+    "a body that touches itself": (changed("contact_body", 10, 1), "PAIR"),
+    "two static bodies": (changed("contact_body", 1, -1), "PAIR"),
+    "no masses": (put("inv_mass", None), "NULL"),
+    "no normals": (put("normal", None), "NULL"),
+    "no bodies of contacts": (put("contact_body", None), "NULL"),
+    "rolling below 0": (put_array("rolling", [-0.1] * 12), "FRICTION"),
+    "rolling not a number": (put_array("rolling", [np.nan] * 12), "FRICTION"),
+    "rows that do not roll": (changed("kind", 2, 5), "BLOCKS"),
+    "a box of one tangent": (lambda q: (changed("kind", 2, 4)(q), changed("block_ptr", 3, 8)(q)), "BLOCKS"),
+    "an order with a block twice": (changed("order", 1, 0), "INDEX"),
+}
+
+
+ROWS = ("inv_mass", "inv_inertia", "contact_body", "normal", "tangent", "arm_a", "arm_b")
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_problem_with_a_mistake_is_refused_and_said(library, mistake):
+    solver, problem = opened(library)
+    assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
+    problem.keep["order"] = np.arange(12, dtype=np.int32)
+    apply, error = MISTAKES[mistake]
+    apply(problem)
+    code = library.c.lav_set(solver.at, ct.byref(problem))
+    assert ERRORS[code] == f"LAV_ERROR_{error}"
+    assert len(library.c.lav_text(code)) > 20
+    if hasattr(apply, "array") and error != "BLOCKS":  # named, with the place of what it is part of
+        at, whole = ct.c_int32(), {"normal": 3, "tangent": 3, "inv_inertia": 9, "contact_body": 2}
+        assert library.c.lav_refused(solver.at, ct.byref(at)).decode() == apply.array
+        size = whole.get(apply.array, 1)
+        assert at.value // size == apply.index % problem.keep[apply.array].size // size
+        if apply.array in ROWS:  # as the package refuses it
+            given = {name: problem.keep[name] for name in ROWS} | {"v_free": problem.keep["velocity"]}
+            with pytest.raises(lv.InputError, match=apply.array):
+                lv.Rows(**given)
+    assert solver.whole()
+    result = Result()
+    result.size = ct.sizeof(Result)
+    budget = library.budget(5, 0.0)
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(result)) == -14  # not the problem before
+    assert library.c.lav_set(solver.at, ct.byref(library.problem(self_test_problem()))) == 0  # and goes on
+
+
+def test_every_error_has_its_own_text(library):
+    texts = {library.c.lav_text(code) for code in [0, *ERRORS]}
+    assert len(texts) == 1 + len(ERRORS) and all(len(text) > 7 for text in texts)
+
+
+def test_null_and_no_solver_are_told_apart(library):
+    c, q, o, r = library.c, Problem(), Options(), Result()
+    assert c.lav_set(None, ct.byref(q)) == c.lav_run(None, None, None) == c.lav_impulse(None, None, 0) == -1
+    assert c.lav_room(None, None, None) == c.lav_open(None, ct.c_uint64(8), None, None, None) == -1
+    nobody = (ct.c_double * 400)()
+    assert c.lav_set(nobody, ct.byref(q)) == -15
+    assert c.lav_default_options(99, ct.byref(o)) == c.lav_default_problem(0, ct.byref(q)) == -12
+    solver, problem = opened(library)
+    budget = library.budget(5, 0.0)
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -14  # no problem yet
+    assert c.lav_set(solver.at, ct.byref(problem)) == 0
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -2  # its size is not filled in
+    r.size = ct.sizeof(Result)
+    budget.tol = np.nan
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -12
+    budget.tol, budget.seconds = 0.0, 1.0
+    assert c.lav_run(solver.at, ct.byref(budget), ct.byref(r)) == -1  # a limit without a clock
+    out = np.full(35, 7.0)
+    assert c.lav_impulse(solver.at, ct.c_void_p(out.ctypes.data), 35) == -3 and set(out) == {7.0}
+    assert solver.whole()
+
+
+@pytest.mark.parametrize(
+    "method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"]
+)
+def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, method):
+    problem, options, room = library.problem(self_test_problem()), library.options(method), ct.c_uint64()
+    seen = set()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    for bytes_ in [*range(0, room.value, room.value // 40), room.value]:
+        solver = Guarded(library, problem, options, bytes_)
+        if solver.code == 0:
+            code = library.c.lav_set(solver.at, ct.byref(problem))
+            seen.add(code)
+            if code == -10:
+                assert library.c.lav_needed(solver.at) > bytes_
+        else:
+            assert solver.code == -10
+        assert solver.whole()
+    assert seen == {0, -10}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_memory_alone_binds_and_needed_suffices_wherever_nothing_is_guessed(library, method):
+    """A solver that was opened for little takes the largest problem in enough memory, with the impulses it had."""
+    small, c = random_lcp(1, m=3), library.c
+    bodies = random_contact_problem(3, bodies=4, contacts=6)
+    rng = np.random.default_rng(5)
+    more = lv.Problem.linear(np.eye(60) + 0.01, rng.normal(size=60))
+    free = lv.Problem.linear(np.eye(3) + 0.01, rng.normal(size=3))
+    towers, grown = [stack_of(n) for n in (1, 6)], 0
+    for few, many in (
+        (free, more),
+        (small, random_lcp(2, m=60)),
+        (as_matrix(bodies), as_matrix(towers[1])),
+        towers,
+    ):
+        problems = [library.problem(p, key=np.arange(p.n_blocks, dtype=np.uint64)) for p in (few, many)]
+        options = library.options(method)
+        if any(c.lav_takes(ct.byref(q), ct.byref(options)) for q in problems):
+            continue
+        solver = library.open(problems[0], options)
+        solver.run(50, 1e-6)
+        before = solver.impulse()
+        code, asked = solver.set(problems[1]), 0
+        while code == -10:
+            needed = c.lav_needed(solver.at)
+            memory, at = (ct.c_double * (needed // 8 + 2))(), ct.c_void_p()
+            assert c.lav_move(solver.at, memory, ct.c_uint64(needed), ct.byref(at)) == 0
+            solver.at, solver.memory, asked = at, memory, asked + 1
+            code = solver.set(problems[1])
+        assert code == 0 and asked <= (1 if method in SWEEPS else 3)
+        grown += asked
+        same = int(np.searchsorted(many.cones.ptr, few.m, side="right")) - 1  # blocks of the same keys
+        if np.array_equal(many.cones.kind[:same], few.cones.kind[:same]) and same == few.n_blocks:
+            assert solver.impulse()[: few.m].tobytes() == before.tobytes()
+    assert grown
+
+
+def test_newton_of_more_bodies_than_its_factor_has_room_for_is_refused(library):
+    problem, options, room = library.problem(stack_of(1501)), library.options("newton"), ct.c_uint64()
+    assert ERRORS[library.c.lav_takes(ct.byref(problem), ct.byref(options))] == "LAV_ERROR_BODIES"
+    assert (
+        ERRORS[library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))] == "LAV_ERROR_BODIES"
+    )
+
+
+def test_a_second_caller_in_one_solver_is_turned_away(library):
+    # From within the clock, which stands for another thread: the solver is busy until the run returns.
+    solver, problem = opened(library)
+    assert library.c.lav_set(solver.at, ct.byref(problem)) == 0
+    said = []
+    out, inner = Result(), Result()
+    out.size = inner.size = ct.sizeof(Result)
+    budget = library.budget(50, 0.0)
+
+    def clock(_):
+        said.append(library.c.lav_run(solver.at, ct.byref(library.budget(1, 0.0)), ct.byref(inner)))
+        said.append(library.c.lav_set(solver.at, ct.byref(problem)))
+        return float(len(said))
+
+    kind = ct.CFUNCTYPE(ct.c_double, ct.c_void_p)
+    kept = kind(clock)
+    budget.seconds, budget.clock = 1e9, ct.cast(kept, ct.c_void_p).value
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+    assert set(said) == {-13} and out.iterations == 50
+    budget.seconds = 3.0  # the clock goes on by two each time
+    assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+    assert out.outcome == 5 and 0 < out.iterations < 50
+
+
+@pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
+def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, method):
+    # Addresses that nothing may be read from: whoever does ends this process.
+    problem, options, room = Problem(), library.options(method), ct.c_uint64()
+    ptr = np.arange(0, 39, 3, dtype=np.int32)
+    library.c.lav_default_problem(form, ct.byref(problem))
+    for key, kind in Problem._fields_:
+        if kind is ct.c_void_p:
+            setattr(problem, key, ptr.ctypes.data if (form, key) == (2, "block_ptr") else 8)
+    problem.n_rows, problem.n_blocks, problem.n_bodies, problem.n_joints = 30, 12, 5, 2
+    problem.n_velocities, problem.n_entries, problem.n_mass_entries = 30, 60, 40
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    assert Guarded(library, problem, options, room.value).code == 0
+
+
+SCRIPT = """
+import { readFileSync } from 'node:fs';
+const [folder, given] = [process.argv[1], JSON.parse(process.argv[2])], lav = await import(`${folder}/index.mjs`);
+const solver = (await lav.load(readFileSync(`${folder}/liblavender.wasm`))).solver(lav.LAV_PGS);
+const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
+const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
+const said = given.map(([problem, budget]) => {
+  try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
+  catch (error) { return error.message; }
+});
+console.log(JSON.stringify(said));
+"""
+
+
+def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(tmp_path):
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    try:
+        export.write("npm", tmp_path / "js")
+    except lv.LavenderError as reason:
+        pytest.skip(str(reason))
+    mistakes = [
+        ({"b": [1]}, {}, "b has 1 numbers; 3 are needed"),  # the other two stood there from the problem before
+        ({"value": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, {}, "value has 3 numbers; 9"),
+        ({"index_ptr": [0, 3, 6], "index": [0] * 9}, {}, "index_ptr has 3 numbers; 4"),
+        ({"kind": [0.7, 0, 0]}, {}, "no whole number"),
+        ({"b": {}}, {}, "an array of numbers is needed"),
+        ({"lower": True}, {}, "an array of numbers is needed"),
+        ({"n_rows": 2.5}, {}, "n_rows is 2.5"),
+        ({"rows": 3}, {}, "there is no rows"),
+        ({}, {"max_iter": 5}, "there is no max_iter"),
+        ({}, {"iterations": 1e12}, "iterations is 1000000000000"),
+        ({}, {"seconds": 1, "clock": 5}, "clock is of C alone"),
+        ({}, 5, "5 is no table of fields"),
+    ]  # fmt: skip
+    asked = [[{}, {}], *([problem, budget] for problem, budget, _ in mistakes), [{"b": [3, 2, 1, 9]}, {}]]
+    words = ["node", "--input-type=module", "-e", SCRIPT, str(tmp_path / "js"), json.dumps(asked)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    first, *said, last = json.loads(done.stdout)
+    assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
+    for (_, _, sign), text in zip(mistakes, said, strict=True):
+        assert isinstance(text, str) and sign in text
+    module = tmp_path / "js" / "liblavender.wasm"
+    module.write_bytes(b"mine")
+    with pytest.raises(lv.InputError, match="is there and is another"):
+        export.write("npm", tmp_path / "js")
+    assert module.read_bytes() == b"mine"
+
+
+def stack_of(n):
+    """n unit boxes on one another, by a contact each."""
+    z = np.tile([0.0, 0.0, 1.0], (n, 1))
+    rows = lv.Rows(
+        np.ones(n), np.tile(6.0 * np.eye(3), (n, 1, 1)), np.hstack([-z, 0.0 * z]), normal=z,
+        tangent=np.roll(z, 1, axis=1), arm_a=0.5 * z, arm_b=-0.5 * z,
+        contact_body=np.arange(n)[:, None] + [-1, 0],
+    )  # fmt: skip
+    return lv.Problem.from_rows(rows, mu=0.5, tangents=2)
+
+
+SWEEPS = (
+    "sequential_impulses",
+    "pgs",
+    "sor",
+    "gauss_seidel",
+    "jacobi",
+    "block_gauss_seidel",
+    "anderson",
+    "nncg",
+)
+SMALL = st.integers(-2, 9)
+WHOLE = st.lists(st.integers(-3, 12), min_size=0, max_size=12)
+REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_size=12)
+
+
+@settings(max_examples=150)
+@drawn(st.data())
+def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, data):
+    problem, keep = Problem(), []
+    form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 12))
+    library.c.lav_default_problem(form, ct.byref(problem))
+    for key in (
+        "law",
+        "n_blocks",
+        "n_rows",
+        "n_entries",
+        "n_bodies",
+        "n_joints",
+        "n_velocities",
+        "n_mass_entries",
+    ):
+        setattr(problem, key, data.draw(SMALL))
+    for key, _ in Problem._fields_[10:]:
+        if data.draw(st.booleans()):
+            x = np.zeros(900, ARRAYS[key])
+            whole = x.dtype.kind != "f"
+            if data.draw(st.booleans()) and key in ("block_ptr", "index_ptr", "mass_ptr"):
+                x[:] = np.arange(900)  # what may well be rows of one entry
+            values = data.draw(WHOLE if whole else REAL)
+            with np.errstate(all="ignore"):
+                x[: len(values)] = np.abs(values) if key == "key" else values
+            keep.append(x)
+            setattr(problem, key, x.ctypes.data)
+    options, room = Options(), ct.c_uint64()
+    library.c.lav_default_options(method, ct.byref(options))
+    code = library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))
+    assert code == 0 or code in ERRORS
+    if code:
+        return
+    assert room.value < 10_000_000
+    solver = Guarded(library, problem, options, room.value)
+    assert solver.code == 0
+    code = library.c.lav_set(solver.at, ct.byref(problem))
+    assert code == 0 or code in ERRORS
+    if code == 0:
+        out, verdict = Result(), Verdict()
+        out.size, verdict.size = ct.sizeof(Result), ct.sizeof(Verdict)
+        budget = library.budget(5, 1e-9)
+        assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+        impulse = (ct.c_double * (problem.n_rows + 2))(*([7.0] * (problem.n_rows + 2)))
+        assert library.c.lav_impulse(solver.at, impulse, problem.n_rows) == 0
+        assert impulse[problem.n_rows] == 7.0
+    assert solver.whole()
+
+
+@settings(max_examples=40)
+@drawn(
+    seed=seeds,
+    method=st.sampled_from(sorted(METHODS)),
+    iterations=st.integers(0, 300),
+    tol=st.sampled_from((0.0, 1e-6)),
+)
+def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, method, iterations, tol):
+    bodies = random_contact_problem(seed, "cone" if seed % 2 else "coulomb", bodies=4, contacts=6, joints=1)
+    for given in (bodies, as_matrix(bodies), random_lcp(seed, m=9)):
+        problem, options, room = library.problem(given), library.options(method), ct.c_uint64()
+        if library.c.lav_takes(ct.byref(problem), ct.byref(options)):
+            continue
+        assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+        code = -10
+        while code == -10:  # what a factor fills is known with the numbers
+            solver = Guarded(library, problem, options, room.value)
+            code = library.c.lav_set(solver.at, ct.byref(problem))
+            room.value = library.c.lav_needed(solver.at)
+        if code:
+            assert (
+                ERRORS[code] == "LAV_ERROR_UNSUPPORTED"
+            )  # `admm` finds an asymmetric A when it has its numbers
+            continue
+        out, impulse = Result(), np.zeros(given.m)
+        out.size = ct.sizeof(Result)
+        budget = library.budget(iterations, tol)
+        assert library.c.lav_run(solver.at, ct.byref(budget), ct.byref(out)) == 0
+        assert library.c.lav_impulse(solver.at, ct.c_void_p(impulse.ctypes.data), given.m) == 0
+        truth = lv.residual(given, impulse)
+        assert out.verdict.relative == truth.relative and out.verdict.worst == truth.worst_row
+        assert tol == 0.0 or (out.outcome == 1) == (truth.relative <= tol)
+        assert out.iterations <= iterations + 2 and solver.whole()
+
+
+def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
+    from lavender.out.header import STRUCTS, functions, struct_fields
+
+    header = HEADER.read_text()
+    made = [f"{kind} {name}({', '.join(arguments)})" for kind, name, arguments in functions(header)]
+    made += [f"{name} = {value}" for name, value in constants(header).items()]
+    for name in STRUCTS:
+        made += [f"{name}[{i}] {kind} {field}" for i, (kind, field) in enumerate(struct_fields(header, name))]
+    kept = (Path(__file__).parent / "abi.txt").read_text().splitlines()
+    lost = [line for line in kept if line not in made]
+    assert not lost, "what a release had is gone or is another"
+    problem, options = Problem(), Options()
+    library.c.lav_default_problem(1, ct.byref(problem))
+    library.c.lav_default_options(1, ct.byref(options))
+    assert (problem.size, options.size) == (ct.sizeof(Problem), ct.sizeof(Options))
+    assert library.budget(1, 0.0).size == ct.sizeof(type(library.budget(1, 0.0)))
+    names = {re.split(r"[ *]", line.split("(")[0])[-1] for line in kept if "(" in line and "[" not in line}
+    assert all(hasattr(library.c, name) for name in names)

@@ -1,0 +1,417 @@
+"""Every method, through the public header alone, has the bits of the package."""
+
+import ctypes as ct
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import random_problems as rp
+from clib import METHODS, Motion, Refused, run
+from tower import self_test_hash, self_test_problem
+
+import lavender as lv
+from lavender.out.vectors import driven, pack
+from lavender.out.view import OTHER_BITS, NotTaken, takes
+
+
+def problems():
+    yield self_test_problem()
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        m = 6 + 6 * seed
+        g = rng.normal(size=(m, m + 2))
+        a = g @ g.T
+        yield lv.Problem.linear(a, rng.normal(size=m))
+        yield lv.Problem.lcp(a, rng.normal(size=m), lower=-0.2, upper=1.5)
+        yield lv.Problem.contact(a, rng.normal(size=m), rng.uniform(0.2, 0.8, size=m // 3))
+        yield rp.random_contact_problem(seed)
+        yield rp.random_contact_problem(seed, "cone")
+    yield rp.random_contact_problem(9, bodies=20, joints=6, contacts=40)  # enough blocks to be swept in pairs
+    yield lv.suite.box_stack(3).problem
+    for friction in ("coulomb", "cone"):
+        rng = np.random.default_rng(7)
+        root = np.diag(rng.uniform(1.0, 2.0, size=4))  # so few that sweeps go over J
+        jac = rng.normal(size=(9, 4))
+        cones = lv.Cones.contacts(0.5, count=3)
+        yield lv.Problem.from_jacobian(jac, root, rng.normal(size=4), cones=cones, friction=friction)
+        yield from kinds_of(friction)
+        yield from kinds_of(friction, mu=0.0)  # the law is what sweeps know, not how rough a contact is
+
+
+def kinds_of(friction, mu=0.4):
+    """Boxes, contacts that resist rolling, and round cones; bodies have none of the last."""
+    rng = np.random.default_rng(11)
+    shapes = [({"shape": "box"}, 3), ({"rolling": 0.1, "tangents": 2}, 5)]
+    shapes += [({"tangents": 4}, 5)] if friction == "cone" else []
+    tower = self_test_problem().rows
+    for more in ({"shape": "box", "tangents": 2}, {"rolling": 0.05, "tangents": 2}):
+        yield lv.Problem.from_rows(tower, mu=mu, friction=friction, **more)
+    for given, rows in shapes:
+        cones = lv.Cones.contacts(mu, count=3, **given)
+        jac = rng.normal(size=(3 * rows, 20))
+        yield lv.Problem(rng.normal(size=3 * rows), cones, jac @ jac.T, friction=friction)
+        yield lv.Problem.from_jacobian(
+            jac[:, :4], np.eye(4), rng.normal(size=4), cones=cones, friction=friction
+        )
+
+
+def is_formed(given, found):
+    """Whether the package swept over rows of an A that it formed, by what `solver.form` says."""
+    form = found.solver.form
+    return given.matrix is None and (
+        "rows of A" in form or (found.solver.name in ("pgs", "jacobi") and form != "whitened J")
+    )
+
+
+GIVEN = list(problems())
+UNSUPPORTED = -11
+
+
+def test_the_self_test_is_of_the_package(library):
+    assert library.c.lav_self_test() == 0
+    text = (library.path.parent / "lavender.c").read_text()
+    assert f"TEST_HASH = {self_test_hash():#x}u" in text
+
+
+def test_methods_are_numbered_and_named_as_in_the_header(library):
+    assert sorted(METHODS.values()) == list(range(1, 13))
+    for name, number in METHODS.items():
+        assert library.c.lav_name(number).decode() == name
+
+
+@pytest.mark.parametrize("at", range(len(GIVEN)))
+def test_every_method_has_the_bits_of_the_package(library, at):
+    given = GIVEN[at]
+    start, ran = given.start(), 0
+    try:
+        problem = library.problem(given, impulse=start)
+    except NotTaken as reason:
+        pytest.skip(str(reason))
+    for name, (n, tol) in itertools.product(METHODS, ((1, 0.0), (9, 0.0), (40, 0.0), (300, 1e-7))):
+        if name in OTHER_BITS or (name in ("newton", "direct") and tol == 0.0):
+            continue  # no fixed budget
+        if library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name))) == UNSUPPORTED:
+            continue
+        try:
+            solver = library.open(problem, library.options(name))
+        except Refused as refused:
+            if (name, refused.code) != ("direct", UNSUPPORTED):
+                raise  # `direct` finds an asymmetric A when it has its numbers
+            continue
+        if name == "newton" and given.generalized is None:
+            wanted, factorisations = driven(given, tol, n)
+            said = solver.run(n, tol)
+            assert (solver.impulse().tobytes(), said.iterations) == (wanted.tobytes(), factorisations)
+            continue
+        found = lv.solve(given, name, tol=tol, max_iter=n, impulse=start)
+        if is_formed(given, found):
+            continue  # the package formed A, where that costs less
+        said = solver.run(n, tol)
+        ran += 1
+        case = (name, n, tol, found.solver.form)
+        assert solver.impulse().tobytes() == found.impulse.tobytes(), case
+        assert said.verdict.relative == found.residual.relative, case
+        assert said.verdict.floor == found.residual.floor, case
+        assert (
+            said.verdict.energy == found.residual.energy and said.verdict.velocity == found.residual.velocity
+        )
+        if (tol or name == "lemke") and name not in ("newton", "direct"):
+            assert said.iterations == found.iterations, case
+    assert ran >= 4
+
+
+SWEEPS = ("pgs", "sequential_impulses", "block_gauss_seidel", "anderson", "nncg")
+
+
+def dense_velocities():
+    """J and a full M, so few velocities that sweeps over A cost less: the package forms it."""
+    for seed, friction in itertools.product(range(4), ("coulomb", "cone")):
+        rng = np.random.default_rng(seed)
+        root, m = rng.normal(size=(24, 24)), 9 * (1 + seed)
+        cones = lv.Cones.contacts(0.5, count=m // 3) if seed else lv.Cones.contacts(0.0, count=m, tangents=0)
+        jac, mass = rng.normal(size=(m, 24)), np.eye(24) + 0.1 * root @ root.T
+        yield lv.Problem.from_jacobian(jac, mass, rng.normal(size=24), cones=cones, friction=friction)
+
+
+def of_matrix(given):
+    return lv.Problem(given.b, given.cones, given.csr, friction=given.friction)
+
+
+def test_where_the_package_sweeps_over_rows_of_a_the_library_has_its_bits_on_that_matrix(library):
+    """`solver.form` says where: `problem.csr` is the matrix to give; everywhere else the problem as it is."""
+    seen = {True: 0, False: 0}
+    for given, name in itertools.product([*GIVEN, *dense_velocities()], SWEEPS):
+        try:
+            found = lv.solve(given, name, tol=0, max_iter=40)
+        except lv.CapabilityError:
+            continue
+        form, formed = found.solver.form, is_formed(given, found)
+        problem = library.problem(of_matrix(given) if formed else given, impulse=given.start())
+        if library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name))):
+            continue
+        solver = library.open(problem, library.options(name))
+        solver.run(40, 0.0)
+        assert solver.impulse().tobytes() == found.impulse.tobytes(), (name, form, given)
+        seen[formed] += 1
+    assert min(seen.values()) > 10
+
+
+def test_vectors_are_of_methods_that_the_library_takes(library):
+    looked = set()
+    for given in GIVEN:
+        problem = library.problem(given)
+        for name in METHODS:
+            try:
+                lv.solve(given, name, tol=0, max_iter=1)
+            except lv.CapabilityError:
+                continue
+            code = library.c.lav_takes(ct.byref(problem), ct.byref(library.options(name)))
+            assert takes(given, name) == (code == 0), (name, given.law, given.cones.kind)
+            looked.add((name, code))
+    assert len(looked) > len(METHODS)
+
+
+def test_no_vector_of_sweeps_over_a_matrix_that_the_library_does_not_form():
+    rng = np.random.default_rng(0)
+    given = lv.Problem.from_jacobian(
+        rng.normal(size=(9, 12)), np.eye(12) + 0.1, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3)
+    )
+    with pytest.raises(NotTaken, match="formed A"):
+        pack(given, "pgs", 0.0, 5, {})
+
+
+@pytest.mark.parametrize("order", ["symmetric", "random", "reverse"])
+def test_orders_of_a_sweep(library, order):
+    given = self_test_problem()
+    options = library.options("sequential_impulses", order={"symmetric": 1, "random": 2, "reverse": 3}[order])
+    options.seed = 5 if order == "random" else 0
+    more = {"seed": 5} if order == "random" else {}
+    found = lv.solve(given, "sequential_impulses", tol=0, max_iter=17, order=order, **more)
+    solver = library.open(library.problem(given), options)
+    solver.run(10, 0.0)
+    solver.run(7, 0.0)  # runs go on where the last one ended
+    assert solver.impulse().tobytes() == found.impulse.tobytes()
+
+
+@pytest.mark.parametrize("method", ["sequential_impulses", "pgs", "anderson", "nncg", "jacobi"])
+def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
+    looked = 0
+    for given in GIVEN:
+        problem, options, room = library.problem(given), library.options(method), ct.c_uint64()
+        if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
+            continue
+        assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+        solver = library.open(problem, options)
+        needed = library.c.lav_needed(solver.at)
+        assert needed <= room.value <= 1.05 * needed + 8192, (given.m, given.n_blocks)
+        looked += 1
+    assert looked >= 3
+
+
+@pytest.mark.parametrize("method", ["direct", "lemke"])
+@pytest.mark.parametrize("n_bodies", [3, 100, 2000])
+def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_bodies):
+    rows = lv.Rows(
+        np.ones(n_bodies), np.tile(np.eye(3), (n_bodies, 1, 1)), np.ones((n_bodies, 6)),
+        jac=np.tile(np.eye(12)[6], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 1]],
+    )  # fmt: skip
+    problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
+    options, room = library.options(method), ct.c_uint64()
+    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
+    assert library.c.lav_needed(library.open(problem, options).at) <= room.value
+
+
+@pytest.mark.parametrize("options", [{"memory": 2}, {"sweep": 2}, {"convex": 5}])
+def test_options_of_accelerated_sweeps(library, options):
+    given = self_test_problem()
+    words = {key: "blocks" if key == "sweep" else value for key, value in options.items()}
+    found = lv.solve(given, "anderson", tol=0, max_iter=25, **words)
+    solver = library.open(library.problem(given), library.options("anderson", **options))
+    solver.run(25, 0.0)
+    assert solver.impulse().tobytes() == found.impulse.tobytes()
+
+
+def test_impulses_are_carried_by_key(library):
+    given = self_test_problem()
+    key = np.arange(12, dtype=np.uint64) + np.uint64(100)
+    solver = library.open(library.problem(given, key=key), library.options("sequential_impulses"))
+    solver.run(20, 0.0)
+    before = solver.impulse().reshape(12, 3)
+    turned = np.roll(key, 5)
+    turned[3] = 7  # nobody's before
+    assert solver.set(library.problem(given, key=turned)) == 0
+    wanted = np.roll(before, 5, axis=0)
+    wanted[3] = 0.0
+    assert solver.impulse().tobytes() == wanted.tobytes()
+    assert solver.set(library.problem(given)) == 0  # without keys nothing is carried
+    assert not solver.impulse().any()
+
+
+def test_velocities_are_those_of_the_problem(library):
+    given = self_test_problem()
+    solver = library.open(library.problem(given), library.options("sequential_impulses"))
+    solver.run(30, 0.0)
+    out = np.zeros(18)
+    assert library.c.lav_velocity(solver.at, out.ctypes.data, 18) == 0
+    np.testing.assert_allclose(out.reshape(3, 6), given.velocity(solver.impulse()), rtol=0.0, atol=1e-14)
+
+
+def test_islands_are_what_shares_no_body(library):
+    given = rp.random_contact_problem(3)
+    solver = library.open(library.problem(given), library.options("block_gauss_seidel"))
+    label = np.full(given.n_blocks, -1, np.int32)
+    count = library.c.lav_islands(solver.at, label.ctypes.data, given.n_blocks)
+    assert count >= 1 and sorted(set(label.tolist())) == list(range(count))
+
+
+@pytest.mark.parametrize("name", ["newton", "admm"])
+def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_does(library, name):
+    met = 0
+    for given in GIVEN:
+        try:
+            solver = library.open(library.problem(given), library.options(name))
+        except (NotTaken, Refused):
+            continue
+        said = solver.run(10_000, 1e-7)
+        truth = lv.residual(given, solver.impulse()).relative
+        assert said.verdict.relative == truth
+        assert (said.outcome == 1) == (truth <= 1e-7)
+        assert said.outcome == 1 or not lv.solve(given, name, tol=1e-7, max_iter=10_000).success
+        met += said.outcome == 1
+    assert met >= 7
+
+
+@pytest.mark.parametrize("tangents", [1, 2])
+def test_newton_of_the_driver_is_that_of_the_package_under_coulombs_law(tangents):
+    for seed, (bodies, contacts, joints) in itertools.product(
+        range(6), ((6, 10, 0), (6, 10, 1), (30, 60, 3))
+    ):
+        given = rp.random_contact_problem(
+            seed, tangents=tangents, bodies=bodies, contacts=contacts, joints=joints
+        )
+        found = lv.solve(given, "newton", tol=1e-8)
+        assert driven(given, 1e-8, 1500)[0].tobytes() == found.impulse.tobytes(), given
+
+
+def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library):
+    """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
+    ran = 0
+    for given in GIVEN:
+        if given.m == 0 or library.c.lav_takes(
+            ct.byref(library.problem(given)), ct.byref(library.options("newton"))
+        ):
+            continue
+        rng = np.random.default_rng(given.m)
+        for start in (
+            given.start(),
+            given.start() + 0.1 * rng.normal(size=given.m),
+            1e3 * rng.normal(size=given.m),
+        ):
+            least = min(1.0, lv.residual(given, start).relative)
+            for n in (0, 1, 2, 3, 5, 10):
+                solver = library.open(library.problem(given, impulse=start), library.options("newton"))
+                said = solver.run(n, 1e-12)
+                assert said.verdict.relative <= least or said.outcome in (1, 4)
+                ran += said.outcome == 0
+    assert ran > 100
+
+
+def test_a_line_search_ends_singular_rows_on_which_exchanges_go_round(library):
+    descended = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        g = rng.normal(size=(14, 6)) * 10.0 ** rng.uniform(-3, 3, size=(14, 1))
+        given = lv.Problem.lcp(g @ g.T, g @ rng.normal(size=6), upper=rng.uniform(0.1, 2.0, size=14))
+        found = lv.solve(given, "direct", tol=1e-9)
+        solver = library.open(library.problem(given), library.options("direct"))
+        said = solver.run(1000, 1e-9)
+        if "line_searches" in found.work:
+            descended += 1
+            assert said.verdict.relative <= max(1e-9, 10.0 * found.residual.relative)
+        else:
+            assert solver.impulse().tobytes() == found.impulse.tobytes()
+    assert descended
+
+
+def test_motion_errors_are_those_of_the_package(library):
+    looked = 0
+    for given in GIVEN:
+        try:
+            solver = library.open(library.problem(given), library.options("newton"))
+        except (NotTaken, Refused):
+            continue
+        if solver.run(5000, 1e-12).verdict.relative > 1e-11:
+            continue
+        reference = solver.impulse()
+        x = reference * (1.0 + 0.01 * np.cos(np.arange(given.m)))
+        out = Motion()
+        out.size = ct.sizeof(Motion)
+        at = [np.ascontiguousarray(a).ctypes.data_as(ct.c_void_p) for a in (x, reference)]
+        assert library.c.lav_motion_error(solver.at, *at, given.m, ct.byref(out)) == 0
+        wanted = lv.motion_error(given, x, reference)
+        if wanted.energy is None:
+            continue
+        looked += 1
+        assert out.energy == pytest.approx(wanted.energy, rel=1e-6)
+        assert out.kinetic == pytest.approx(
+            wanted.energy if wanted.kinetic is None else wanted.kinetic, rel=1e-6
+        )
+        assert out.relative == pytest.approx(wanted.relative, rel=1e-6)
+        assert (out.row, out.rows) == (wanted.row, pytest.approx(wanted.rows, rel=1e-6))
+        if wanted.speed is not None:
+            assert (out.body, out.speed) == (wanted.body, pytest.approx(wanted.speed, rel=1e-6))
+            assert out.spin == pytest.approx(wanted.spin or 0.0, rel=1e-6)
+        if wanted.bound is not None:
+            assert out.bound == pytest.approx(wanted.bound, rel=1e-4)
+        else:
+            rough = (
+                given.cones.mu.any()
+            )  # without friction Coulomb's law is convex, which the package does not use
+            assert out.bound == np.inf or given.law != "coulomb" or not rough
+    assert looked >= 5
+
+
+def test_frames_of_float32_are_made_whole_as_the_package_does(library):
+    rng = np.random.default_rng(4)
+    tower = self_test_problem().rows
+    axes = np.linalg.qr(rng.normal(size=(12, 3, 3)))[0].astype(np.float32).astype(float)
+    rough = {"normal": axes[:, 0].copy(), "tangent": axes[:, 1].copy()}
+    given = lv.Problem.from_rows(dataclasses.replace(tower, **rough), mu=0.3, tangents=2)
+    assert not np.array_equal(given.rows.normal, rough["normal"])
+    found = lv.solve(given, "sequential_impulses", tol=0, max_iter=30)
+    problem = library.problem(given, **{name: np.ascontiguousarray(x) for name, x in rough.items()})
+    solver = library.open(problem, library.options("sequential_impulses"))
+    solver.run(30, 0.0)
+    np.testing.assert_allclose(solver.impulse(), found.impulse, rtol=0.0, atol=1e-13)
+
+
+DUMP = """#include "lavender_dump.h"
+LAV_API int32_t dump(lav_solver *s, const lav_problem *q, const char *path) { return lav_dump(s, q, path); }
+"""
+
+
+def test_a_dumped_problem_is_the_problem_to_the_last_bit(library, folder, compiler, tmp_path):
+    (tmp_path / "dump.c").write_text(DUMP)
+    flags = ["-Wall", "-Wextra", "-Wpedantic", "-Werror", "-DLAV_SHARED", "-fPIC", "-shared", "-I", folder]
+    run(compiler, "-std=c99", *flags, tmp_path / "dump.c", library.path, "-o", tmp_path / "dump.so")
+    run(compiler, "-std=c++11", "-x", "c++", *flags, "-fsyntax-only", tmp_path / "dump.c")
+    c, path = ct.CDLL(str(tmp_path / "dump.so")), tmp_path / "step.npz"
+    looked = set()
+    for given in GIVEN:
+        key = np.arange(given.n_blocks, dtype=np.uint64) + np.uint64(2**63)
+        problem = library.problem(given, key=key)
+        solver = library.open(problem, library.options("block_gauss_seidel"))
+        assert c.dump(solver.at, ct.byref(problem), str(path).encode()) == 0
+        found = lv.load(path)
+        assert (
+            found.b.tobytes() == given.b.tobytes() and found.cones == given.cones and found.rows == given.rows
+        )
+        assert np.array_equal(found.key, key) and found.friction == given.friction
+        again = library.open(library.problem(found), library.options("block_gauss_seidel"))
+        solver.run(7, 0.0), again.run(7, 0.0)
+        assert solver.impulse().tobytes() == again.impulse().tobytes()
+        looked.add(given.operator)
+    assert looked == {"matrix", "rows", "generalized"}
+    missing = str(tmp_path / "no" / "such").encode()
+    assert c.dump(solver.at, ct.byref(problem), missing) == -20

@@ -1,0 +1,220 @@
+"""Steps of `newton`: its first phase on the engine's arrays is the one of `lavender.solve`, bit for bit."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from random_problems import good
+from worked import after
+
+import lavender as lv
+from lavender import registry
+from lavender.solvers import newton
+from lavender.solvers.newton_systems.systems import System
+from lavender_ext.newton.solve import PHASES
+
+SCENES = [
+    ("stack", {"n": 5}),
+    ("stack", {"n": 4, "friction": 0.0}),
+    ("stack", {"n": 4, "patch_radius": 0.1}),
+    ("pyramid", {"base": 5}),
+    ("pyramid", {"base": 5, "friction": 0.15}),
+    ("ramp", {}),
+    ("chain", {"n": 12}),
+    ("bridge", {"n": 5}),
+    ("four_bar", {}),
+    ("newtons_cradle", {"substeps": 1}),
+    ("pile", {"n": 12}),
+]
+
+
+def impulses(sim, observation):
+    s = sim.state
+    return np.concatenate([observation["joint_impulses"], _contact_rows(s)])
+
+
+def _contact_rows(state):
+    first, rows = len(state.a["joint_impulse"]), int(state.head[1])
+    return state.a["impulse"][first : first + rows]
+
+
+@pytest.mark.parametrize(("name", "more"), SCENES)
+def test_a_step_is_what_solve_returns(name, more):
+    sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
+    judged = 0
+    for step in range(60):
+        problem = sim.constraint_problem()
+        observation = sim.step()[0]
+        if problem.m == 0:
+            assert sim.last_solution is None
+            continue
+        found = lv.solve(problem, "newton", max_iter=sim.solver_iterations)
+        told = sim.last_solution
+        np.testing.assert_array_equal(impulses(sim, observation), found.impulse, err_msg=f"step {step}")
+        np.testing.assert_array_equal(told.impulse, found.impulse)
+        assert (told.status, dict(told.work), told.message) == (found.status, dict(found.work), found.message)
+        assert told.residual.relative == found.residual.relative
+        assert not told.contradicted
+        assert not found.contradicted
+        # what the observation says of the normal rows, to rounding: the judge forms w in another order
+        contact = problem.cones.ptr[:-1][problem.cones.kind > 0]
+        error = np.abs(found.residual.error[contact]).max(initial=0.0)
+        size = np.abs(found.impulse).max() + np.abs(problem.b / problem.d).max()
+        assert observation["solver"][5] == pytest.approx(error, abs=1e-12 * size)
+        judged += 1
+    assert judged >= 30  # the scenes touch something from the first half second on
+
+
+def test_the_first_phase_ends_in_each_of_its_ways():
+    def messages(name, **more):
+        sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
+        for _ in range(40):
+            sim.step()
+            yield sim.last_solution
+
+    seen = list(messages("stack"))
+    assert seen[-1].message == "as it came" and dict(seen[-1].work) == {"factorisations": 0}
+    chain = list(messages("chain", n=12))
+    # the first step is cold: no warm start to carry on
+    assert {s.message for s in chain[1:]} == {"joints solved directly"}
+    assert all(dict(s.work) == {"factorisations": 1} for s in chain[1:])
+    assert all(s.residual.relative <= 1e-10 for s in chain[1:])
+    swept = [s for s in messages("pyramid", base=6, dt=1 / 240) if s.message == "warm sweeps"]
+    assert all(s.work["sweeps"] in (4, 8, 16, 32, 64) and s.success for s in swept)
+    problem = lv.Simulation("table").constraint_problem()
+    exact = lv.solve(problem, "newton", tol=1e-12).impulse
+    near = lv.solve(problem, "newton", impulse=exact * (1.0 + 1e-5))
+    assert near.message == "warm sweeps" and near.success and near.work["factorisations"] == 0
+
+
+def test_a_warm_start_within_tol_comes_back_as_it_is():
+    sim = after(100, "pyramid", base=4)
+    problem = sim.constraint_problem()
+    exact = lv.solve(problem, "newton", tol=1e-10).impulse
+    again = lv.solve(problem, "newton", impulse=exact, tol=1e-8)
+    np.testing.assert_array_equal(again.impulse, exact)
+    assert dict(again.work) == {"factorisations": 0} and again.message == "as it came"
+
+
+def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
+    from lavender_ext.warm import start
+
+    sim = lv.Simulation(lv.Scene("four_bar", solver="newton"))  # a closed loop: its rows depend on each other
+    sim.step()
+    problem = sim.constraint_problem()
+    lam = problem.guess.copy()
+    how, _, factorisations = start.from_guess(problem.data, lam, 1e-6)
+    assert (how, factorisations) == (0, 1)
+    np.testing.assert_array_equal(lam, problem.guess)
+    # nothing reaches a millionth of what float64 can hold
+    problem = lv.Simulation(lv.Scene("stack", n=10)).constraint_problem()
+    lam = 0.2 * lv.solve(problem, "newton", tol=1e-10).impulse
+    before = lam.copy()
+    how, sweeps, factorisations = start.from_guess(problem.data, lam, 1e-22)
+    assert how == 0 and sweeps > 0
+    np.testing.assert_array_equal(lam, before)
+    found = lv.solve(problem, "newton", impulse=before, tol=1e-22)
+    assert found.status.name == "FLOOR"
+    # what the first phase did in vain is counted; there are no other sweeps
+    assert found.work["sweeps"] == sweeps and found.work["factorisations"] > factorisations
+
+
+def test_another_newton_is_asked_itself():
+    asked = []
+
+    class Mine(newton.Newton):
+        def prepare(self, problem):
+            asked.append(problem.m)
+            return super().prepare(problem)
+
+    spec = registry.get("newton")
+    mine = lv.SolverSpec(
+        name="newton", factory=Mine, laws=spec.laws, resumable=False, max_iter=10, summary="counts its calls"
+    )
+    sim = lv.Simulation(lv.Scene("stack", n=2, solver="newton"))
+    registry.register(mine, replace=True)
+    try:
+        for _ in range(3):
+            sim.step()
+    finally:
+        registry.register(spec, replace=True)
+    assert asked == [24, 24, 24]
+
+
+def without(monkeypatch, *phases):
+    """Newton's method goes without these."""
+    given = System.__init__
+
+    def begin(self, problem, solve):
+        given(self, problem, solve)
+        solve.without = sum(PHASES[name] for name in phases)
+
+    monkeypatch.setattr(System, "__init__", begin)
+
+
+#: One substep of 1/120 s in the order given: contacts on which rounds and polishes alone do not end.
+ONE = {"substeps": 1, "order": "given"}
+
+
+def problem_in(scene, step, **parameters):
+    """What `step + 1` steps of a scene lead to, without its warm start."""
+    return dataclasses.replace(after(step + 1, scene, **parameters).constraint_problem(), guess=None)
+
+
+@pytest.mark.parametrize(
+    ("scene", "step", "parameters"),
+    [
+        ("pyramid", 1, {}),
+        ("pyramid", 3, {"friction": 0.2}),
+        ("pyramid", 12, {"friction": 0.2}),
+        ("card_house", 1, ONE),
+        ("card_house", 3, ONE),
+        ("table", 3, {"friction": 1.0, **ONE}),
+    ],
+)
+@pytest.mark.parametrize("walks", [False, True])
+def test_redundant_contacts_at_rest(scene, step, parameters, walks, monkeypatch):
+    problem = problem_in(scene, step, **parameters)
+    assert problem.law == "coulomb"
+    if not walks:
+        without(monkeypatch, "pursuit")
+    solution = lv.solve(problem, "newton", tol=1e-8)
+    assert good(solution, 1e-8), str(solution)
+    assert walks or "De Saxce steps" in solution.message
+    assert "sweeps" not in solution.work
+    # Coulomb's law itself, apart from the judge: w_n >= 0, friction in its disk and against the sliding.
+    lam, w = solution.impulse, problem.slack(solution.impulse)
+    cones, size = problem.cones, np.abs(problem.b).max()
+    j = cones.ptr[:-1][np.diff(cones.ptr) == 3]
+    mu = cones.mu[np.diff(cones.ptr) == 3]
+    normal, tangent, slip = lam[j], lam[np.stack([j + 1, j + 2])], w[np.stack([j + 1, j + 2])]
+    # 1e-8 of doing nothing, times the square root of the mass ratio and of the number of contacts.
+    near = 1e-6
+    assert normal.min() >= -near * normal.max()
+    assert w[j].min() >= -near * size
+    assert np.all(np.hypot(*tangent) <= mu * normal + near * normal.max())
+    power = (tangent * slip).sum(axis=0) + mu * normal * np.hypot(*slip)
+    assert np.abs(power).max() <= near * normal.max() * size
+
+
+@pytest.mark.parametrize("law", ["coulomb", "cone"])
+@pytest.mark.parametrize(("step", "friction"), [(45, 0.5), (60, 0.1), (99, 0.5)])
+def test_bridge_whose_hinges_nearly_depend_on_each_other(step, friction, law):
+    problem = problem_in("bridge", step, friction=friction, **ONE)
+    rows = np.flatnonzero(np.isinf(problem.cones.upper) & np.isinf(problem.cones.lower))
+    scale = 1.0 / np.sqrt(problem.d)
+    h = problem.dense() * scale[:, None] * scale[None, :]
+    joints = rows[rows < problem.cones.ptr[problem.rows.n_joints]]
+    smallest = np.linalg.eigvalsh(h[np.ix_(joints, joints)])[0]
+    assert smallest < 1e-9  # far below what K K^T keeps beside contacts with W of 1e-10 to 1e10
+    solution = lv.solve(problem if law == "coulomb" else problem.relaxed("cone"), "newton", tol=1e-8)
+    assert good(solution, 1e-8), str(solution)
+
+
+def test_the_best_point_is_kept_when_a_walk_apart_finds_nothing_better():
+    problem = problem_in("table", 1, friction=1.0)
+    budgets = [
+        lv.solve(problem, "newton", tol=1e-8, max_iter=n).residual.relative for n in (30, 60, 120, 240)
+    ]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(budgets))

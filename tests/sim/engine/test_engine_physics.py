@@ -1,0 +1,233 @@
+"""The engine against closed forms, conservation laws, and the convergence laws of its own sweeps."""
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.sim.engine.layout import SETTING
+from lavender.sim.scene.parts import rotation
+
+G = 9.81
+
+
+def run(sim, steps):
+    for _ in range(steps):
+        observation, _, terminated, *_ = sim.step()
+        assert not terminated
+    return observation
+
+
+def test_a_projectile_follows_the_integrator_exactly_and_physics_to_first_order():
+    errors = []
+    for n in (100, 200):
+        scene = lv.Scene(dt=1.0 / n, substeps=1)
+        scene.add_sphere(position=(0, 0, 5), velocity=(3, 0, 4))
+        x = run(lv.Simulation(scene), n)["positions"][0]
+        # Semi-implicit Euler over 1 s: z = z0 + v0 - g h^2 n (n + 1) / 2.
+        assert x == pytest.approx([3.0, 0.0, 9.0 - G / n**2 * n * (n + 1) / 2], abs=1e-12)
+        errors.append(abs(x[2] - (9.0 - 0.5 * G)))
+    assert errors[0] / errors[1] == pytest.approx(2.0, rel=1e-9)
+
+
+def test_a_spinning_ball_decelerates_with_mu_r_n():
+    sim = lv.Simulation(lv.Scene("spinner", friction=0.4, patch_radius=0.07, spin=10.0))
+    spin = [run(sim, 1)["velocities"][1, 5] for _ in range(30)]
+    rate = 0.4 * 0.07 * G / (0.4 * 0.5**2)  # mu r m g / I
+    np.testing.assert_allclose(-np.diff(spin), rate / 120.0, rtol=1e-12)
+    rest = run(sim, 600)
+    assert rest["velocities"][1, 5] == pytest.approx(0.0, abs=1e-15)
+    assert abs(rest["contacts"]["impulses"][0, 3]) <= 0.4 * 0.07 * rest["contacts"]["impulses"][0, 0]
+
+
+def test_two_spheres_bounce_elastically():
+    scene = lv.Scene(gravity=0.0, restitution=1.0, friction=0.0)
+    scene.add_sphere(0.5, 1.0, position=(-1, 0.1, 0), velocity=(2, 0, 0))
+    scene.add_sphere(0.4, 3.0, position=(1, -0.2, 0.3), velocity=(-1, 0.2, 0))
+    sim = lv.Simulation(scene)
+    mass = np.array([1.0, 3.0])
+
+    def sums(v):
+        return np.array([0.5 * mass @ (v**2).sum(axis=1), *(mass @ v)])
+
+    before = sums(sim.reset()[0]["velocities"][:, :3])
+    observation = run(sim, 120)
+    assert np.linalg.norm(observation["velocities"][0, :3] - [2, 0, 0]) > 1.0  # they met
+    np.testing.assert_allclose(sums(observation["velocities"][:, :3]), before, rtol=0, atol=1e-14)
+
+
+def test_restitution_gives_the_wanted_speed_and_slow_contacts_do_not_bounce():
+    for e, threshold, expected in ((0.5, 0.1, 0.5), (0.5, 10.0, 0.0), (1.0, 0.1, 1.0)):
+        scene = lv.Scene(restitution=e, gravity=0.0, restitution_threshold=threshold)
+        scene.add_plane()
+        scene.add_sphere(0.5, position=(0, 0, 1), velocity=(0, 0, -2))
+        v = run(lv.Simulation(scene), 60)["velocities"][1, 2]
+        assert v == pytest.approx(2.0 * expected, abs=1e-12)
+
+
+def kinetic(scene, observation):
+    """Kinetic energy [J] of bodies whose inertia is even."""
+    v = observation["velocities"]
+    return sum(
+        0.5 * b.mass * w[:3] @ w[:3] + 0.5 * b.inertia[0, 0] * w[3:] @ w[3:]
+        for b, w in zip(scene.bodies, v, strict=True)
+        if not b.is_static
+    )
+
+
+def test_the_cradle_never_gains_energy():
+    sim = lv.Simulation("newtons_cradle")
+    scene, h = sim.scene, sim.scene.parameters.dt / sim.scene.parameters.substeps
+    mass = np.array([b.mass for b in scene.bodies])
+
+    def energy(o):
+        return kinetic(scene, o) + G * mass @ o["positions"][:, 2]
+
+    start = energy(sim.reset()[0])
+    most, speed, moved = start, 0.0, False
+    for _ in range(240 * 4):
+        observation = run(sim, 1)
+        most = max(most, energy(observation))
+        speed = max(speed, np.abs(observation["velocities"][:, 0]).max())
+        moved = moved or observation["velocities"][-1, 0] > 1.0
+    # Semi-implicit Euler oscillates about the true energy by h/2 v.grad V at most; nothing is gained beyond.
+    assert most - start < 0.5 * h * G * speed * mass[0]
+    last = energy(observation)
+    assert last <= start
+    assert moved  # the last ball was sent off
+    assert last > 0.9 * start
+
+
+@pytest.mark.parametrize("kind", ["collisions", "joints", "tumbling"])
+def test_a_closed_system_keeps_its_momentum(kind):
+    scene = lv.Scene(gravity=0.0, friction=0.5, position_iterations=0)
+    rng = np.random.default_rng(4)
+    if kind == "collisions":
+        for i in range(6):
+            scene.add_box(
+                rng.uniform(0.4, 0.8, 3),
+                position=(i * 0.8, 0, 0),
+                velocity=(3 - i, 0.1 * i, 0),
+                quaternion=rng.normal(size=4),
+            )
+    elif kind == "joints":
+        a = scene.add_box((1, 0.2, 0.3), position=(0, 0, 0), angular_velocity=(1, 2, 3))
+        b = scene.add_box((0.5, 0.6, 0.3), 2.0, position=(1, 0, 0), velocity=(0, 1, 0))
+        scene.add_joint("distance", a, b, anchor_a=(0.5, 0, 0), anchor_b=(0.8, 0.1, 0))
+    else:
+        scene.add_box((0.2, 0.7, 1.3), 2.0, angular_velocity=(0.1, 8.0, 0.2), quaternion=(0.3, 0.2, 0.1, 0.9))
+    sim = lv.Simulation(scene)
+
+    def momentum(o):
+        linear, angular = np.zeros(3), np.zeros(3)
+        for b, x, q, v in zip(scene.bodies, o["positions"], o["quaternions"], o["velocities"], strict=True):
+            r = rotation(q)
+            linear += b.mass * v[:3]
+            angular += np.cross(x, b.mass * v[:3]) + r @ b.inertia @ r.T @ v[3:]
+        return np.concatenate([linear, angular])
+
+    before = momentum(sim.reset()[0])
+    contacts = 0
+    for _ in range(240):
+        last = run(sim, 1)
+        contacts += int(last["solver"][2])
+    after = momentum(last)
+    assert contacts > 0 or kind != "collisions"
+    # Rounding of a few hundred additions near 10 kg m^2/s.
+    np.testing.assert_allclose(after, before, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(last["quaternions"], axis=1), 1.0, atol=1e-15)
+
+
+def test_a_tumbling_body_keeps_its_energy_to_second_order():
+    drift = []
+    for dt in (1 / 120, 1 / 240):
+        scene = lv.Scene(gravity=0.0, dt=dt, substeps=1)
+        body = scene.bodies[scene.add_box((0.2, 0.7, 1.3), 2.0, angular_velocity=(0.1, 4.0, 0.2))]
+        sim = lv.Simulation(scene)
+        energies = []
+        for _ in range(round(5 / dt)):
+            o = run(sim, 1)
+            local = rotation(o["quaternions"][0]).T @ o["velocities"][0, 3:]
+            energies.append(0.5 * local @ body.inertia @ local)
+        drift.append(
+            np.abs(
+                np.array(energies) / (0.5 * np.array([0.1, 4.0, 0.2]) ** 2 @ np.diag(body.inertia)) - 1
+            ).max()
+        )
+    assert drift[0] < 0.05
+    assert 3.0 < drift[0] / drift[1] < 5.0  # half the step, a quarter of the drift
+
+
+# -- joints ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["chain", "bridge", "four_bar", "newtons_cradle"])
+def test_joints_hold(name):
+    sim = lv.Simulation(lv.Scene(name, solver_iterations=64))
+    worst = 0.0
+    for _ in range(600):
+        run(sim, 1)
+        worst = max(worst, sim.state.setting[SETTING["joint_error"]])
+    # A substep drifts by (h omega)^2 r / 2 to first order, about 4 mm here; a fifth of the error is removed in each.
+    assert worst < 0.025
+
+
+def test_a_motor_turns_and_its_torque_is_bounded():
+    sim = lv.Simulation(lv.Scene("four_bar", motor=2.0, solver_iterations=64))
+    speed = np.linalg.norm(run(sim, 240)["velocities"][0, 3:])
+    assert speed == pytest.approx(2.0, rel=1e-3)
+    weak = lv.Simulation(lv.Scene("four_bar", motor=50.0, torque=3.0))
+    impulses = run(weak, 5)["joint_impulses"]
+    assert impulses[5] == pytest.approx(3.0 / 240.0, rel=1e-12)  # torque times the substep, at its bound
+
+
+# -- stacks and sweeps -----------------------------------------------------------------------------
+
+
+def test_position_projection_adds_no_kinetic_energy():
+    scene = lv.Scene(gravity=0.0, friction=0.0)
+    for x in (0.0, 0.7):
+        scene.add_box(position=(x, 0, 0), quaternion=(1, 0.1 * x, 0.2 * x, 0))
+    sim = lv.Simulation(scene)
+    assert sim.constraint_problem().m > 0
+    for _ in range(240):
+        observation = run(sim, 1)
+        assert not observation["velocities"].any()
+    # pushed apart without a speed, down to the slop
+    assert observation["contacts"]["depth"].max(initial=0.0) < 1.1 * scene.parameters.slop
+
+
+def slope(angle, turned, shape, **more):
+    """Speed [m/s] down a slope after a second, the first tangent `turned` from the way down."""
+    g, mu = 9.81, 0.5
+    down = g * np.sin(angle)
+    scene = lv.Scene(
+        gravity=(down * np.cos(turned), down * np.sin(turned), -g * np.cos(angle)), friction=mu,
+        friction_shape=shape, **more,
+    )  # fmt: skip
+    scene.add_plane()
+    scene.add_box((1.0, 1.0, 0.2), position=(0.0, 0.0, 0.1))
+    sim = lv.Simulation(scene)
+    for _ in range(120):
+        observation = sim.step()[0]
+    return float(np.linalg.norm(observation["velocities"][1, :2]))
+
+
+@pytest.mark.parametrize("more", [{}, {"stepper": "soft_step"}, {"solver": "newton"}])
+def test_a_box_grips_more_on_the_diagonal(more):
+    g, mu, root = 9.81, 0.5, np.sqrt(2.0)
+    for turned, grip in ((0.0, mu), (np.pi / 4, root * mu)):
+        below, above = np.arctan(grip) - 0.01, np.arctan(grip) + 0.05
+        assert slope(below, turned, "box", **more) < 1e-3
+        speed = g * (np.sin(above) - grip * np.cos(above)) * 1.0
+        assert slope(above, turned, "box", **more) == pytest.approx(speed, rel=0.02)
+    assert slope(np.arctan(mu) + 0.05, np.pi / 4, "disk", **more) > 0.3
+
+
+def test_what_no_scene_of_boxes_has_is_told():
+    with pytest.raises(lv.UnknownName, match="friction_shape"):
+        lv.Scene("stack", friction_shape="square")
+    for stepper in ("xpbd", "avbd"):
+        with pytest.raises(lv.InputError, match="by a disk"):
+            lv.Scene("stack", friction_shape="box", stepper=stepper)
+    with pytest.raises(lv.InputError, match="no spin friction"):
+        lv.Simulation(lv.Scene("spinner", friction_shape="box"))

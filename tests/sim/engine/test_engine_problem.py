@@ -1,0 +1,441 @@
+"""The problem inside a step: the same bits as the step, the judge's values, snapshots, other solvers."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from worked import after
+
+import lavender as lv
+from lavender.io.stored import framed, unframed
+from lavender.sim.engine import stepping
+from lavender.sim.engine.layout import HEAD, SETTING
+from lavender.sim.engine.snapshot import MAGIC
+from lavender.sim.scene.scene import SCENE_ORDERS
+
+SCENES = {
+    "stack": {},
+    "pyramid": {"base": 4, "friction_shape": "box"},
+    "chain": {"n": 8},
+    "spinner": {},
+    "ramp": {},
+    "four_bar": {"motor": 1.0},
+    "bridge": {"n": 6},
+    "pile": {"n": 20, "kind": "mixed"},
+    "card_house": {},
+}
+
+
+def reported(observation, problem):
+    """Impulses of a step in the order of the problem's rows."""
+    contacts = observation["contacts"]["impulses"]
+    size = np.diff(problem.cones.ptr)[problem.rows.n_joints :]
+    parts = [observation["joint_impulses"], *(row[:n] for row, n in zip(contacts, size, strict=True))]
+    return np.concatenate(parts)
+
+
+@pytest.mark.parametrize("warm", [True, False])
+@pytest.mark.parametrize("name", SCENES)
+def test_the_step_reports_the_bits_of_the_front_door(name, warm):
+    sim = lv.Simulation(lv.Scene(name, warm_start=warm, solver_iterations=9, substeps=1, **SCENES[name]))
+    rows = 0
+    for _ in range(30):
+        problem = sim.constraint_problem()
+        expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=9).impulse
+        observation, *_ = sim.step()
+        np.testing.assert_array_equal(reported(observation, problem), expected)
+        rows += problem.m
+    assert rows > 0
+
+
+def test_every_substep_of_the_defaults_has_the_bits_of_the_front_door():
+    sim = lv.Simulation(lv.Scene("stack", dt=1 / 60))
+    assert sim.scene.parameters.substeps == 4
+    for _ in range(40):
+        problem = sim.constraint_problem()
+        expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
+        assert sim.state.kernel.substeps(1) == (0, 1)
+        np.testing.assert_array_equal(sim.state.a["impulse"][: problem.m], expected)
+
+
+@pytest.mark.parametrize("order", SCENE_ORDERS)
+@pytest.mark.parametrize("name", ["stack", "bridge"])
+def test_every_order_is_the_order_of_that_name(name, order):
+    sim = lv.Simulation(lv.Scene(name, order=order, seed=5, substeps=1, **SCENES[name]))
+    for _ in range(25):
+        problem = sim.constraint_problem()
+        more = {"seed": sim.sweep_seed()} if order == "random" else {}
+        if order != "alternating":  # whose contacts stand as they are swept
+            more["order"] = order
+        expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16, **more).impulse
+        observation, *_ = sim.step()
+        np.testing.assert_array_equal(reported(observation, problem), expected)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_asking_for_the_problem_changes_no_state(name):
+    one, two = (lv.Simulation(lv.Scene(name, **SCENES[name])) for _ in range(2))
+    for _ in range(10):
+        one.constraint_problem()
+        a, b = one.step()[0], two.step()[0]
+        for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
+            np.testing.assert_array_equal(a[key], b[key])
+
+
+@pytest.mark.parametrize("warm", [True, False])
+@pytest.mark.parametrize("name", ["stack", "pyramid", "spinner", "bridge"])
+def test_the_eight_values_are_the_judges_on_the_normal_rows(name, warm):
+    sim = after(40, name, warm_start=warm, substeps=1, **SCENES[name])
+    problem = sim.constraint_problem()
+    normal = problem.cones.ptr[:-1][problem.cones.kind > 0]
+    solver = sim.step()[0]["solver"]
+    assert solver.dtype == np.float64 and solver.shape == (8,)
+    values = dict(zip(lv.SOLVER_FIELDS, solver, strict=True))
+    assert values["iterations"] == 16 and values["warm_start"] == warm and values["contacts"] == len(normal)
+    start = problem.start() if problem.guess is None else problem.guess
+    end = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
+    for when, impulse in (("initial", start), ("final", end)):
+        judged = lv.residual(problem, impulse)
+        # w is a difference of velocities near 0.1 m/s, so it carries their rounding, some 1e-16 m/s.
+        assert values[f"residual_{when}"] == pytest.approx(
+            np.abs(judged.error[normal]).max(), rel=1e-9, abs=1e-14
+        )
+        assert values[f"violation_{when}"] == pytest.approx(
+            max(0.0, -judged.slack[normal].min()), rel=1e-9, abs=1e-14
+        )
+
+
+def test_without_contacts_the_residuals_are_zero():
+    assert np.array_equal(lv.Simulation("chain").step()[0]["solver"][2:], np.zeros(6))
+
+
+def test_names_keys_and_guess_travel_with_the_problem():
+    sim = after(60, "bridge", n=4)
+    problem = sim.constraint_problem()
+    assert problem.row_name(3) == "hinge 0, axis 3"
+    assert problem.row_name(len(problem.rows.jac)).startswith("plank") and "load" in problem.row_name(
+        problem.m - 1
+    )
+    assert len(set(problem.key.tolist())) == problem.n_blocks
+    assert problem.guess.shape == (problem.m,) and np.abs(problem.guess).max() > 0
+    sim.set_warm_start(False)
+    assert sim.constraint_problem().guess is None
+    assert lv.Simulation(lv.Scene("ramp", friction=0)).constraint_problem().cones.n_rows == 4
+
+
+def test_budget_and_mode_take_effect_at_the_next_step():
+    sim = lv.Simulation("stack")
+    sim.step()
+    assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [16, 1, 24]
+    sim.set_solver_iterations(33)
+    sim.set_warm_start(False)
+    assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [33, 0, 0]
+    sim.set_warm_start(True)  # the cache was kept meanwhile
+    assert sim.step()[0]["solver"][[0, 1, 3]].tolist() == [33, 1, 24]
+
+
+@pytest.mark.parametrize("n", [3, 65, 8.0, "8", True])
+def test_a_budget_that_is_none_is_refused(n):
+    with pytest.raises(lv.InputError, match="solver_iterations"):
+        lv.Simulation("stack").set_solver_iterations(n)
+    with pytest.raises(lv.InputError, match="solver_iterations"):
+        lv.Scene("stack", solver_iterations=n)
+
+
+# -- the same bits -------------------------------------------------------------------------------
+
+
+def trajectory(sim, steps):
+    out = []
+    for _ in range(steps):
+        o = sim.step()[0]
+        out += [
+            o["positions"],
+            o["quaternions"],
+            o["velocities"],
+            o["joint_impulses"],
+            o["solver"],
+            *o["contacts"].values(),
+        ]
+    return out
+
+
+def assert_same(a, b):
+    assert len(a) == len(b)
+    for x, y in zip(a, b, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_repeat_runs_and_restored_runs_have_the_same_bits(name, tmp_path):
+    scene = lv.Scene(name, order="random", seed=3, **SCENES[name])
+    sim = after(15, scene)
+    sim.set_solver_iterations(7)
+    sim.set_warm_start(name != "stack")
+    state = sim.snapshot()
+    sim.save(tmp_path / "state")
+    expected = trajectory(sim, 20)
+    sim.restore(state)
+    assert_same(trajectory(sim, 20), expected)
+    other = lv.Simulation(scene)
+    other.load(tmp_path / "state")
+    assert (other.solver_iterations, other.warm_start, other.steps) == (7, name != "stack", 15)
+    assert_same(trajectory(other, 20), expected)
+    assert_same(trajectory(lv.Simulation(scene), 5), trajectory(lv.Simulation(scene), 5))
+
+
+def test_reset_starts_again_and_a_seed_builds_the_scene_anew():
+    sim = lv.Simulation(lv.Scene("pile", n=10, seed=1))
+    first = sim.reset()[0]["positions"]
+    trajectory(sim, 5)
+    observation, info = sim.reset()
+    np.testing.assert_array_equal(observation["positions"], first)
+    assert info["step"] == 0
+    assert not np.array_equal(sim.reset(seed=2)[0]["positions"], first)
+    np.testing.assert_array_equal(sim.reset(seed=1)[0]["positions"], first)
+
+
+def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
+    sim = lv.Simulation(lv.Scene("stack", n=3))
+    path = tmp_path / "state"
+    sim.save(path)
+    for other in (
+        lv.Scene("stack", n=4),
+        lv.Scene("stack", n=3, friction=0.3),
+        lv.Scene("stack", n=3, friction_shape="box"),
+        lv.Scene("stack", n=3, mass=2.0),
+    ):
+        with pytest.raises(lv.InputError, match="another scene"):
+            lv.Simulation(other).load(path)
+    data = bytearray(path.read_bytes())
+    for at in (5, len(data) // 2, len(data) - 1):
+        bad = data.copy()
+        bad[at] ^= 1
+        path.write_bytes(bad)
+        with pytest.raises(lv.InputError, match=r"not a lavender snapshot|damaged"):
+            sim.load(path)
+    path.write_bytes(data[:-40])
+    with pytest.raises(lv.InputError, match="damaged"):
+        sim.load(path)
+    # What is cut or lengthened inside a file whose checksum is right.
+    header, end = unframed(data, MAGIC, 2**20)
+    said, arrays = header["lengths"], bytes(data[end:-32])
+    for lengths, rest in (
+        (said, arrays[:-8]),
+        (said, arrays + bytes(8)),
+        ([*said[:3], said[3] - 1], arrays[:-8]),
+        ([*said[:3], said[3] + 1], arrays + bytes(8)),
+        ([said[0] - 1, *said[1:]], arrays[4:]),
+        ([*said[:3], -1], arrays),
+        ([10**30, *said[1:]], arrays),
+        ([*said[:3], float(said[3])], arrays),
+    ):
+        body = framed(MAGIC, {**header, "lengths": lengths}) + rest
+        path.write_bytes(body + hashlib.sha256(body).digest())
+        with pytest.raises(lv.InputError, match=r"does not hold what its header says|size has 9 entries"):
+            sim.load(path)
+    shot = sim.snapshot()
+    for name in ("real", "index", "keys"):
+        with pytest.raises(lv.InputError, match="do not fit its sizes"):
+            sim.restore(replace(shot, **{name: getattr(shot, name)[:-1]}))
+    with pytest.raises(lv.InputError, match="sizes are not those of this scene"):
+        sim.restore(replace(lv.Simulation(lv.Scene("stack", n=4)).snapshot(), fingerprint=shot.fingerprint))
+    with pytest.raises(lv.InputError, match="cannot read"):
+        sim.load(tmp_path / "missing")
+    with pytest.raises(lv.InputError, match="Snapshot is needed"):
+        sim.restore({"x": 1})
+    alone = lv.Scene()  # no pair, no contact: arrays of one entry or none
+    alone.add_sphere()
+    one = after(2, alone)
+    one.save(path)
+    one.load(path)
+
+
+def test_substeps_are_steps_of_a_fraction():
+    one = lv.Simulation(lv.Scene("stack", n=3, dt=0.01, substeps=2))
+    two = lv.Simulation(lv.Scene("stack", n=3, dt=0.005, substeps=1))
+    for _ in range(30):
+        two.step()
+        assert_same(trajectory(one, 1), trajectory(two, 1))
+    assert one.time == pytest.approx(two.time, rel=1e-15)
+
+
+def with_room(state, pairs, contacts):
+    """The same state in arrays of so much room."""
+    size = state.size.copy()
+    size[8:10] = pairs, contacts
+    tight = type(state)(size)
+    for name, array in state.a.items():
+        goal = tight.a[name]
+        goal[...] = array[tuple(slice(n) for n in goal.shape)]
+    return tight
+
+
+def test_arrays_grow_without_changing_the_trajectory():
+    scene = lv.Scene("pile", n=60, kind="boxes")
+    sim, tight = lv.Simulation(scene), lv.Simulation(scene)
+    tight.state = with_room(tight.state, 3, 3)
+    for _ in range(80):
+        a, b = sim.step()[0], tight.step()[0]
+        np.testing.assert_array_equal(a["positions"], b["positions"])
+    assert tight.state.size[9] >= a["solver"][2] > 3
+
+
+def test_what_lacks_room_says_so_before_any_state_has_changed():
+    sim = lv.Simulation("stack")
+    state = with_room(sim.state, sim.state.size[8], 5)
+    before = {k: state.a[k].copy() for k in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse")}
+    assert state.kernel.substeps(3) == (1, 0)
+    assert state.head[HEAD["need_contacts"]] == 24
+    for key, value in before.items():
+        np.testing.assert_array_equal(state.a[key], value)
+
+
+# -- other solvers ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pgs", "block_gauss_seidel", "newton", "nncg", "anderson", "admm"])
+def test_any_registered_solver_steps_the_scene(name):
+    sim = lv.Simulation(lv.Scene("stack", n=3, solver=name, solver_iterations=2000))
+    for _ in range(30):
+        observation, *_, info = sim.step()
+    assert sim.last_solution.solver.name == name
+    assert info["failed_solves"] == 0
+    assert observation["solver"][0] == 2000 and observation["solver"][3] == 12
+    # tol 1e-6 of gravity's 0.08 m/s per step leaves the boxes still.
+    assert np.abs(observation["velocities"]).max() < 1e-4
+
+
+def test_direct_steps_a_chain_like_many_sweeps():
+    exact = lv.Simulation(lv.Scene("chain", n=4, solver="direct", substeps=2, position_iterations=0))
+    sweeps = lv.Simulation(lv.Scene("chain", n=4, solver_iterations=64, position_iterations=0))
+    for _ in range(20):
+        a, b = exact.step()[0], sweeps.step()[0]
+    # 12 rows: 64 warm sweeps reach about 1e-6 of each step; twenty steps add up to well below a millimetre.
+    np.testing.assert_allclose(a["positions"], b["positions"], rtol=0, atol=1e-4)
+    assert exact.residual()["relative"] < 1e-9
+
+
+@pytest.mark.parametrize("policy", ["use", "keep", "damp", "raise"])
+def test_a_failed_solve_is_counted_and_dealt_with(policy):
+    # One sweep of pgs cannot reach 1e-6 on six boxes.
+    sim = lv.Simulation(lv.Scene("stack", solver="pgs", solver_iterations=1, on_failure=policy))
+    sim.state.head[HEAD["warm_start"]] = 1
+    if policy == "raise":
+        twin = lv.Simulation(lv.Scene("stack", solver="pgs", solver_iterations=1, on_failure="use"))
+        with pytest.raises(lv.SolveFailed, match="step 0"):
+            sim.step()
+        assert sim.steps == 0
+        for name in ("x", "q", "v", "cache_key", "cache_impulse", "joint_impulse"):
+            np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name])
+        # The same where a later substep fails.
+        scene = lv.Scene(dt=0.2, substeps=4, solver="pgs", solver_iterations=1, on_failure="raise")
+        scene.add_plane()
+        scene.add_box(position=(0, 0, 0.62), quaternion=(1, 0.02, 0.03, 0))
+        sim = lv.Simulation(scene)
+        before = sim.state.copy()
+        with pytest.raises(lv.SolveFailed):
+            sim.step()
+        assert sim.state.head[HEAD["step"]] == 0
+        for name in ("setting", "x", "q", "v", "cache_key", "cache_impulse", "joint_impulse"):
+            np.testing.assert_array_equal(sim.state.a[name], before.a[name])
+        return
+    problem = sim.constraint_problem()
+    found = lv.solve(problem, "pgs", max_iter=1).impulse
+    observation, *_, info = sim.step()
+    assert info["failed_solves"] == 1
+    expected = {"use": found, "keep": problem.guess, "damp": 0.5 * (problem.guess + found)}[policy]
+    np.testing.assert_array_equal(observation["contacts"]["impulses"].ravel(), expected)
+
+
+# -- every row judged ------------------------------------------------------------------------------
+
+
+def test_the_residual_of_all_rows_is_the_judges():
+    sim = lv.Simulation(lv.Scene("bridge", n=6, patch_radius=0.05, substeps=1), report_residual=True)
+    for _ in range(50):
+        problem = sim.constraint_problem()
+        *_, info = sim.step()
+    judged = lv.residual(problem, lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse)
+    assert info["residual"]["relative"] == judged.relative
+    assert info["residual"]["energy"] == judged.energy
+    assert info["residual"]["worst"] == judged.worst_name
+    share = info["residual"]["share"]
+    assert set(share) == {"joint", "normal", "disk", "spin"}
+    assert sum(share.values()) == pytest.approx(1.0, abs=1e-12)  # four shares of one sum
+    energy = problem.d * judged.error**2
+    assert share["joint"] == pytest.approx(energy[: len(problem.rows.jac)].sum() / energy.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [
+        ("stack", {"friction": 0.0}),
+        ("pyramid", {"base": 3, "friction": 0.0}),
+        ("four_bar", {"motor": 1.0}),
+        ("chain", {}),
+        ("ramp", {}),
+        ("table", {}),
+    ],
+)
+def test_exported_problems_can_be_solved_to_the_floor(name, more):
+    problem = after(5, name, **more).constraint_problem()
+    if problem.law in ("linear", "lcp"):
+        solution = lv.solve(problem, "direct", tol=1e-10)
+        other = lv.solve(problem, "osqp", tol=1e-9)
+        # Both within 1e-9 of velocities near 0.1 m/s, times the conditioning of a few boxes.
+        np.testing.assert_allclose(
+            problem.velocity(other.impulse), problem.velocity(solution.impulse), rtol=0, atol=1e-7
+        )
+    else:
+        solution = lv.solve(problem, "sequential_impulses", tol=0, max_iter=8000)
+    assert solution.residual.relative <= max(1e-10, 2.0 * solution.residual.floor)
+
+
+def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
+    sim, twin = (lv.Simulation(lv.Scene("ramp")) for _ in range(2))
+    paths = sim.record(tmp_path / "ramp", 3)
+    assert [p.name for p in paths] == ["ramp-1.npz", "ramp-2.npz", "ramp-3.npz"]
+    from lavender.io import load
+
+    for path in paths:
+        assert load(path) == twin.constraint_problem()
+        twin.step()
+    assert sim.steps == 3
+    with pytest.raises(lv.UnknownName, match="form"):
+        sim.record(tmp_path, 1, form="csv")
+    chain = lv.Simulation("chain")
+    pytest.importorskip("h5py")
+    assert sim.record(tmp_path / "fclib", 1, form="fclib")[0].suffix == ".hdf5"
+    with pytest.raises(lv.CapabilityError):  # joints
+        chain.record(tmp_path / "joints", 1, form="fclib")
+    assert chain.steps == 0
+    mixed = lv.Scene(friction=0.5)
+    mixed.add_plane()
+    mixed.add_box((1, 1, 1), mass=1, position=(0, 0, 0.5))
+    mixed.add_sphere(
+        0.3, mass=1.0, position=(5, 0, 0.42), friction=0.0
+    )  # falls: a contact of one row beside those of three
+    later = lv.Simulation(mixed)
+    with pytest.raises(lv.CapabilityError, match="contacts of 1, 3 rows"):
+        later.record(tmp_path / "later", 60, form="fclib")
+    assert later.steps == len(list((tmp_path / "later").iterdir())) > 0  # that step is not done
+    (tmp_path / "file").write_text("")
+    with pytest.raises(lv.InputError, match="is no folder"):
+        sim.record(tmp_path / "file", 1)
+
+
+def test_setting_places_are_those_of_the_kernels():
+    sim = lv.Simulation(lv.Scene("stack", dt=0.02, substeps=2, gravity=3.0))
+    assert sim.state.setting[SETTING["h"]] == 0.01
+    sim.step()
+    # free fall of the top box over two substeps, had it nothing below: v = -g h at least once
+    assert sim.state.a["v_free"][:, 2].min() <= -0.03 + 1e-12
+    assert sim.state.head[HEAD["contacts"]] == 24 and sim.state.head[HEAD["step"]] == 2
+
+
+def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):
+    monkeypatch.setattr(stepping, "moved", None)
+    *_, info = lv.Simulation("stack").step()
+    assert "motion" not in info

@@ -1,0 +1,381 @@
+"""Scenes: what they are made of, what they refuse, and the gallery."""
+
+import copy
+import inspect
+import math
+import pickle
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender.sim.engine.layout import SIZE
+from lavender.sim.scene import SCENES, Box, Plane, Sphere
+from lavender.sim.scene.parts import quaternion, rotation
+
+
+def test_the_readme_of_a_scene_by_hand():
+    scene = lv.Scene(dt=0.01)
+    assert (scene.add_plane(), scene.add_box((1, 1, 1), mass=2.0, position=(0, 0, 0.5))) == (0, 1)
+    observation, reward, terminated, truncated, info = lv.Simulation(scene).step()
+    assert (reward, terminated, truncated) == (0.0, False, False)
+    assert info == {"time": 0.01, "step": 1, "failed_solves": 0}
+    assert set(observation) == {
+        "positions",
+        "quaternions",
+        "velocities",
+        "contacts",
+        "joint_impulses",
+        "solver",
+    }
+    assert set(observation["contacts"]) == {"pair", "point", "normal", "tangent", "depth", "impulses"}
+    # 2 kg held over the last of the three substeps of 10 ms
+    assert observation["contacts"]["impulses"][:, 0].sum() == pytest.approx(2.0 * 9.81 * 0.01 / 3, rel=1e-3)
+
+
+def test_observations_are_fresh_copies():
+    sim = lv.Simulation("stack")
+    first = sim.step()[0]
+    kept = {k: v.copy() for k, v in first.items() if isinstance(v, np.ndarray)}
+    second = sim.step()[0]
+    for key, value in kept.items():
+        np.testing.assert_array_equal(first[key], value)
+    second["positions"][:] = np.nan
+    second["contacts"]["impulses"][:] = np.nan
+    assert np.isfinite(sim.step()[0]["positions"]).all()
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_every_scene_of_the_gallery_says_why_it_exists(name):
+    text = inspect.getdoc(SCENES[name])
+    assert text and text.splitlines()[0].endswith(".")
+    assert repr(lv.Scene(name)).startswith(f"<Scene {name!r}")
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "bodies", "contacts", "rows"),
+    [
+        ("stack", {"friction": 0.0}, 7, 24, 24),
+        ("stack", {}, 7, 24, 72),
+        ("stack", {"patch_radius": 0.1}, 7, 24, 96),
+        ("pyramid", {"base": 10}, 56, 400, 1200),
+        ("table", {}, 11, 72, 216),
+        ("heavy_on_light", {}, 3, 8, 24),
+        ("ramp", {}, 2, 4, 12),
+        ("spinner", {}, 2, 1, 4),
+        ("chain", {"n": 7}, 7, 0, 21),
+        ("bridge", {"n": 4, "load": 0.0}, 4, 0, 25),
+        ("four_bar", {}, 3, 0, 20),
+        ("four_bar", {"motor": 1.0}, 3, 0, 21),
+    ],
+)
+def test_sizes_are_those_of_the_docstrings(name, more, bodies, contacts, rows):
+    scene = lv.Scene(name, **more)
+    problem = lv.Simulation(scene).constraint_problem()
+    assert (scene.n_bodies, problem.rows.n_contacts, problem.m) == (bodies, contacts, rows)
+
+
+def test_what_a_scene_does_not_declare_is_not_allocated():
+    def size(**more):
+        scene = lv.Scene(**more)
+        scene.add_plane()
+        scene.add_sphere(position=(0, 0, 0.5))
+        return lv.Simulation(scene).state
+
+    smooth, rough, spin = size(friction=0.0), size(), size(patch_radius=0.1)
+    rows = SIZE["rows_per_contact"]
+    assert [s.size[rows] for s in (smooth, rough, spin)] == [1, 3, 4]
+    assert smooth.nbytes < rough.nbytes < spin.nbytes
+    for name in ("tangent", "coupling", "rot", "jac", "joint_impulse"):
+        assert smooth.a[name].size == 0
+    assert rough.a["tangent"].size > 0
+    # a friction parameter on a body that touches nothing brings no rows
+    scene = lv.Scene(friction=0.0)
+    scene.add_plane()
+    scene.add_sphere()
+    scene.add_body(friction=1.0)
+    assert lv.Simulation(scene).state.size[rows] == 1
+
+
+def test_contacts_of_one_scene_may_have_different_rows():
+    scene = lv.Scene(friction=0.0, patch_radius=0.2, substeps=1)
+    scene.add_plane(friction=0.5)
+    scene.add_sphere(position=(0, 0, 0.5), friction=0.5, velocity=(1, 0, 0), angular_velocity=(0, 0, 3))
+    scene.add_sphere(position=(2, 0, 0.5))
+    scene.add_sphere(position=(4, 0, 0.5), friction=0.2, patch_radius=0.0)
+    sim = lv.Simulation(scene)
+    problem = sim.constraint_problem()
+    assert np.diff(problem.cones.ptr).tolist() == [4, 1, 3]
+    assert problem.cones.mu.tolist() == [0.5, 0.0, math.sqrt(0.1)]
+    impulses = sim.step()[0]["contacts"]["impulses"]
+    assert impulses.shape == (3, 4)
+    assert impulses[0, 2] != 0.0 and impulses[0, 3] != 0.0  # sliding along x, spinning
+    assert np.all(impulses[1, 1:] == 0.0) and impulses[2, 3] == 0.0
+    expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
+    np.testing.assert_array_equal(np.concatenate([impulses[0], impulses[1, :1], impulses[2, :3]]), expected)
+
+
+# -- bad input ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda s: s.add_box(mass=0.0), "mass"),
+        (lambda s: s.add_box(mass=-1.0), "mass"),
+        (lambda s: s.add_box((1, 0, 1)), "positive"),
+        (lambda s: s.add_box((1, -1, 1)), "positive"),
+        (lambda s: s.add_sphere(0.0), "radius"),
+        (lambda s: s.add_plane((0, 0, 0)), "direction"),
+        (lambda s: s.add_plane(position=(0, 0, 1)), "position"),
+        (lambda s: s.add_body(quaternion=(0, 0, 0, 0)), "quaternion"),
+        (lambda s: s.add_body(shape="box"), "a Plane, Sphere or Box"),
+        (lambda s: s.add_body(shape=Sphere(-1.0), inertia=(1, 1, 1)), "radius"),
+        (lambda s: s.add_body(shape=Box((1.0, np.nan, 1.0)), inertia=(1, 1, 1)), "size .* finite"),
+        (lambda s: s.add_body(shape=Box((1.0, -1.0, 1.0))), "positive edges"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 1.0), np.nan)), "offset"),
+        (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
+        (lambda s: s.add_body(inertia=(1, 1, 0)), "positive"),
+        (lambda s: s.add_body(inertia=(1, 1, -1)), "positive"),
+        (lambda s: s.add_body(inertia=(1, 1, 1e-15)), "positive"),
+        (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
+        (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
+        (lambda s: s.add_body(static=True, velocity=(1, 0, 0)), "static"),
+        (lambda s: s.add_body(friction=-0.1), "friction"),
+        (lambda s: s.add_body(restitution=1.1), "restitution"),
+        (lambda s: s.add_joint("ball", 0, 7, anchor=(0, 0, 0)), "body 7"),
+        (lambda s: s.add_joint("ball", 0, -2, anchor=(0, 0, 0)), "body -2"),
+        (lambda s: s.add_joint("ball", 0, 0, anchor=(0, 0, 0)), "two bodies"),
+        (lambda s: s.add_joint("ball", -1, 1, anchor=(0, 0, 0)), "dynamic"),
+        (lambda s: s.add_joint("ball", 0, -1), "anchor"),
+        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1)), "axis"),
+        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0)), "axis"),
+        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 0)), "direction"),
+        (lambda s: s.add_joint("hinge", 0, -1, anchor=(0, 0, 0), axis=(0, 0, 1), motor_speed=1.0), "motor"),
+        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), motor_speed=1.0, motor_torque=1.0), "motor"),
+        (lambda s: s.add_joint("distance", 0, -1), "anchor"),
+        (lambda s: s.add_joint("distance", 0, -1, anchor_a=(0, 0, 0), anchor_b=(0, 0, 0)), "length 0"),
+        (lambda s: s.add_joint("ball", 0, -1, anchor=(0, 0, 0), hertz=-1), "hertz"),
+        (lambda s: s.add_joint("slider", 0, -1), "joint 'slider'"),
+    ],
+)
+def test_bad_parts_are_refused_and_nothing_is_added(build, message):
+    scene = lv.Scene()
+    scene.add_sphere(name="ball")
+    scene.add_plane()
+    with pytest.raises(lv.LavenderError, match=message):
+        build(scene)
+    assert (scene.n_bodies, scene.n_joints) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"dt": 0.0}, "dt"),
+        ({"dt": -0.01}, "dt"),
+        ({"substeps": 0}, "substeps"),
+        ({"friction": -1.0}, "friction"),
+        ({"restitution": 2.0}, "restitution"),
+        ({"solver": "pgz"}, "did you mean 'pgs'"),
+        ({"order": "bottomup"}, "bottom_up"),
+        ({"on_failure": "ignore"}, "on_failure"),
+        ({"solver_options": {"omega": 1}}, "solver_options"),
+        ({"solver": "pgs", "order": "reverse"}, "solver_options"),
+        ({"solver_options": 3, "solver": "pgs"}, "mapping"),
+    ],
+)
+def test_bad_parameters_are_refused(more, message):
+    with pytest.raises(lv.LavenderError, match=message):
+        lv.Scene("stack", **more)
+
+
+def test_unknown_scenes_and_parameters_name_the_nearest():
+    with pytest.raises(lv.UnknownName, match="did you mean 'stack'"):
+        lv.Scene("stac")
+    with pytest.raises(lv.UnknownName, match="did you mean 'friction'"):
+        lv.Scene("stack", frction=1.0)
+    with pytest.raises(lv.UnknownName, match="tip_mass"):
+        lv.Scene("chain", tipmass=1.0)
+    with pytest.raises(lv.UnknownName, match="spheres"):
+        lv.Scene("pile", kind="sphere")
+    with pytest.raises(lv.UnknownName):
+        lv.Scene(n=3)
+    with pytest.raises(lv.InputError):
+        lv.Scene("stack", n=0)
+    with pytest.raises(lv.InputError, match="no bodies"):
+        lv.Simulation(lv.Scene())
+    with pytest.raises(lv.InputError, match=r"lavender.Scene is needed"):
+        lv.Simulation(3)
+    with pytest.raises(lv.InputError, match="takes none"):
+        lv.Simulation("stack").step([1, 2])
+
+
+# -- extremes ---------------------------------------------------------------------------------------
+
+
+def extreme(build, steps=240, **more):
+    scene = lv.Scene(**more)
+    build(scene)
+    sim = lv.Simulation(scene)
+    for _ in range(steps):
+        observation, _, terminated, _, info = sim.step()
+        if terminated:
+            assert info["lost_body"] in {b.name for b in scene.bodies}
+            return None
+        assert np.isfinite(observation["positions"]).all() and np.isfinite(observation["velocities"]).all()
+        assert np.isfinite(observation["solver"]).all()
+    return observation
+
+
+def test_deep_overlap_coincident_centres_and_flat_boxes_stay_finite():
+    def overlap(scene):
+        for _ in range(5):
+            scene.add_box(position=(0, 0, 0))
+        for _ in range(4):
+            scene.add_sphere(0.5, position=(3, 0, 0))
+        scene.add_sphere(0.5, position=(0, 0, 0))
+        scene.add_plane(offset=0.3)
+
+    assert extreme(overlap) is not None
+
+    def flat(scene):
+        scene.add_plane()
+        for i in range(4):
+            scene.add_box(
+                (1e-6, 1.0, 1.0), position=(0.1 * i, 0, 0.6), quaternion=quaternion((0, 1, 0), 0.1 * i)
+            )
+            scene.add_box((1e-3, 1e-3, 10.0), position=(0.2 * i, 2, 5.0))
+
+    assert extreme(flat) is not None
+
+
+@pytest.mark.parametrize("ratio", [1e-6, 1e6])
+def test_size_and_mass_ratios_of_a_million_stay_finite(ratio):
+    def sizes(scene):
+        scene.add_plane()
+        scene.add_box(position=(0, 0, 0.5))
+        scene.add_sphere(0.5 * ratio, position=(0, 0, 1 + 0.5 * ratio))
+        scene.add_box((ratio, ratio, ratio), position=(0.2, 0, 1 + ratio))
+
+    def masses(scene):
+        scene.add_plane()
+        scene.add_box(position=(0, 0, 0.5))
+        scene.add_box(mass=ratio, position=(0, 0, 1.5))
+
+    assert extreme(sizes) is not None
+    assert extreme(masses) is not None
+
+
+@pytest.mark.parametrize(
+    ("solver", "velocity", "spin"),  # of the second, rows whose numbers are not finite
+    [
+        ("sequential_impulses", (1.79e308, 0, 0), 0),
+        *((name, (0, 0, -1.79e308), 1.79e308) for name in ("pgs", "newton")),
+    ],
+)
+def test_a_state_that_is_lost_is_named_and_ends_the_simulation(solver, velocity, spin):
+    scene = lv.Scene(solver=solver)
+    scene.add_plane()
+    scene.add_sphere(position=(0, 0, 0.5), name="fine")
+    scene.add_sphere(position=(5, 0, 0.5), velocity=velocity, angular_velocity=(0, spin, 0), name="gone")
+    sim = lv.Simulation(scene)
+    before = sim.snapshot()
+    for _ in range(400):
+        *_, terminated, _, info = sim.step()
+        if terminated:
+            break
+    assert terminated and info["lost_body"] == "gone"
+    with pytest.raises(lv.LavenderError, match="'gone' is not finite"):
+        sim.step()
+    sim.restore(before)
+    assert not sim.step()[2]
+
+
+# -- parts --------------------------------------------------------------------------------------------
+
+
+def test_inertia_of_the_shapes():
+    scene = lv.Scene()
+    scene.add_box((1, 2, 3), 12.0)
+    scene.add_sphere(2.0, 5.0)
+    np.testing.assert_allclose(scene.bodies[0].inertia, np.diag([13.0, 10.0, 5.0]), rtol=1e-15)
+    np.testing.assert_allclose(scene.bodies[1].inertia, np.eye(3) * 8.0, rtol=1e-15)
+
+
+def test_anchors_lie_where_they_were_given():
+    scene = lv.Scene()
+    a = scene.add_box(position=(1, 0, 0), quaternion=(1, 1, 0, 0))
+    b = scene.add_box(position=(0, 2, 0), quaternion=(0, 1, 2, 3))
+    scene.add_joint("hinge", a, b, anchor=(0.5, 0.5, 0.5), axis=(1, 2, 3))
+    j = scene.joints[0]
+    for i, anchor, axis in ((a, j.anchor_a, j.axis_a), (b, j.anchor_b, j.axis_b)):
+        body = scene.bodies[i]
+        r = rotation(body.quaternion)
+        np.testing.assert_allclose(body.position + r @ anchor, [0.5, 0.5, 0.5], atol=1e-15)
+        np.testing.assert_allclose(r @ axis, np.array([1, 2, 3]) / np.sqrt(14), atol=1e-15)
+    sim = lv.Simulation(scene)
+    sim.prepare_substep()
+    np.testing.assert_allclose(sim.state.a["joint_error"], 0.0, atol=1e-15)
+
+
+def test_what_is_added_to_a_scene_is_in_its_copies_and_not_in_the_simulations_before():
+    scene = lv.Scene("stack", n=2)
+    sim = lv.Simulation(scene)
+    scene.add_sphere(0.3, position=(5.0, 0.0, 3.0))
+    before = sim.snapshot()
+    assert len(sim.reset()[0]["positions"]) == 3
+    sim.restore(before)
+    changed = scene.with_parameters(slop=2e-3)
+    changed.add_joint("ball", -1, 3, anchor=(5.0, 0.0, 3.0))
+    assert (scene.n_bodies, changed.n_bodies, changed.bodies[3]) == (4, 4, scene.bodies[3])
+    assert len(lv.Simulation(scene, stepper="soft_step").step()[0]["positions"]) == 4
+    with pytest.raises(lv.InputError, match="by number"):
+        changed.with_parameters(n=5)
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_a_copy_of_a_simulation_goes_on_alone(copied):
+    sim, twin = lv.Simulation("stack"), lv.Simulation("stack")
+    for _ in range(5):
+        sim.step(), twin.step()
+    other = copied(sim)
+    for _ in range(3):
+        last = other.step()[0]
+    for _ in range(3):
+        mine, right = sim.step()[0], twin.step()[0]
+    assert (other.steps, sim.steps) == (8, 8)
+    np.testing.assert_array_equal(mine["positions"], right["positions"])
+    np.testing.assert_array_equal(last["positions"], right["positions"])
+
+
+def test_a_builder_registers_itself_and_is_a_scene_like_those_of_the_gallery(monkeypatch):
+    from lavender.sim.scene import scene as table
+
+    monkeypatch.setattr(table, "SCENES", dict(table.SCENES))
+    monkeypatch.setattr(table, "DEFAULTS", dict(table.DEFAULTS))
+
+    @table.named_scene(friction=0.2, dt=0.01)
+    def plank(scene, size=2.0):
+        scene.add_plane()
+        scene.add_box((size, size, 0.1), position=(0, 0, 0.05))
+
+    scene = lv.Scene("plank", size=3.0, dt=0.02)
+    assert (scene.parameters.friction, scene.parameters.dt) == (0.2, 0.02)
+    assert scene.bodies[1].shape.size == (3.0, 3.0, 0.1)
+    lv.Simulation(scene).reset(seed=4)
+    with pytest.raises(lv.UnknownName, match="size"):
+        lv.Scene("plank", sise=3.0)
+    with pytest.raises(lv.InputError, match="registered already"):
+        table.named_scene()(plank)
+    with pytest.raises(lv.UnknownName, match="frction"):
+        table.named_scene(frction=0.2)
+
+    def clash(scene, friction=1.0):
+        pass
+
+    def bare(scene, n):
+        pass
+
+    for build in (clash, bare):
+        with pytest.raises(lv.InputError, match="parameter"):
+            table.named_scene()(build)

@@ -1,0 +1,161 @@
+"""Record natively what WebAssembly is to repeat: scenes step by step.
+
+    python tests/sim/web/record.py FOLDER
+
+writes FOLDER/recording.json (what there is) and FOLDER/recording.bin (the numbers, little-endian).
+"""
+
+import hashlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from newton_steps import NewtonSteps
+
+import lavender as lv
+from lavender.sim.web.scenes import describe, layout
+
+STEPS = 600
+BODY_ARRAYS = ("x", "q", "v")
+
+#: Gallery scene, parameters, and what is changed before which step.
+SCENES = [
+    ("stack", {}, {200: {"warm_start": 0}, 400: {"warm_start": 1}}),
+    ("stack", {"substeps": 1}, {}),
+    ("pyramid", {"base": 8}, {300: {"iterations": 4}}),
+    ("chain", {"tip_mass": 5.0}, {}),
+    ("spinner", {}, {}),
+    ("pile", {"n": 60, "kind": "mixed", "substeps": 2}, {}),
+    ("stack", {"n": 5, "order": "random", "seed": 3, "solver_iterations": 64}, {}),
+    ("pyramid", {"base": 4, "order": "symmetric"}, {}),
+    ("pyramid", {"base": 4, "order": "top_down", "solver_iterations": 4}, {}),
+    ("card_house", {"order": "bottom_up"}, {}),
+    ("bridge", {"order": "colored"}, {}),
+    ("four_bar", {"order": "reverse", "motor": 2.0}, {}),
+    ("newtons_cradle", {}, {}),
+    ("pyramid", {"base": 4, "stepper": "soft_step", "restitution": 0.3}, {}),
+    ("bridge", {"stepper": "soft_step", "solver_iterations": 2}, {}),
+    ("bridge", {"n": 5, "stepper": "xpbd"}, {}),
+    ("bridge", {"n": 5, "stepper": "avbd"}, {}),
+    ("pile", {"n": 30, "kind": "mixed", "friction_shape": "box"}, {}),
+]
+
+
+#: The same for Newton's method on both sides of the border: joints and contacts alone and together, spin, cold starts.
+NEWTON_STEPS = 120
+NEWTON_SCENES = [
+    ("stack", {}, {40: {"warm_start": 0}, 80: {"warm_start": 1}}),
+    ("pyramid", {"base": 5, "friction": 0.15}, {}),
+    ("pile", {"n": 12, "kind": "mixed"}, {}),
+    ("pyramid", {"base": 4, "friction_shape": "box"}, {}),
+    ("bridge", {"n": 5}, {}),
+    ("chain", {}, {60: {"warm_start": 0}}),
+    ("four_bar", {}, {}),
+    ("spinner", {}, {60: {"warm_start": 0}}),
+]
+
+
+class Writer:
+    """Arrays one after the other, and where each one is."""
+
+    def __init__(self):
+        self.parts, self.at = [], 0
+
+    def put(self, values, dtype):
+        data = np.ascontiguousarray(values).astype(dtype).tobytes()
+        data += bytes(-len(data) % 8)
+        place = [self.at, int(np.size(values)), np.dtype(dtype).str[1:]]
+        self.parts.append(data)
+        self.at += len(data)
+        return place
+
+
+def record_scene(writer, name, parameters, changes, steps=STEPS):
+    """One scene over `steps` steps: poses, velocities, eight values and the hash of everything, after each."""
+    scene = lv.Scene(name, **parameters)
+    simulation = lv.Simulation(scene)
+    start = simulation.snapshot()
+    states, values, hashes = [], [], []
+    for step in range(steps):
+        change = changes.get(step, {})
+        if "iterations" in change:
+            simulation.set_solver_iterations(change["iterations"])
+        if "warm_start" in change:
+            simulation.set_warm_start(bool(change["warm_start"]))
+        observation = simulation.step()[0]
+        shot = simulation.snapshot()
+        states.append(
+            np.concatenate([observation[key].ravel() for key in ("positions", "quaternions", "velocities")])
+        )
+        values.append(observation["solver"])
+        hashes.append(
+            hashlib.sha256(shot.real.tobytes() + shot.index.tobytes() + shot.keys.tobytes()).digest()
+        )
+    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    return {
+        "name": f"{name}({given})",
+        "substeps": scene.parameters.substeps,
+        "steps": steps,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe(start),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
+        "last": writer.put(shot.real, "<f8"),
+    }
+
+
+def record_newton(writer, name, parameters, changes):
+    """A scene solved by Newton's method: poses, the eight values, what each last solve said, the hash of everything."""
+    run = NewtonSteps(name, **parameters)
+    start = run.simulation.snapshot()
+    states, values, said, hashes = [], [], [], []
+    for step in range(NEWTON_STEPS):
+        if step in changes:
+            run.set_warm_start(changes[step]["warm_start"])
+        values.append(run.step())
+        states.append(run.bodies())
+        said.append([*run.told[1:], len(run.trace)])
+        hashes.append(hashlib.sha256(run.everything()).digest())
+    given = ", ".join(f"{key}={value}" for key, value in parameters.items())
+    return {
+        "name": f"{name}({given}), newton",
+        "dt": run.simulation.scene.parameters.dt,
+        "substeps": run.substeps,
+        "newton_substeps": run.substeps,
+        "steps": NEWTON_STEPS,
+        "changes": {str(step): change for step, change in changes.items()},
+        **describe(start),
+        "met": sum(how > 0 for how in run.ended),
+        "solved": len(run.ended),
+        "states": writer.put(states, "<f8"),
+        "values": writer.put(values, "<f8"),
+        "said": writer.put(said, "<f8"),
+        "trace": writer.put(run.trace, "<f8"),
+        "hashes": writer.put(np.frombuffer(b"".join(hashes), np.uint8), "|u1"),
+    }
+
+
+def record(folder, steps=STEPS):
+    """Both files; returns the path of the JSON."""
+    writer = Writer()
+    scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
+    newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
+    contents = {
+        "layout": layout(),
+        "body_arrays": BODY_ARRAYS,
+        "scenes": scenes,
+        "newton": newton,
+    }
+    path = Path(folder) / "recording.json"
+    path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
+    path.with_suffix(".bin").write_bytes(b"".join(writer.parts))
+    return path
+
+
+if __name__ == "__main__":
+    print(record(sys.argv[1]))

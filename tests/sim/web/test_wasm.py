@@ -1,0 +1,247 @@
+"""The kernels in WebAssembly give the bits of the native ones, under Node."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import lavender as lv
+from lavender.base.errors import InputError, LavenderError
+from lavender.sim.scene import SCENES
+from lavender.sim.web import compile as wasm
+from lavender.sim.web import cut, pages
+from lavender.sim.web.scenes import describe, page_scenes
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[2]
+CHECK = HERE / "check_wasm_exports.mjs"
+# Left out where the kernels run with every check on: the module is compiled without them either way.
+pytestmark = pytest.mark.slow
+
+needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
+
+
+@pytest.fixture(scope="session")
+def module():
+    """The module of these sources, as bytes; built once for each state of the sources."""
+    try:
+        return pages.module()
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def newton_module():
+    """The module of Newton's method, likewise."""
+    try:
+        return pages.module(name="newton")
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory):
+    """Folder of what the native kernels did."""
+    folder = tmp_path_factory.mktemp("recording")
+    subprocess.run([sys.executable, str(HERE / "record.py"), str(folder)], check=True, cwd=ROOT)
+    return folder
+
+
+# -- the module ------------------------------------------------------------------------------------------------
+
+
+HEAD = "from libc.stdint cimport int32_t\n"
+BAD = {
+    "Python": """
+cdef public double lav_bad(double x) noexcept nogil:
+    with gil:
+        return <double>len(str(x))
+""",
+    "libm": """
+from libc.math cimport sin
+cdef public double lav_bad(double x) noexcept nogil:
+    return sin(x)
+""",
+    "malloc": """
+from libc.stdlib cimport malloc
+cdef public void lav_bad(void** out) noexcept nogil:
+    out[0] = malloc(8)
+""",
+    "a module-level variable": """
+cdef double EPS = 1e-9
+cdef public double lav_bad(double x) noexcept nogil:
+    return x + EPS
+""",
+    "a function of another module": """
+from elsewhere cimport half
+cdef public double lav_bad(double x) noexcept nogil:
+    return half(x)
+""",
+    "a table": """
+cdef extern from *:
+    '''
+    static const double TABLE[64] = {3, 1, 4, 1, 5};
+    '''
+    const double TABLE[64]
+cdef public double lav_bad(int32_t i) noexcept nogil:
+    return TABLE[i]
+""",
+}
+SIGNS = ("Python's side", "symbol: sin", "'malloc'", "Python's side", "Python's side", "Python's side")
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind, sign", list(zip(BAD, SIGNS, strict=True)), ids=list(BAD))
+def test_a_kernel_that_needs_more_does_not_link(tmp_path, kind, sign):
+    path = tmp_path / "bad.pyx"
+    path.write_text(HEAD + BAD[kind])
+    (tmp_path / "elsewhere.pxd").write_text("cdef double half(double x) noexcept nogil\n")
+    with pytest.raises(wasm.BuildFailed, match=sign):
+        wasm.build(tmp_path / "bad.wasm", ROOT, [path])
+    assert not (tmp_path / "bad.wasm").exists()
+
+
+@needs_compiler
+def test_a_home_that_nobody_may_write_into_is_not_needed(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", os.devnull)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.delenv("ZIG_GLOBAL_CACHE_DIR", raising=False)
+    (tmp_path / "a.c").write_text("int lav_a(int x) { return 2 * x; }\n")
+    wasm.build_library(tmp_path / "a.out", tmp_path / "a.c", ["lav_a"])
+    assert (tmp_path / "a.out").read_bytes().startswith(b"\0asm")
+
+
+GOOD = (
+    HEAD
+    + "cdef public int32_t lav_good(int32_t x) noexcept nogil:\n    return 2 * x + <int32_t>sizeof(void*)\n"
+)
+
+
+@needs_compiler
+def test_the_same_sources_give_the_same_bytes_and_pointers_of_the_module_s_machine(tmp_path):
+    path = tmp_path / "good.pyx"
+    path.write_text(GOOD)
+    for name in ("one.wasm", "two.wasm"):
+        built = wasm.build(tmp_path / name, ROOT, [path])
+        assert built.functions == ("lav_good",)
+        assert built.size < 1000
+    assert (tmp_path / "one.wasm").read_bytes() == (tmp_path / "two.wasm").read_bytes()
+
+
+@needs_compiler
+def test_a_module_that_is_too_large_is_refused(tmp_path):
+    path = tmp_path / "good.pyx"
+    path.write_text(GOOD)
+    with pytest.raises(wasm.BuildFailed, match="below 10 are allowed"):
+        wasm.build(tmp_path / "good.wasm", ROOT, [path], largest=10)
+
+
+@pytest.mark.parametrize("name", list(wasm.PARTS))
+def test_a_module_has_the_size_that_the_page_says_and_room_to_grow(name, request):
+    size = len(request.getfixturevalue({"lavender": "module", "newton": "newton_module"}[name]))
+    page = (ROOT / "docs" / "web.md").read_text(encoding="utf-8")
+    (told,) = re.findall(rf"`{name}\.wasm` \((\d+) kB\)", page)
+    assert size == pytest.approx(1000 * int(told), rel=0.03)  # compilers differ by a percent or two
+    assert size < 0.95 * wasm.LARGEST
+
+
+def test_a_compiler_that_is_not_there_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("LAVENDER_WASM_CC", "no-such-compiler --target=wasm32-wasi")
+    with pytest.raises(LavenderError, match="names 'no-such-compiler', which is not there"):
+        pages.build_module(tmp_path / "a.wasm")
+
+
+def test_a_folder_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match="is not there; make it first"):
+        pages.build_module(tmp_path / "none" / "a.wasm")
+
+
+def test_without_compiler_a_missing_or_stale_module_says_what_to_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(wasm, "why_not", lambda: "no compiler")
+    monkeypatch.setattr(pages, "SHIPPED", tmp_path)
+    with pytest.raises(
+        LavenderError, match="lavender is not in this installation and cannot be built: no compiler"
+    ):
+        pages.module()
+    other = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, b"0" * 64)
+    (tmp_path / "lavender.wasm").write_bytes(other)
+    with pytest.raises(LavenderError, match="is of other kernels"):
+        pages.module()
+    fresh = b"\0asm\1\0\0\0" + wasm.section(wasm.SECTION, wasm.source_hash(ROOT).encode())
+    (tmp_path / "lavender.wasm").write_bytes(fresh)
+    assert pages.module() == fresh
+
+
+def test_hash_covers_what_is_cimported():
+    # core/rows.pxd cimports nothing that the judge does not reach; newton.pyx is no part of the module.
+    with_rows = wasm.source_hash(ROOT, ["judge.measure"])
+    assert with_rows != wasm.source_hash(ROOT, ["sweep.serial"]) != wasm.source_hash(ROOT)
+    assert cut.CIMPORT.findall(
+        "from lavender_ext.core.rows cimport (a,\n  b)\nfrom libc.math cimport sqrt\n"
+    ) == ["core.rows"]
+
+
+# -- Node ------------------------------------------------------------------------------------------------------
+
+
+def node(*arguments):
+    if shutil.which("node") is None:
+        pytest.skip("Node is not installed")
+    return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture(scope="session")
+def module_file(module, newton_module, tmp_path_factory):
+    path = tmp_path_factory.mktemp("wasm") / "lavender.wasm"
+    path.write_bytes(module)
+    (path.parent / "newton.wasm").write_bytes(newton_module)
+    return path
+
+
+def test_node_finds_every_bit_the_same(module_file, recording):
+    done = node(CHECK, module_file, recording)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "all the same: 18 scenes, 10800 steps, 960 solves by newton" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("what", "sign"),
+    [
+        ("values", "eight values"),
+        ("states", "x,q,v"),
+        ("hashes", "other array"),
+        ("newton", "what it said"),
+    ],
+)
+def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
+    contents = json.loads((recording / "recording.json").read_text())
+    numbers = bytearray((recording / "recording.bin").read_bytes())
+    if what == "newton":
+        at = contents["newton"][0]["said"][0] + 1000
+        contents["scenes"] = [s for s in contents["scenes"] if s["name"] == "stack(substeps=1)"]
+    else:
+        at = contents["scenes"][0][what][0] + 1000
+    numbers[at] ^= 1  # the last bit of a number's mantissa: bytes are little-endian
+    (tmp_path / "recording.json").write_text(json.dumps(contents))
+    (tmp_path / "recording.bin").write_bytes(numbers)
+    done = node(CHECK, module_file, tmp_path)
+    assert done.returncode == 1
+    assert sign in done.stderr
+
+
+# -- scenes and command ----------------------------------------------------------------------------------------
+
+
+def test_page_scenes_are_the_start_of_native_ones():
+    contents = json.loads(json.dumps(page_scenes()))
+    gallery = [name for name, build in SCENES.items() if build.__module__ == "lavender.sim.scene.gallery"]
+    assert sorted(scene["name"] for scene in contents["scenes"]) == sorted(gallery)
+    for scene in contents["scenes"]:
+        start = lv.Simulation(scene["name"]).snapshot()
+        assert scene == scene | describe(start)
+        assert len(scene["bodies"]) == scene["size"][0]
