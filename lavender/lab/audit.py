@@ -99,7 +99,7 @@ class Audit:
         Row (without the contact's number): how often it was the worst of an early stop, by how much at most [m/s].
     worst : list of Worst
     stopped : bool
-        By Ctrl-C.
+        By Ctrl-C, or workers were lost.
     """
 
     runs: Runs
@@ -122,10 +122,10 @@ class Audit:
 
     @property
     def largest(self) -> float:
-        """Velocity error of the worst early stop [m/s]; 0 without one, infinite of a world that is not finite."""
+        """Largest velocity error that rounding does not explain [m/s]; infinite where a world is not finite."""
         if (self.verdict == VERDICTS.index("not finite")).any():
             return np.inf
-        return float(np.max(self.numbers[0][self.early], initial=0.0))
+        return float(np.max(self.numbers[0][self.verdict > VERDICTS.index(AT_FLOOR)], initial=0.0))
 
     @property
     def head(self) -> str:
@@ -183,29 +183,16 @@ class Audit:
         )
 
     @property
-    def figures(self) -> tuple[Figure, Figure]:
-        """Errors over time, and how many steps are further off than an error."""
-        speed = np.where(self.verdict >= 0, self.numbers[0], np.nan)
+    def figure(self) -> Figure:
+        """Errors over time."""
         width = -(-self.runs.steps // POINTS)
-        parts = [speed[:, k : k + width] for k in range(0, self.runs.steps, width)]
+        parts = [self.numbers[0][:, k : k + width] for k in range(0, self.runs.steps, width)]
         known = [(k * width, p[np.isfinite(p)]) for k, p in enumerate(parts) if np.isfinite(p).any()]
-        over = tuple(
+        curves = tuple(
             Curve.of(name, name, [(k, float(np.quantile(p, q, method="higher")) or np.nan) for k, p in known])
             for name, q in (("median", 0.5), ("99 %", 0.99), ("worst", 1.0)) if known
         )  # fmt: skip
-        sorted_ = np.sort(speed[np.isfinite(speed) & (speed > 0.0)])[::-1]
-        at = np.unique(np.geomspace(1, max(len(sorted_), 1), 120).astype(int)) - 1
-        share = Curve.of(
-            "worst",
-            "",
-            [(sorted_[k], (k + 1) / self.done) for k in at if k < len(sorted_)][::-1] or [(1.0, 1.0)],
-        )
-        return (
-            Figure("over-time", "over time", "step", "velocity error [m/s]", over, x_log=False),
-            Figure(
-                "further-off", "share of steps further off than", "velocity error [m/s]", "share", (share,)
-            ),
-        )
+        return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """`index.html`, figures, `numbers.json`, `records.npz`, the worst as `worst/worst_1.npz`, and `states.npz`.
@@ -217,21 +204,24 @@ class Audit:
         with folder_for_steps(folder / "worst", replace=True) as worst:
             for i, w in enumerate(self.worst, 1):
                 npz.write(w.problem, worst / f"worst_{i}.npz", impulse=w.impulse)
-        states = (
-            {name: np.array([w.state[name] for w in self.worst]) for name in self.worst[0].state}
-            if self.worst
-            else {}
-        )
-        places = {
-            "world": np.array([w.world for w in self.worst]),
-            "step": np.array([w.step for w in self.worst]),
-        }
+        names = self.worst[0].state if self.worst else ()
+        states = {name: np.array([w.state[name] for w in self.worst]) for name in names}
+        places = {name: np.array([getattr(w, name) for w in self.worst], int) for name in ("world", "step")}
         held = dict(zip(NUMBERS, self.numbers, strict=True))
-        write_arrays(folder / "states.npz", {**states, **places})
-        write_arrays(
-            folder / "records.npz", {**held, "verdict": self.verdict, "verdicts": np.array(VERDICTS)}
-        )
+        write_arrays(folder / "states.npz", states | places)
+        write_arrays(folder / "records.npz", held | {"verdict": self.verdict, "verdicts": np.array(VERDICTS)})
         return self.sheet.write(folder)
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """The sums, as `numbers.json` has them."""
+        runs, early, largest = self.runs, self.early, self.largest
+        return {
+            "head": self.head, "engine": self.engine, "model": runs.model, "worlds": runs.worlds, "steps": runs.steps,
+            "seed": runs.seed, "done": self.done, "early": int(early.sum()),
+            "worlds_early": int(early.any(axis=1).sum()), "largest": largest if np.isfinite(largest) else None,
+            "stopped": self.stopped,
+        }  # fmt: skip
 
     @property
     def sheet(self) -> Sheet:
@@ -239,13 +229,11 @@ class Audit:
         return Sheet(
             "lavender audit", self.head,
             [
-                Section("How wrong", [self.table_of_errors, self.table_of_verdicts], self.figures, OF_ERRORS, short=4),
+                Section("How wrong", [self.table_of_errors, self.table_of_verdicts], [self.figure], OF_ERRORS, short=4),
                 Section("Where", [self.table_of_rows], short=5, note="Rows that were the worst of an early stop."),
                 Section("The worst worlds", [self.table_of_worst], short=WORST, note=OF_FILES),
             ],
-            {"head": self.head, "engine": self.engine, "model": str(self.runs.model), "worlds": self.runs.worlds,
-             "steps": self.runs.steps, "seed": self.runs.seed, "done": self.done, "early": int(self.early.sum()),
-             "worlds_early": int(self.early.any(axis=1).sum()), "largest": self.largest, "stopped": self.stopped},
+            self.told,
         )  # fmt: skip
 
 
@@ -305,13 +293,12 @@ def audit(
     how = precision or "float64", number("threshold", threshold, low=0.0)
     numbers, verdict = np.full((len(NUMBERS), worlds, steps), np.nan), np.full((worlds, steps), -1, np.int8)
     found = Audit(runs, engine, numbers, verdict, where={}, worst=[])
-    stopped = False
+    if engine == "mujoco":
+        pieces = _by_mujoco(runs, how, workers, backend)
+    else:
+        pieces = _by_frames(engine, runs, how[1])
     try:
-        for piece in (
-            _by_mujoco(runs, how, workers, backend)
-            if engine == "mujoco"
-            else _by_frames(engine, runs, how[1])
-        ):
+        for piece in pieces:
             numbers[:, piece.world, piece.step] = piece.numbers
             verdict[piece.world, piece.step] = piece.verdict
             for i, name in piece.where:
@@ -323,10 +310,9 @@ def audit(
     except KeyboardInterrupt:
         if not found.done:
             raise
-        stopped = True
     if not found.done:
         raise InputError("no step was judged: workers were lost; fewer of them (--workers) need less memory")
-    return replace(found, stopped=stopped)
+    return replace(found, stopped=found.done < worlds * steps)
 
 
 def _worst(some: list[Worst]) -> list[Worst]:

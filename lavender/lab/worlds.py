@@ -19,7 +19,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, number, whole_number
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.efc import from_efc
+from lavender.io.efc import from_efc, whole_mass
 from lavender.io.recording import Control, control_of, drive_of, model_of
 from lavender.problem.batch import Batch
 
@@ -28,6 +28,7 @@ __all__ = ["ENGINES", "Frame", "Runs", "fields_of", "frames", "states_of"]
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # what a step is made of
 KIND = {0: "equality", 1: "friction loss", 2: "friction loss", 3: "limit of a joint", 4: "limit of a tendon"}
+PYRAMIDAL = 6  # of mjtConstraint, as the keys of KIND
 ROOM = 256  # rows of each world that MuJoCo Warp is given at least
 
 
@@ -150,10 +151,9 @@ def frames(engine: str, runs: Runs) -> Iterator[Frame]:
         ctrl = np.array([drive(d, k) for drive, d in zip(drives, starts, strict=True)], np.float32)
         state, efc, mass, contact, rest = step(ctrl)
         where, address, dim, rub, _ = contact
-        made = from_efc(
-            **{f"efc_{name}": x for name, x in efc.items()}, M=_whole(model, mass), qvel=state["qvel"],
-            timestep=dt, contacts=(where, address, dim, rub), **rest,
-        )  # fmt: skip
+        given = {f"efc_{name}": x for name, x in efc.items()} | rest
+        given |= {"M": mass if mass.ndim == 3 else whole_mass(model, mass), "qvel": state["qvel"]}
+        made = from_efc(**given, timestep=dt, contacts=(where, address, dim, rub))
         made.batch.names_of = _namer(mj, model, made.batch, efc["type"], contact)
         assert made.impulse is not None
         yield Frame(made.batch, made.impulse, state)
@@ -233,42 +233,22 @@ def _warp(mj: Any, model: Any, begin: dict[str, Any]) -> Any:
     return step
 
 
-def _whole(model: Any, mass: Any) -> Any:
-    """M (n, nv, nv), from the lower triangle in compressed rows where it is that."""
-    if mass.ndim == 3:
-        return mass
-    row, whole = (
-        np.repeat(np.arange(model.nv), model.M_rownnz),
-        np.zeros((len(mass), model.nv, model.nv), mass.dtype),
-    )
-    whole[:, row, model.M_colind] = mass
-    whole[:, model.M_colind, row] = mass
-    return whole
-
-
 def _namer(mj: Any, model: Any, batch: Batch, of: IntArray, contact: Any) -> Any:
     """Names of the blocks of a world, by the type of its rows and the geoms of its contacts."""
     where, address, _, _, geom = contact
 
-    def name(g: Any) -> str:
+    def geom_name(g: Any) -> str:
         return mj.mj_id2name(model, mj.mjtObj.mjOBJ_GEOM, int(g)) or str(int(g))
 
     def names_of(i: int) -> list[str]:
-        begins = batch._cones_of(i).ptr[:-1]
         types = np.broadcast_to(of, (len(batch), of.shape[-1]))[i]
-        mine = np.flatnonzero((where == i) & (address >= 0))
-        at = {int(address[k]): int(k) for k in mine}
-        names, here, edge = [], -1, 0
-        for row in begins.tolist():
-            if row in at:
-                here, edge = at[row], 0
-            if int(types[row]) in KIND:
-                names.append(KIND[int(types[row])])
-                continue
-            word = f"contact ({name(geom[here][0])}, {name(geom[here][1])})" if here >= 0 else "contact"
-            edges = int(types[row]) == int(mj.mjtConstraint.mjCNSTR_CONTACT_PYRAMIDAL)
-            names.append(f"{word}, edge {edge}" if edges else word)
-            edge += 1
+        first = {int(address[k]): k for k in np.flatnonzero((where == i) & (address >= 0))}
+        names, word, begun = [], "contact", 0
+        for row in batch._cones_of(i).ptr[:-1].tolist():
+            if row in first:
+                word, begun = f"contact ({', '.join(map(geom_name, geom[first[row]]))})", row
+            edge = f", edge {row - begun}" if int(types[row]) == PYRAMIDAL else ""
+            names.append(KIND.get(int(types[row]), word + edge))
         return names
 
     return names_of

@@ -162,6 +162,11 @@ def test_the_command_accepts_or_does_not(model, tmp_path):
     assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # those of another run are gone
 
 
+def test_what_is_close_enough_may_still_not_be_accepted(model):
+    found = audit(model(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
+    assert not found.early.any() and found.largest == found.numbers[0].max() > 1e-3
+
+
 def test_a_world_that_is_not_finite_is_accepted_by_nobody(model, monkeypatch):
     states_of = module.states_of
 
