@@ -8,12 +8,9 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import Progress
+from lavender.cli.measuring import Progress, show_sheet
 from lavender.cli.options import (
-    EXIT_INTERRUPTED,
     EXIT_UNMET,
-    console,
-    going_on,
     one_thread,
     precision_option,
     threshold_option,
@@ -65,12 +62,7 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
     one_thread()
     with Progress() as watch:
         found = run(model, watch=watch, **asked)
-    page = found.write(out)
-    with going_on():
-        found.sheet.show(console())
-        console().print(f"\npage: {page}", highlight=False, markup=False, soft_wrap=True)
-    if found.stopped:
-        console().print("[yellow]Stopped: of what was done until then.[/]")
-        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    found.write(out)
+    show_sheet(found.sheet, out, found.stopped)
     if accept is not None and found.largest > accept:
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -7,15 +7,8 @@ from typing import Any
 
 import click
 
-from lavender.cli.measuring import Progress
-from lavender.cli.options import (
-    EXIT_INTERRUPTED,
-    console,
-    going_on,
-    one_thread,
-    threshold_option,
-    worlds_options,
-)
+from lavender.cli.measuring import Progress, show_sheet
+from lavender.cli.options import one_thread, threshold_option, worlds_options
 from lavender.io.stored import writable
 
 __all__ = ["tune"]
@@ -43,10 +36,4 @@ def tune(model: Path, out: Path, **asked: Any) -> None:
     one_thread()
     with Progress() as watch:
         found = run(model, watch=watch, **asked)
-    page = found.write(out)
-    with going_on():
-        found.sheet.show(console())
-        console().print(f"\npage: {page}", highlight=False, markup=False, soft_wrap=True)
-    if found.stopped:
-        console().print("[yellow]Stopped: of what was done until then.[/]")
-        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    show_sheet(found.sheet, out, found.stopped)

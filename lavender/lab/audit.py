@@ -1,7 +1,7 @@
 """Every step of many worlds judged: how many ended early, how wrong they are and where, and the worst to go back to.
 
     found = audit("ant.xml", worlds=64, steps=200)
-    found.table_of_errors; found.worst[0].problem; found.write("lavender-audit")
+    found.table_of_errors; found.worst[0].problem; found.write("lavender-audit"); found.sheet.write("lavender-audit")
 
 An answer that rounding explains, in the precision of the engine, is at its floor and no early stop
 (`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, made anew from the state before
@@ -194,8 +194,8 @@ class Audit:
         )  # fmt: skip
         return Figure("over-time", "over time", "step", "velocity error [m/s]", curves, x_log=False)
 
-    def write(self, folder: str | os.PathLike[str]) -> Path:
-        """`index.html`, figures, `numbers.json`, `records.npz`, the worst as `worst/worst_1.npz`, and `states.npz`.
+    def write(self, folder: str | os.PathLike[str]) -> None:
+        """`records.npz`, the worst as `worst/worst_1.npz`, and `states.npz`; the page is `sheet.write`.
 
         `records.npz` holds `velocity` [m/s], `impulse` [N s], `relative`, `floor`, `verdict` (worlds, steps) and
         `verdicts`; `states.npz` qpos, qvel, act, ctrl, qacc_warmstart of the worst, a row each, before their step.
@@ -210,7 +210,6 @@ class Audit:
         held = dict(zip(NUMBERS, self.numbers, strict=True))
         write_arrays(folder / "states.npz", states | places)
         write_arrays(folder / "records.npz", held | {"verdict": self.verdict, "verdicts": np.array(VERDICTS)})
-        return self.sheet.write(folder)
 
     @property
     def told(self) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """MuJoCo's settings on worlds of one model: time of a step beside error, and the `<option>` line to copy.
 
     found = tune("ant.xml", worlds=16, steps=200)
-    found.faster, found.closer; found.write("lavender-tune")
+    found.faster, found.closer; found.sheet.write("lavender-tune")
 
 Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `ahead` steps of a run with the
 settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
@@ -53,7 +53,7 @@ ENUMS = {
     "solver": "mjSOL_",
     "cone": "mjCONE_",
     "jacobian": "mjJAC_",
-}  # words of MJCF and their names in MuJoCo
+}  # what words of MJCF begin with in MuJoCo
 OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
 OTHER = ("cone", "impratio", "noslip_iterations")  # of another problem
 CONVERGED = {
@@ -152,7 +152,10 @@ class Stage:
             starts.append(states_of(mj, model, runs, world)[::ahead])
             controls.append(ctrl)
         made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
-        made.ends = made.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
+        try:
+            made.ends = made.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
+        except mj.FatalError as error:
+            raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
         return made
 
     def run(self, model: Any, states: FloatArray | None = None) -> tuple[float, FloatArray]:
@@ -177,7 +180,7 @@ class Stage:
     def measured(self, setting: Setting) -> Measured:
         """A setting judged, not timed yet; its errors are infinite where a world flies apart."""
         mj, model = self.mj, setting.on(self.mj, self.model)
-        solver = str(_word(mj, model, "solver"))
+        apart = Measured(setting, str(_word(mj, model, "solver")), np.full(1, np.inf), np.full(1, np.inf))
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
@@ -188,11 +191,11 @@ class Stage:
                 batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
                 errors.append(residual_many(batch, impulse, errors="status").velocity_error)
         except mj.FatalError:
-            return Measured(setting, solver, np.full(1, np.inf), np.full(1, np.inf))
+            return apart
         off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
         if np.isnan(off).any():
-            return Measured(setting, solver, np.full(1, np.inf), np.full(1, np.inf))
-        return Measured(setting, solver, np.nan_to_num(np.concatenate(errors), nan=np.inf), off)
+            return apart
+        return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off)
 
     def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
         """The least of several rounds in which all take turns, the first of them the model's own setting.
@@ -346,10 +349,6 @@ class Tuning:
              "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
         )  # fmt: skip
 
-    def write(self, folder: str | os.PathLike[str]) -> Path:
-        """`index.html`, `numbers.json` and the figure; the path of the page."""
-        return self.sheet.write(folder)
-
 
 def _beside(m: Measured, now: Measured) -> str:
     return f"{m.time / now.time:.2f} of the time, error {size(m.worst)} m/s beside {size(now.worst)}"
@@ -471,7 +470,7 @@ def tune(
         stage = Stage.of(mj, made, runs, range(1, worlds, 2), ahead)
         last = judge(stage, list(dict.fromkeys(kept)))
         stage.time(last, 2 * rounds, tell)
-        held += last
+        held += last if np.isfinite(last[0].time) else []
     except KeyboardInterrupt:
         if not measured or not np.isfinite(measured[0].time):
             raise

@@ -15,7 +15,7 @@ from lavender.judge.solution import Claim, Status, Turn
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers.islands import islands
-from lavender.solvers.small import NOTHING, NO_TIME, told
+from lavender.solvers.small import NO_TIME, NOTHING, told
 from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
 

@@ -134,7 +134,8 @@ def test_ctrl_c_keeps_what_there_is(model, tmp_path, monkeypatch):
     found = audit(model(EARLY), worlds=3, steps=20, workers=1, watch=watch)
     assert found.stopped and found.done == 20
     assert np.isnan(found.numbers[:, 1:]).all()
-    assert found.write(tmp_path / "out").is_file()
+    found.write(tmp_path / "out")
+    assert found.sheet.write(tmp_path / "out").is_file()
 
 
 def test_the_command_accepts_or_does_not(model, tmp_path):
