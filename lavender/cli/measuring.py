@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import bytes_of, console, one_thread, was_given
+from lavender.cli.options import EXIT_INTERRUPTED, bytes_of, console, going_on, one_thread, was_given
 
 if TYPE_CHECKING:
     from lavender.lab.bench import Event, Item, Plan, Records
+    from lavender.lab.report.sheet import Sheet
 
     P = TypeVar("P", bound=Plan)
 
-__all__ = ["Measured", "measure", "run_campaign"]
+__all__ = ["Measured", "Progress", "measure", "run_campaign", "show_sheet"]
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
-        with _Progress() as bar:
+        with Progress() as bar:
 
             def watch(event: Event) -> None:
                 nonlocal reused
@@ -135,7 +136,7 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
     check_named(bench.resolve(words))
     plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
     more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
-    with bench.Store(path) as store, _Progress() as watch:
+    with bench.Store(path) as store, Progress() as watch:
         try:
             made = bench.campaign(words, asked["solvers"], plan, store, watch=watch, **more)
         except KeyboardInterrupt:
@@ -143,8 +144,19 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
         return Measured(made, False)
 
 
-class _Progress:
-    """A progress bar over pairs of case and solver, on a terminal; silent elsewhere."""
+def show_sheet(sheet: Sheet, folder: Path, stopped: bool) -> None:
+    """Write a page and print its short form; an exit where Ctrl-C came before the end."""
+    page = sheet.write(folder)
+    with going_on():
+        sheet.show(console())
+        console().print(f"\npage: {page}", highlight=False, markup=False, soft_wrap=True)
+    if stopped:
+        console().print("[yellow]Stopped: of what was done until then.[/]")
+        raise click.exceptions.Exit(EXIT_INTERRUPTED)
+
+
+class Progress:
+    """A progress bar over what is measured, pairs of case and solver for one, on a terminal; silent elsewhere."""
 
     def __enter__(self) -> Callable[[Event], None]:
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -163,7 +175,10 @@ class _Progress:
 
         def watch(event: Event) -> None:
             self.bar.update(
-                task, completed=event.done, total=event.total, what=f"{event.case} {event.solver}".strip()
+                task,
+                completed=event.done,
+                total=event.total or None,
+                what=f"{event.case} {event.solver}".strip(),
             )
 
         return watch

@@ -43,6 +43,8 @@ __all__ = [
     "refuse_unused_recording",
     "threshold_option",
     "unheard",
+    "was_given",
+    "worlds_options",
 ]
 
 EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
@@ -206,6 +208,24 @@ def recording_options(command: Callable[..., Any]) -> Callable[..., Any]:
     for name, more in reversed(RECORDING_OPTIONS):
         command = click.option(*name, show_default=True, **more)(command)
     return threshold_option(command)
+
+
+def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Which worlds of a MuJoCo model are simulated, with these numbers as the defaults."""
+    options = {
+        "--worlds": {"default": worlds, "help": "How many; the first is that of `lavender record`."},
+        "--steps": {"default": steps, "help": "Of each world."},
+        "--spread": {"default": 0.1, "metavar": "M/S",
+                     "help": "Standard deviation of what the others' first velocities differ by."},
+    }  # fmt: skip
+    kept = [(names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed")]
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for names, more in reversed([*(((name,), more) for name, more in options.items()), *kept]):
+            command = click.option(*names, show_default=True, **more)(command)
+        return command
+
+    return decorate
 
 
 def refuse_unused_recording(context: click.Context, recorded: bool) -> None:

@@ -242,10 +242,7 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
         s = scale[0]
         jac *= s[:, None]
         goal, soft, lam = goal * s, soft * s * s, lam / s
-    row = np.repeat(np.arange(nv), model.M_rownnz)
-    whole = np.zeros((n, nv, nv))
-    whole[:, row, model.M_colind] = mass
-    whole[:, model.M_colind, row] = mass
+    whole = whole_mass(model, mass)
     batch = Batch(
         jac,
         whole,
@@ -257,6 +254,15 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
         row_ptr=ptr,
     )
     return Imported(batch, lam)
+
+
+def whole_mass(model: Any, mass: Any) -> Any:
+    """M (n, nv, nv) of its lower triangles (n, entries), stored as the model says."""
+    n, nv = len(mass), model.nv
+    row, whole = np.repeat(np.arange(nv), model.M_rownnz), np.zeros((n, nv, nv), mass.dtype)
+    whole[:, row, model.M_colind] = mass
+    whole[:, model.M_colind, row] = mass
+    return whole
 
 
 def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str) -> None:

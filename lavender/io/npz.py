@@ -26,7 +26,7 @@ from lavender.base.arrays import FloatArray, as_array
 from lavender.base.errors import InputError
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
-from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_atomically
+from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.cones import CONTACT, ROW, Cones
 from lavender.problem.generalized import Generalized
@@ -251,12 +251,7 @@ def write(problem: Problem, path: str | os.PathLike[str], *, impulse: Any = None
     if problem.generalized is not None:
         meta["dof_names"] = problem.generalized.names
     arrays["meta"] = np.frombuffer(json.dumps(meta).encode("ascii"), np.uint8)
-
-    def write_to(temporary: Path) -> None:
-        with open(temporary, "xb") as stream:
-            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would keep allow_pickle as an entry
-
-    write_atomically(path, write_to)
+    write_arrays(path, arrays)
 
 
 def _read_own(archive: Archive) -> Stored:

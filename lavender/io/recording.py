@@ -185,22 +185,36 @@ def record_file(
     **options: Any,
 ) -> Recording:
     """`record` of a model by its file (MJCF); an array of controls may be given by its file (.npy), too."""
+    mj, made = model_of(path)
+    found = record(made, mj.MjData(made), folder, steps, control=control_of(control), **options)
+    if not found.files:
+        why = f" ({found.left_out[0]})" if found.left_out else ": more steps, or other controls"
+        raise InputError(f"{path}: no step had a constraint that could be kept{why}")
+    return found
+
+
+def model_of(path: str | os.PathLike[str]) -> tuple[Any, Any]:
+    """MuJoCo, and the model of a file (MJCF).
+
+    Raises
+    ------
+    InputError
+        MuJoCo is not installed, or cannot read the file.
+    """
     try:
         import mujoco as mj
     except ImportError:
         raise InputError("mujoco cannot be imported: pip install mujoco") from None
     path = str(as_path(path))
     try:
-        made = mj.MjModel.from_xml_path(path)
+        return mj, mj.MjModel.from_xml_path(path)
     except ValueError as error:  # MuJoCo's word about a file that it cannot read
         raise InputError(f"{path}: {error}") from None
-    if isinstance(control, str) and control not in CONTROLS:
-        control = _controls(control)
-    found = record(made, mj.MjData(made), folder, steps, control=control, **options)
-    if not found.files:
-        why = f" ({found.left_out[0]})" if found.left_out else ": more steps, or other controls"
-        raise InputError(f"{path}: no step had a constraint that could be kept{why}")
-    return found
+
+
+def control_of(control: Control) -> Control:
+    """Controls as `record` takes them, of a file (.npy) its array."""
+    return _controls(control) if isinstance(control, str) and control not in CONTROLS else control
 
 
 def _controls(path: str) -> Any:

@@ -17,6 +17,8 @@ from threading import get_native_id
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.errors import InputError
 from lavender.problem import Problem
@@ -207,6 +209,16 @@ def write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 def write_text(path: str | os.PathLike[str], text: str) -> None:
     """`write_atomically` of a text."""
     write_bytes(path, text.encode())
+
+
+def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
+    """`write_atomically` of an archive of arrays (.npz)."""
+
+    def write_to(temporary: Path) -> None:
+        with open(temporary, "xb") as stream:
+            np.savez_compressed(stream, **arrays)  # NumPy before 2.1 would keep allow_pickle as an entry
+
+    write_atomically(path, write_to)
 
 
 def check_figure(path: str | os.PathLike[str]) -> Path:

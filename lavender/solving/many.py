@@ -80,6 +80,11 @@ class _Many:
         return self._numbers("speed")
 
     @property
+    def impulse_error(self) -> FloatArray:
+        """(n,) N s, of that row."""
+        return self._numbers("push")
+
+    @property
     def floor(self) -> FloatArray:
         """(n,) relative residual that rounding alone costs."""
         return self._numbers("floor")
@@ -107,6 +112,7 @@ class _Many:
         known = {
             "relative": found.relative, "energy": found.energy, "speed": found.velocity, "floor": found.floor,
             "start_energy": found.energy_start, "start_speed": found.velocity_start,
+            "push": abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0,
         }  # fmt: skip
         for name, x in known.items():
             self._worlds.numbers[NUMBER[name], i] = x
@@ -183,8 +189,8 @@ class Solutions(_Many, Sequence[Solution]):
         world they are of. NaN of a world that is REFUSED, like all its numbers; its counts are 0.
     status : (n,) of Status
         REFUSED where the data of a world are no problem's.
-    relative, energy, velocity_error, floor : (n,)
-        Of the judge: -, sqrt J, m/s, -.
+    relative, energy, velocity_error, impulse_error, floor : (n,)
+        Of the judge: -, sqrt J, m/s and N s of the worst row, -.
     worst_row, iterations : (n,) int
     tol : float, -
     faults : dict
@@ -320,7 +326,7 @@ class Residuals(_Many):
 
     Parameters
     ----------
-    relative, energy, velocity_error, floor : (n,)
+    relative, energy, velocity_error, impulse_error, floor : (n,)
         As of `Solutions`; the floor is that of `precision`.
     worst_row : (n,) int
     precision : {"float64", "float32"} or sequence of them

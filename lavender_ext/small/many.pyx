@@ -262,7 +262,8 @@ cdef enum:                      # what is known of a world when it is done, rows
     START_SPEED = 5
     START_RELATIVE = 6
     RHS_ENERGY = 7              # of b
-    N_NUMBERS = 8
+    PUSH = 8                    # N s, |e| of the worst row
+    N_NUMBERS = 9
 
 
 #: Columns of `at`, by their names.
@@ -272,7 +273,7 @@ PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "
 
 #: Rows of `Worlds.numbers` and codes of worlds by their names.
 NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "start_energy": START_ENERGY,
-          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY}
+          "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH}
 CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE}
 
 
@@ -405,6 +406,7 @@ cdef class Worlds:
             self.number[(START_ENERGY + k) * n + i] = j.begin[k]
         norms_of_rhs(&j.p, &self.number[RHS_ENERGY * n + i], &size)
         self.worst_at[i] = j.score.worst
+        self.number[PUSH * n + i] = fabs(j.both[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
         for k in range(4):
             self.count[4 * i + k] = j.counts[k]
         if self.jobs == NULL:

@@ -282,6 +282,7 @@ def test_every_import_is_declared():
     )
     known |= {
         "lavendersim",
+        "mujoco_warp",
         "newton",
         "pinocchio",
         "pydrake",

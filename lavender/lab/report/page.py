@@ -24,7 +24,7 @@ MOST_SPREADS = 100  # widest spreads of sweep orders on a page
 
 
 @functools.cache
-def _environment() -> Any:
+def environment() -> Any:
     """The templates, compiled once."""
     import jinja2
 
@@ -51,7 +51,7 @@ def page(report: Report, figures: Figures, title: str = "lavender report", saved
     saved : bool
         The figures are beside the page as SVG and PNG.
     """
-    return _environment().get_template("index.html.j2").render(
+    return environment().get_template("index.html.j2").render(
         title=title, saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
     )  # fmt: skip
 

@@ -7,7 +7,8 @@ import math
 from lavender.lab.bench.store import Records
 
 __all__ = [
-    "NONE", "count", "left_out", "percent", "residual", "seconds", "share", "suspicions", "times", "who", "without",
+    "NONE", "count", "left_out", "percent", "residual", "seconds", "share", "size", "suspicions", "times", "who",
+    "without",
 ]  # fmt: skip
 
 NONE = "–"  # where there is no number
@@ -33,6 +34,11 @@ def residual(x: float) -> str:
         return "0"
     mantissa, _, exponent = f"{x:.1e}".partition("e")
     return f"{mantissa}e{int(exponent)}"
+
+
+def size(x: float) -> str:
+    """Two digits of what may be large: 24, 0.31, 3.4e-7."""
+    return f"{x:.2g}" if 0.05 <= x < 99.5 else residual(x)
 
 
 def times(x: float) -> str:

@@ -29,6 +29,7 @@ def assert_same(many, i, single):
     for name in ("relative", "energy", "velocity", "floor", "worst_row", "energy_start", "velocity_start"):
         assert getattr(own.residual, name) == getattr(found, name), name
     assert own.residual.slack.tobytes() == found.slack.tobytes()
+    assert many.impulse_error[i] == (abs(found.error[found.worst_row]) if found.worst_row >= 0 else 0.0)
     assert (many.relative[i], many.energy[i], many.velocity_error[i], many.floor[i], many.worst_row[i]) == (
         found.relative, found.energy, found.velocity, found.floor, found.worst_row,
     )  # fmt: skip

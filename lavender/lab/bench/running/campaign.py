@@ -14,7 +14,7 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import resource_tracker
@@ -74,7 +74,6 @@ class Order:
     plan: CampaignPlan
     run: Run
     memory: int | None  # bytes of each backend's process; a share of the machine it runs on if None
-    parent: int = 0  # process whose end ends its workers; 0: they belong to a cluster
 
 
 def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
@@ -141,7 +140,7 @@ def campaign(
         A backend that joblib does not have here, another number of workers than -1 or 1 to 4096, or workers that were
         lost again and again.
     """
-    _check(workers)
+    check_workers(workers)
     plan = plan or CampaignPlan()
     items = resolve(cases)
     names = solver_names(solvers)
@@ -155,7 +154,7 @@ def campaign(
         for j, name in enumerate(names)
     ]
     out = Records()
-    name, cluster = _backend(backend)
+    name, cluster = connected(backend)
     with cluster, opened(store) as kept:
         known = {} if kept is None else _finished(kept.records, this.run)
         out.source = str(kept.path) if kept is not None else ""
@@ -188,7 +187,8 @@ def _keep(store: Store | None, entries: Iterable[Any]) -> None:
             store.add(entry)
 
 
-def _check(workers: Any) -> None:
+def check_workers(workers: Any) -> None:
+    """InputError for another number of workers than -1 or 1 to 4096."""
     whole = isinstance(workers, int) and not isinstance(workers, bool)
     if not whole or not (workers == -1 or 1 <= workers <= MOST_WORKERS):
         raise InputError(
@@ -222,6 +222,21 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
     """Results as they come; ends early, without an exception, when workers were lost."""
     import joblib
 
+    if backend == "loky":
+        share = machine.memory_share(joblib.effective_n_jobs(workers))
+        order = replace(order, memory=order.memory or share)
+    yield from hand_out(work, ((pair, order) for pair in pairs), workers, backend)
+
+
+def hand_out(
+    function: Callable[..., Any], arguments: Iterable[tuple[Any, ...]], workers: int, backend: str
+) -> Iterator[Any]:
+    """What a function makes of each of its arguments, as it comes, by the backend that `connected` named.
+
+    Ends early, without an exception, when workers were lost.
+    """
+    import joblib
+
     lost: tuple[type[BaseException], ...] = (BrokenPipeError, ConnectionError)
     with contextlib.suppress(ImportError):
         from joblib.externals.loky.process_executor import BrokenProcessPool
@@ -231,11 +246,9 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
         from distributed.scheduler import KilledWorker
 
         lost = (*lost, KilledWorker)
+    parent = os.getpid() if backend == "loky" else 0  # 0: workers belong to a cluster
     with joblib.parallel_config(backend=backend, n_jobs=workers):
-        if backend == "loky":
-            share = machine.memory_share(joblib.effective_n_jobs(workers))
-            order = replace(order, memory=order.memory or share, parent=os.getpid())
-        calls = (joblib.delayed(work)(pair, order) for pair in pairs)
+        calls = (joblib.delayed(_led)(parent, function, given) for given in arguments)
         try:
             try:
                 parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
@@ -249,6 +262,13 @@ def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> It
             yield from found
         except lost:
             return
+
+
+def _led(parent: int, function: Callable[..., Any], given: tuple[Any, ...]) -> Any:
+    """One call in a worker, which ends with its parent."""
+    if parent and parent != os.getpid():
+        _end_with(parent)
+    return function(*given)
 
 
 @contextlib.contextmanager
@@ -266,7 +286,7 @@ def _deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _backend(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
+def connected(word: str) -> tuple[str, contextlib.AbstractContextManager[Any]]:
     """The name by which joblib knows a backend, and what holds the connection to its cluster.
 
     Raises
@@ -332,8 +352,6 @@ _worker: Worker | None = None  # one for each process, kept between pairs
 
 def work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     """All entries of one pair; runs in a worker, on one thread: the pairs are what runs side by side."""
-    if order.parent and order.parent != os.getpid():
-        _end_with(order.parent)
     with one_thread(pair.solver):
         return _work(pair, order)
 

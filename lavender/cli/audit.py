@@ -1,0 +1,68 @@
+"""`lavender audit`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lavender.base.errors import InputError
+from lavender.cli.measuring import Progress, show_sheet
+from lavender.cli.options import (
+    EXIT_UNMET,
+    one_thread,
+    precision_option,
+    threshold_option,
+    was_given,
+    worlds_options,
+)
+from lavender.io.stored import writable
+
+__all__ = ["audit"]
+
+
+@click.command()
+@click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))
+@worlds_options(worlds=4096, steps=200)
+@click.option(
+    "--engine",
+    default="mujoco",
+    show_default=True,
+    metavar="mujoco|mjx|mujoco_warp",
+    help="Who steps the worlds.",
+)
+@click.option("--accept", type=float, metavar="M/S",
+              help="Velocity error of an early stop [m/s] up to which the exit code is 0.")  # fmt: skip
+@threshold_option
+@precision_option
+@click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
+@click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
+@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("lavender-audit"),
+              show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
+@click.pass_context
+def audit(context: click.Context, /, model: Path, out: Path, accept: float | None, **asked: Any) -> None:
+    """Simulate worlds of a MuJoCo model (MJCF) and judge the engine's answer to every step.
+
+    The page says how many steps ended early, how wrong they are and where. The worst worlds are problem files in
+    OUT/worst; OUT/states.npz holds the states before them.
+
+    Exit code 1: with --accept, an answer that is not at its floor is further off. Exit code 130: stopped by Ctrl-C; the
+    page tells of what was done.
+    """
+    from lavender.lab.audit import audit as run
+
+    if accept is not None and not accept >= 0.0:
+        raise InputError(f"--accept is {accept}; a velocity error in m/s is needed")
+    if asked["engine"] != "mujoco":
+        for name in ("workers", "backend", "precision"):
+            if was_given(context, name):
+                raise InputError(f"--{name} is of --engine mujoco: leave it out")
+    writable(out, folder=True)
+    one_thread()
+    with Progress() as watch:
+        found = run(model, watch=watch, **asked)
+    found.write(out)
+    show_sheet(found.sheet, out, found.stopped)
+    if accept is not None and found.largest > accept:
+        raise click.exceptions.Exit(EXIT_UNMET)

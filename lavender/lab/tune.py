@@ -1,0 +1,478 @@
+"""MuJoCo's settings on worlds of one model: time of a step beside error, and the `<option>` line to copy.
+
+    found = tune("ant.xml", worlds=16, steps=200)
+    found.faster, found.closer; found.sheet.write("lavender-tune")
+
+Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `ahead` steps of a run with the
+settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
+
+    time    of mj_step, over all steps [s]: the least of several rounds, in which all settings take turns
+    error   of the engine's answer to the problem of each step, by the judge [m/s]
+    motion  how far the body that is furthest off is, after `ahead` steps, from where the converged run has it [m]
+
+A cone, impratio or noslip other than the model's is another problem: its error is that of its own, its motion says how
+far it leads away, and no line names it.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.errors import InputError
+from lavender.io.efc import from_mujoco_many
+from lavender.io.recording import Control
+from lavender.judge.residuals import ENOUGH
+from lavender.lab.audit import AT_ONCE
+from lavender.lab.bench.running.runner import Event
+from lavender.lab.report.curves import Curve, Figure
+from lavender.lab.report.sheet import Part, Sheet
+from lavender.lab.report.table import Table
+from lavender.lab.report.text import seconds, size, times
+from lavender.lab.worlds import Runs, flew_apart, states_of
+from lavender.solving.many import residual_many
+
+__all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
+
+WORST = 0.99  # quantile of the error by which settings are compared
+EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
+SLOW = 2.0  # times the time now, above which a setting is timed no more
+NEAR = 1.5  # times the time now, up to which settings of the front are varied
+TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
+ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
+ENUMS = {
+    "solver": "mjSOL_",
+    "cone": "mjCONE_",
+    "jacobian": "mjJAC_",
+}  # what words of MJCF begin with in MuJoCo
+OPTIONS = ("solver", "iterations", "tolerance", "ls_iterations", "ls_tolerance", "jacobian")
+OTHER = ("cone", "impratio", "noslip_iterations")  # of another problem
+CONVERGED = {
+    "solver": "Newton",
+    "iterations": 300,
+    "tolerance": 0.0,
+    "ls_iterations": 100,
+    "ls_tolerance": 1e-4,
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Attributes of `<option>` that differ from the model's."""
+
+    options: tuple[tuple[str, Any], ...] = ()
+
+    @classmethod
+    def of(cls, mj: Any, model: Any, **options: Any) -> Setting:
+        """Those that differ, in the order of `OPTIONS`."""
+        has = {name: _word(mj, model, name) for name in (*OPTIONS, *OTHER)}
+        return cls(tuple((name, options[name]) for name in has if options.get(name, has[name]) != has[name]))
+
+    def on(self, mj: Any, model: Any) -> Any:
+        """A copy of the model with these."""
+        made = copy.copy(model)
+        for name, x in self.options:
+            kind = ENUMS.get(name)
+            setattr(made.opt, name, x if kind is None else _values(mj, name)[x])
+        return made
+
+    @property
+    def line(self) -> str:
+        """To copy into the model; empty where nothing differs."""
+        said = (f'{name}="{x:g}"' if isinstance(x, float) else f'{name}="{x}"' for name, x in self.options)
+        return f"<option {' '.join(said)}/>" if self.options else ""
+
+    @property
+    def is_other(self) -> bool:
+        """Another problem than the model's."""
+        return any(name in OTHER for name, _ in self.options)
+
+
+def _values(mj: Any, name: str) -> dict[str, Any]:
+    members = getattr(mj, f"mjt{name.capitalize()}").__members__
+    words = {"NEWTON": "Newton", "CG": "CG", "PGS": "PGS"}
+    short = ((key.removeprefix(ENUMS[name]), value) for key, value in members.items())
+    return {words.get(key, key.lower()): value for key, value in short}
+
+
+def _word(mj: Any, model: Any, name: str) -> Any:
+    x = getattr(model.opt, name)
+    if name not in ENUMS:
+        return float(x) if isinstance(x, float) else int(x)
+    return next(word for word, value in _values(mj, name).items() if int(value) == int(x))
+
+
+@dataclass(eq=False)
+class Measured:
+    """One setting on some worlds."""
+
+    setting: Setting
+    solver: str
+    error: FloatArray = field(repr=False)  # (steps,) m/s
+    motion: FloatArray = field(repr=False)  # (stretches,) m
+    time: float = np.inf  # s, of a step
+
+    @property
+    def worst(self) -> float:
+        """Error that one step of a hundred exceeds [m/s]."""
+        return float(np.quantile(self.error, WORST, method="higher"))
+
+    @property
+    def worst_motion(self) -> float:
+        """Distance that one stretch of a hundred exceeds [m]."""
+        return float(np.quantile(self.motion, WORST, method="higher"))
+
+
+@dataclass(eq=False)
+class Stage:
+    """Worlds on which settings are measured: starts (n, size), controls (n, ahead, nu), where bodies converge to."""
+
+    mj: Any
+    model: Any
+    starts: FloatArray
+    controls: FloatArray
+    ends: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, mj: Any, model: Any, runs: Runs, worlds: Iterable[int], ahead: int) -> Stage:
+        """Stretches of worlds that run with the model's own setting."""
+        starts, controls = [], []
+        for world in worlds:
+            drive = runs.drive(model, world)
+            ctrl = np.array([drive(None, step) for step in range(runs.steps)]).reshape(-1, ahead, model.nu)
+            starts.append(states_of(mj, model, runs, world)[::ahead])
+            controls.append(ctrl)
+        made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))
+        try:
+            made.ends = made.run(Setting.of(mj, model, **CONVERGED).on(mj, model))[1]
+        except mj.FatalError as error:
+            raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
+        return made
+
+    def run(self, model: Any, states: FloatArray | None = None) -> tuple[float, FloatArray]:
+        """Seconds of a step, and places of bodies after each stretch (n, bodies, 3) [m]; states before each step."""
+        mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
+        data, spent = mj.MjData(model), 0.0
+        n, ahead, _ = self.controls.shape
+        ends = np.empty((n, model.nbody, 3))
+        for i in range(n):
+            mj.mj_setState(model, data, self.starts[i], kind)
+            for k in range(ahead):
+                data.ctrl[:] = self.controls[i, k]
+                if states is not None:
+                    mj.mj_getState(model, data, states[ahead * i + k], kind)
+                begin = perf_counter()
+                mj.mj_step(model, data)
+                spent += perf_counter() - begin
+            mj.mj_kinematics(model, data)
+            ends[i] = np.nan if flew_apart(mj, data) else data.xpos
+        return spent / (n * ahead), ends
+
+    def measured(self, setting: Setting) -> Measured:
+        """A setting judged, not timed yet; its errors are infinite where a world flies apart."""
+        mj, model = self.mj, setting.on(self.mj, self.model)
+        apart = Measured(setting, str(_word(mj, model, "solver")), np.full(1, np.inf), np.full(1, np.inf))
+        states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
+        judge = copy.copy(model)
+        judge.opt.noslip_iterations = 0
+        errors = []
+        try:
+            ends = self.run(model, states)[1]
+            for i in range(0, len(states), AT_ONCE):
+                batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
+                errors.append(residual_many(batch, impulse, errors="status").velocity_error)
+        except mj.FatalError:
+            return apart
+        off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
+        if np.isnan(off).any():
+            return apart
+        return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off)
+
+    def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
+        """The least of several rounds in which all take turns, the first of them the model's own setting.
+
+        Worlds that fly apart tell no time.
+        """
+        some = [m for m in some if np.isfinite(m.error).all()]
+        models = [m.setting.on(self.mj, self.model) for m in some]
+        for turn in range(rounds):
+            for m, model in zip(some, models, strict=True):
+                if turn == 0 or m.time <= SLOW * some[0].time:
+                    m.time = min(m.time, self.run(model)[0])
+                    tell("timed")
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What `tune` found; the first of `measured` and of `held` is the model's own setting.
+
+    Parameters
+    ----------
+    runs : Runs
+    ahead : int
+        Steps of a stretch.
+    measured : list of Measured
+        On the even worlds.
+    held : list of Measured
+        The own setting and those chosen, on the odd worlds; empty where Ctrl-C came before.
+    threshold : float, m/s, m
+        Error, and distance, below which nobody asks for less.
+    stopped : bool
+    """
+
+    runs: Runs
+    ahead: int
+    measured: list[Measured]
+    held: list[Measured]
+    threshold: float
+    stopped: bool = False
+
+    @property
+    def now(self) -> Measured:
+        """The model's own setting."""
+        return self.measured[0]
+
+    @property
+    def _own(self) -> list[Measured]:
+        return [m for m in self.measured if not m.setting.is_other and np.isfinite(m.time)]
+
+    def _holds(self, m: Measured) -> bool:
+        """No further off than now in its worst steps and in motion, or within the threshold."""
+        now, most = self.now, self.threshold
+        pairs = ((m.error.max(), now.error.max()), (m.worst_motion, now.worst_motion))
+        return all(x <= max(own, most) for x, own in pairs)
+
+    @cached_property
+    def faster(self) -> Measured | None:
+        """As accurate as now, or within the threshold, and fastest."""
+        now = self.now
+        good = [m for m in self._own if m.worst <= max(now.worst, self.threshold) and self._holds(m)]
+        best = min(good, key=lambda m: m.time)
+        return best if best.time < (1.0 - EQUAL) * now.time else None
+
+    @cached_property
+    def closer(self) -> Measured | None:
+        """As fast as now, and most accurate; None where now is within the threshold."""
+        now = self.now
+        good = [m for m in self._own if m.time <= (1.0 + EQUAL) * now.time and self._holds(m)]
+        best = min(good, key=lambda m: m.worst)
+        return best if best.worst < now.worst > self.threshold else None
+
+    @property
+    def front(self) -> list[Measured]:
+        """Settings that no other beats in both, the fastest first."""
+        kept: list[Measured] = []
+        for m in sorted(self._own, key=lambda m: (m.time, m.worst)):
+            if not kept or m.worst < kept[-1].worst:
+                kept.append(m)
+        return kept
+
+    @property
+    def lines(self) -> list[str]:
+        """What to copy, and how it did on the worlds that were held back."""
+        none = f"none of {len(self._own)} settings"
+        enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
+        closer = enough if self.now.worst <= self.threshold else none
+        said = []
+        for word, m, why in (
+            ("as accurate as now, faster", self.faster, none),
+            ("as fast as now, more accurate", self.closer, closer),
+        ):
+            if m is None:
+                said.append(f"{word}: {why}")
+                continue
+            held = next((h for h in self.held[1:] if h.setting == m.setting), None)
+            said += [
+                f"{m.setting.line}  <!-- {word} -->", f"    chosen on: {_beside(m, self.now)}",
+                f"    held back: {'not measured' if held is None else _beside(held, self.held[0])}",
+            ]  # fmt: skip
+        return said
+
+    def _table(self, some: Iterable[Measured]) -> Table:
+        rows = [
+            [
+                m.setting.line or "as it is", seconds(m.time), f"{m.time / self.now.time:.2f}", size(m.worst),
+                size(float(m.error.max())), size(m.worst_motion),
+            ]
+            for m in some
+        ]  # fmt: skip
+        heads = ["setting", "a step", "of now", "error 99 % [m/s]", "worst", f"motion after {self.ahead} [m]"]
+        return Table(heads, rows, words=frozenset({"setting"}))
+
+    @property
+    def figure(self) -> Figure:
+        """Error against time: every setting, the front, and what the model has."""
+
+        def curve(name: str, some: list[Measured], **more: Any) -> Curve:
+            notes = tuple(m.setting.line for m in some)
+            return replace(Curve.of(name, name, [(m.time, m.worst) for m in some], notes=notes), **more)
+
+        by = {s: [m for m in self._own if m.solver == s] for s in ITERATIONS}
+        parts = [curve(s, some, points=True) for s, some in by.items() if some]
+        parts += [curve("front", self.front), curve("as it is", [self.now], points=True)]
+        return Figure("time-and-error", Path(self.runs.model).name, "time of a step [s]",
+                      "error that 1 % of the steps exceed [m/s]", tuple(parts), x_log=True)  # fmt: skip
+
+    @property
+    def sheet(self) -> Sheet:
+        """The page."""
+        now = self.now
+        head = (
+            f"{Path(self.runs.model).name}: a step takes {seconds(now.time)}, and 1 % of the steps are more than "
+            f"{size(now.worst)} m/s off."
+        )
+        if self.closer is not None:
+            gain = times(now.worst / self.closer.worst) if self.closer.worst else "exact:"
+            head += f" In the same time it can be {gain} less."
+        other = [m for m in self.measured if m.setting.is_other]
+        shown = [now, *(m for m in self.front if m is not now)]
+        every = sorted(self.measured, key=lambda m: m.time)
+        return Sheet(
+            "lavender tune", head,
+            [
+                Part("Lines to copy", code=self.lines, note="Chosen on the even worlds, tried on the odd ones."),
+                Part("The front of time and error", [self._table(shown)], [self.figure], short=9),
+                Part("Other problems", [self._table(other)], short=4,
+                     note="A cone, impratio or noslip other than the model's: the error is that of its own problem."),
+                Part("Every setting", [self._table(every)], note="Without those with which a world flies apart."),
+            ],
+            {"model": self.runs.model, "lines": self.lines, "stopped": self.stopped,
+             "measured": [_told(m) for m in self.measured], "held": [_told(m) for m in self.held]},
+        )  # fmt: skip
+
+
+def _beside(m: Measured, now: Measured) -> str:
+    return f"{m.time / now.time:.2f} of the time, error {size(m.worst)} m/s beside {size(now.worst)}"
+
+
+def _told(m: Measured) -> dict[str, Any]:
+    return {"options": dict(m.setting.options), "seconds": m.time, "error": m.worst,
+            "worst": float(m.error.max()), "motion": m.worst_motion}  # fmt: skip
+
+
+def grid(mj: Any, model: Any) -> list[Setting]:
+    """What is tried first: each solver to each tolerance and for each number of iterations; then other problems."""
+    enough = max(100, int(model.opt.iterations))
+    tried: list[dict[str, Any]] = [{}]
+    for solver, budgets in ITERATIONS.items():
+        tried += [{"solver": solver, "iterations": enough, "tolerance": t} for t in TOLERANCES]
+        tried += [{"solver": solver, "iterations": n} for n in budgets]
+    tried += [{"cone": "pyramidal"}, {"cone": "elliptic"}, {"impratio": 1.0}, {"impratio": 10.0}]
+    tried += [{"noslip_iterations": n} for n in (0, 3, 10)]
+    return list(dict.fromkeys(Setting.of(mj, model, **x) for x in tried))
+
+
+def around(mj: Any, model: Any, setting: Setting) -> list[Setting]:
+    """A setting with another line search, and with J stored the other way."""
+    whole = dict(setting.options)
+    stored = "dense" if mj.mj_isSparse(model) else "sparse"
+    tried: list[dict[str, Any]] = [{"jacobian": stored}]
+    if whole.get("solver", _word(mj, model, "solver")) != "PGS":
+        tried += [{"ls_tolerance": x} for x in (0.1, 1e-3)] + [{"ls_iterations": n} for n in (5, 15, 50)]
+        tried += [{"jacobian": stored, "ls_tolerance": x} for x in (0.1, 1e-3)]
+    return [Setting.of(mj, model, **whole | x) for x in tried]
+
+
+def tune(
+    model: str | os.PathLike[str],
+    *,
+    worlds: int = 16,
+    steps: int = 200,
+    control: Control = "random",
+    seed: int = 0,
+    spread: float = 0.1,
+    ahead: int = 10,
+    rounds: int = 5,
+    threshold: float = ENOUGH,
+    watch: Callable[[Event], None] | None = None,
+) -> Tuning:
+    """Measure MuJoCo's settings on worlds of a model.
+
+    Parameters
+    ----------
+    model : path (MJCF)
+    worlds, steps, control, seed, spread : as `Runs`
+        Half of the worlds are held back; `steps` is a multiple of `ahead`.
+    ahead : int
+        Steps of a stretch.
+    rounds : int
+        In which settings are timed in turns.
+    threshold : float, m/s, m
+        Error, and distance, below which nobody asks for less.
+    watch : callable, optional
+        Told of what is done.
+
+    Returns
+    -------
+    Tuning
+        After Ctrl-C of what was done by then, `stopped`.
+
+    Raises
+    ------
+    InputError
+        A model that cannot be read, fewer than two worlds, or steps that `ahead` does not divide.
+    CapabilityError
+        An integrator whose problem is not of M.
+    """
+    own = {"worlds": whole_number("worlds", worlds, 2, None), "steps": steps}
+    runs = Runs(os.fspath(model), **own, control=control, seed=seed, spread=spread)
+    ahead, rounds = whole_number("ahead", ahead, 1, None), whole_number("rounds", rounds, 1, None)
+    threshold = number("threshold", threshold, low=0.0)
+    if steps % ahead:
+        raise InputError(f"steps is {steps} and ahead {ahead}; a multiple of it is needed")
+    mj, made = runs.load()
+    from_mujoco_many(made, np.zeros((0, made.nq + made.nv)))  # what it refuses is refused here
+    done = 0
+
+    def tell(what: str) -> None:
+        nonlocal done
+        done += 1
+        if watch is not None:
+            watch(Event(done, 0, what, ""))
+
+    measured: list[Measured] = []
+    held: list[Measured] = []
+
+    def found(stopped: bool) -> Tuning:
+        timed = [m for m in measured if np.isfinite(m.time)]
+        return Tuning(runs, ahead, timed, held, threshold=threshold, stopped=stopped)
+
+    def judge(stage: Stage, settings: list[Setting]) -> list[Measured]:
+        out = []
+        for setting in settings:
+            out.append(stage.measured(setting))
+            tell(setting.line or "as it is")
+        return out
+
+    try:
+        stage = Stage.of(mj, made, runs, range(0, worlds, 2), ahead)
+        measured += judge(stage, [Setting()])
+        if not np.isfinite(measured[0].error).all():
+            raise InputError(f"{runs.model}: these worlds fly apart with the model's own setting")
+        measured += judge(stage, grid(mj, made)[1:])
+        stage.time(measured, 1, tell)
+        near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
+        known = {m.setting for m in measured}
+        more = dict.fromkeys(x for s in [Setting(), *near] for x in around(mj, made, s) if x not in known)
+        measured += judge(stage, list(more))
+        stage.time(measured, rounds, tell)
+        chosen = found(False)
+        kept = [Setting(), *(m.setting for m in (chosen.faster, chosen.closer) if m is not None)]
+        stage = Stage.of(mj, made, runs, range(1, worlds, 2), ahead)
+        last = judge(stage, list(dict.fromkeys(kept)))
+        stage.time(last, 2 * rounds, tell)
+        held += last if np.isfinite(last[0].time) else []
+    except KeyboardInterrupt:
+        if not measured or not np.isfinite(measured[0].time):
+            raise
+        return found(True)
+    return found(False)

@@ -1,0 +1,150 @@
+"""Settings of MuJoCo beside each other: what is measured, what is chosen, and the line to copy."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from test_audit import EARLY, MODEL, model  # noqa: F401 - a fixture
+
+import lavender as lv
+from lavender.cli.tune import tune as command
+from lavender.lab import tune as module
+from lavender.lab.audit import audit
+from lavender.lab.tune import Measured, Setting, Stage, Tuning, grid, tune
+from lavender.lab.worlds import Runs
+
+mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
+
+
+def fewer(monkeypatch):
+    monkeypatch.setattr(module, "TOLERANCES", (1e-6, 1e-12))
+    monkeypatch.setattr(module, "ITERATIONS", {"Newton": (2,), "CG": (3, 25)})
+
+
+def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(model, monkeypatch):  # noqa: F811
+    fewer(monkeypatch)
+    path = model(EARLY)
+    found = tune(path, worlds=4, steps=30, rounds=1)
+    whole = audit(path, worlds=4, steps=30, workers=1).numbers[0]
+    assert found.measured[0].setting == Setting()
+    np.testing.assert_allclose(found.measured[0].error, whole[0::2].ravel(), rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(found.held[0].error, whole[1::2].ravel(), rtol=1e-6, atol=1e-12)
+    best = min(found.measured, key=lambda m: m.worst)
+    assert best.worst < 1e-6 < found.now.worst
+    assert best.worst_motion < 1e-6 < found.now.worst_motion
+    assert all(m.time > 0.0 for m in found.measured)
+
+
+def test_the_converged_run_does_not_move_away_from_itself(model):  # noqa: F811
+    runs = Runs(str(model()), 1, 20)
+    handle, made = runs.load()
+    stage = Stage.of(handle, made, runs, [0], 10)
+    same = stage.measured(Setting.of(handle, made, **module.CONVERGED))
+    assert same.motion.max() == 0.0 and same.worst < 1e-9
+
+
+@pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
+def test_a_line_means_in_a_model_what_was_measured(options):
+    plain = mj.MjModel.from_xml_string(MODEL.format(options=options))
+    for setting in [*grid(mj, plain), *module.around(mj, plain, Setting())]:
+        text = setting.line.removeprefix("<option").removesuffix("/>")
+        names = {name for name, _ in setting.options}
+        kept = " ".join(w for w in options.split() if w.partition("=")[0] not in names)
+        copied = mj.MjModel.from_xml_string(MODEL.format(options=f"{kept} {text}")).opt
+        tried = setting.on(mj, plain).opt
+        for name in (*module.OPTIONS, *module.OTHER):
+            assert getattr(copied, name) == getattr(tried, name), setting
+    assert Setting.of(mj, plain, iterations=int(plain.opt.iterations)).line == ""
+
+
+def measured(time, error, **options):
+    return Measured(Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), time)
+
+
+def chosen(*some, held=(), threshold=1e-6):
+    return Tuning(Runs("m.xml", 2, 10), 10, list(some), list(held), threshold)
+
+
+def test_what_is_chosen():
+    now = measured(10.0, 1e-3)
+    quick, loose = measured(8.0, 1e-3, iterations=9), measured(2.0, 1e-1, iterations=1)
+    exact, slow = measured(10.2, 1e-5, tolerance=1e-9), measured(20.0, 1e-9, tolerance=1e-15)
+    other = measured(1.0, 0.0, cone="elliptic")
+    found = chosen(now, quick, loose, exact, slow, other)
+    assert found.faster is quick and found.closer is exact
+    assert found.front == [loose, quick, exact, slow]
+    assert '<option iterations="9"/>' in found.lines[0]
+
+
+def test_noise_is_no_gain_and_what_is_within_the_threshold_is_enough():
+    now, noise = measured(10.0, 1e-9), measured(9.8, 1e-9, iterations=9)
+    found = chosen(now, noise, measured(10.0, 1e-12, tolerance=1e-12))
+    assert found.faster is None and found.closer is None
+    assert "not needed" in found.lines[1]
+    loose = measured(5.0, 1e-7, tolerance=1e-4)
+    assert chosen(now, loose).faster is loose  # further off than now, and no further than anybody asks
+    rare = measured(5.0, 1e-10, tolerance=1e-4)
+    rare.error[0] = 1.0  # one step in a hundred: below the quantile, not below the worst
+    assert chosen(now, rare).faster is None
+    astray = measured(5.0, 1e-10, tolerance=1e-4)
+    astray.motion[:] = 1e-3  # its answers are right, and the bodies elsewhere
+    assert chosen(now, astray).faster is None
+
+
+def test_both_sides_of_the_choice_are_printed():
+    now, quick = measured(10.0, 1e-3), measured(8.0, 1e-3, iterations=9)
+    held = [measured(10.0, 2e-3), measured(11.0, 3e-3, iterations=9)]
+    lines = chosen(now, quick, held=held).lines
+    assert "0.80 of the time, error 1.0e-3" in lines[1]
+    assert "1.10 of the time, error 3.0e-3 m/s beside 2.0e-3" in lines[2]
+
+
+def test_ctrl_c_keeps_what_there_is(model, monkeypatch):  # noqa: F811
+    fewer(monkeypatch)
+
+    def watch(event):
+        if event.case == "timed":
+            seen.append(event)
+            if len(seen) == 5:
+                raise KeyboardInterrupt
+
+    seen = []
+    found = tune(model(EARLY), worlds=2, steps=10, rounds=1, watch=watch)
+    assert found.stopped and len(found.measured) == 5 and not found.held
+    assert "not measured" in "".join(found.lines) or found.faster is found.closer is None
+
+
+def test_the_command_prints_a_page_and_few_lines(model, tmp_path, monkeypatch):  # noqa: F811
+    fewer(monkeypatch)
+    words = ["--worlds", "2", "--steps", "20", "--rounds", "1", "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(command, [str(model(EARLY)), *words])
+    assert done.exit_code == 0, done.output
+    assert len(done.output.splitlines()) <= 25
+    assert "held back" in done.output
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert "&lt;option" in page and "<svg" in page
+    assert (tmp_path / "out" / "figures" / "time-and-error.png").is_file()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"), [({"worlds": 1}, "worlds"), ({"steps": 15}, "ahead"), ({"rounds": 0}, "rounds")]
+)
+def test_bad_words_are_told(model, given, words):  # noqa: F811
+    with pytest.raises(lv.InputError, match=words):
+        tune(model(), **{"worlds": 2, "steps": 20} | given)
+
+
+def test_a_setting_with_which_mujoco_ends_in_an_error_is_left_out(model, monkeypatch):  # noqa: F811
+    fewer(monkeypatch)
+    run = Stage.run
+
+    def dies(self, model, states=None):
+        if model.opt.iterations == 25:
+            raise mj.FatalError("out of memory")
+        return run(self, model, states)
+
+    monkeypatch.setattr(Stage, "run", dies)
+    found = tune(model(), worlds=2, steps=10, rounds=1)
+    assert not any(dict(m.setting.options).get("iterations") == 25 for m in found.measured)
+    monkeypatch.setattr(Stage, "measured", lambda self, setting: measured(np.inf, np.inf))
+    with pytest.raises(lv.InputError, match="fly apart"):
+        tune(model(), worlds=2, steps=10, rounds=1)
