@@ -70,8 +70,6 @@ def robots(models: tuple[str, ...], steps: int) -> Iterator[lv.Problem]:
 
 def sources(draws: int, steps: int, models: tuple[str, ...]) -> Iterator[tuple[str, lv.Problem]]:
     """(source, problem) of at most ROWS rows."""
-    import benchmarks.drawn.wild  # noqa: F401 - registers the family
-
     for seed in range(draws):
         problem = suite.case(DRAWS.format(seed)).problem
         if 0 < problem.m <= ROWS:

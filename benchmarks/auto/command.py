@@ -9,7 +9,6 @@ from pathlib import Path
 
 import click
 
-import benchmarks.drawn  # noqa: F401 - makes them families of the suite
 from benchmarks.auto.record import Record, as_line, read, records
 from benchmarks.auto.replay import RULES, fit, regrets, summary
 from benchmarks.output import out_option

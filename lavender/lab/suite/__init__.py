@@ -7,7 +7,7 @@ case = suite.pyramid(k=10, mass_ratio=1e6)
 case = suite.case("pyramid(k=10, mass_ratio=1e6)")      # the same by name
 case.problem, case.reason, case.reference, case.expect
 suite.families()                                        # every family with its parameters
-suite.cases("default"), suite.cases("hard")             # sets, or a single name
+suite.cases("default"), suite.cases("@hard")            # sets, or a single name
 ```
 """
 
@@ -30,6 +30,8 @@ from lavender.lab.suite.families import (
     toy_stack,
     two_particles,
 )
+from lavender.lab.suite.lots import drawn, wild
+from lavender.lab.suite.steps import engine_step, walking
 
 __all__ = [
     "FAMILIES",
@@ -42,6 +44,8 @@ __all__ = [
     "cases",
     "chain",
     "default",
+    "drawn",
+    "engine_step",
     "families",
     "friction",
     "granular",
@@ -53,6 +57,8 @@ __all__ = [
     "stack",
     "toy_stack",
     "two_particles",
+    "walking",
+    "wild",
 ]
 
 #: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that
@@ -78,6 +84,17 @@ SETS: dict[str, tuple[str, ...]] = {
         "granular(n=4, friction=cone)",
     ),
     "hard": hard.SET,
+    "drawn": (
+        *(f"wild(seed={i}, rows=600)" for i in range(24)),
+        *(f"drawn_judged(seed={i}, rows=600)" for i in range(24)),
+    ),
+    "rolling": tuple(f"drawn_rolling(seed={i}, rows=300)" for i in range(12)),
+    "engine": tuple(
+        f"engine_step(scene={scene}, at={at})"
+        for scene in ("stack", "pyramid", "bridge", "four_bar", "heavy_on_light", "table")
+        for at in (3, 30)
+    ),
+    "walking": tuple(f"walking(seed={i})" for i in range(12)),
 }
 
 
@@ -107,15 +124,18 @@ def case(text: str) -> Case:
 
 
 def cases(text: str) -> Iterator[Case]:
-    """The cases of a set ("default", "hard"), or the one case of that name; made one by one.
+    """The cases of a set ("default", "@hard"), or the one case of that name; made one by one.
 
     Raises
     ------
     UnknownName, InputError
         As `case`, at once.
     """
-    if text in SETS:
-        return (case(name) for name in SETS[text])
+    name = text.removeprefix("@")
+    if text.startswith("@") and name not in SETS:
+        raise UnknownName("set of cases", name, SETS)
+    if name in SETS:
+        return (case(one) for one in SETS[name])
     return iter([case(text)])
 
 

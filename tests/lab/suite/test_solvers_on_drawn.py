@@ -1,4 +1,4 @@
-"""Solvers on problems of structures drawn by lot (`benchmarks.drawn`)."""
+"""Solvers on problems of structures drawn by lot (`lavender.lab.suite.lots`)."""
 
 import re
 from dataclasses import replace
@@ -10,8 +10,8 @@ from calls import REACHED, check, driven, facts
 from random_problems import as_matrix, good
 
 import lavender as lv
-from benchmarks.drawn import wild
 from lavender import registry
+from lavender.lab.suite.lots import wild
 from lavender.solvers.certify import certify
 from lavender.solvers.newton_systems import general, systems
 from lavender.solvers.newton_systems.systems import make_system

@@ -9,11 +9,11 @@ from random_problems import random_lcp
 from random_trees import random_general
 
 import lavender as lv
-from benchmarks.drawn import wild
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference
 from lavender.lab.suite.build import Bodies, Contacts, contact_problem
+from lavender.lab.suite.lots import wild
 from lavender.problem import OPERATORS
 from lavender.solvers import costs
 from lavender.solvers.auto import LAST, MOST, SHARE, Stage, Tree, solve

@@ -17,7 +17,11 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
-from benchmarks.drawn.wild import (
+from lavender.base.errors import UnknownName
+from lavender.lab.suite.build import Bodies, Contacts, sideways
+from lavender.lab.suite.case import Draft, family
+from lavender.lab.suite.families import BOX, SPHERE, at_least
+from lavender.lab.suite.lots.wild import (
     FORMS,
     LARGEST_DENSE,
     LAWS,
@@ -30,10 +34,6 @@ from benchmarks.drawn.wild import (
     on_floor,
     problem_of,
 )
-from lavender.base.errors import UnknownName
-from lavender.lab.suite.build import Bodies, Contacts, sideways
-from lavender.lab.suite.case import Draft, family
-from lavender.lab.suite.families import BOX, SPHERE, at_least
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 

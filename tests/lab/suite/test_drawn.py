@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from benchmarks import drawn
-from benchmarks.drawn.wild import FORMS, LAWS, MASSES, STRUCTURES
 from lavender import suite
 from lavender.base.errors import UnknownName
+from lavender.lab.suite import lots as drawn
+from lavender.lab.suite.lots.wild import FORMS, LAWS, MASSES, STRUCTURES
 
 SEEDS = range(400)
 LOTS = ("drawn",)  # families half of whose structures are for judging
@@ -17,7 +17,7 @@ LOTS = ("drawn",)  # families half of whose structures are for judging
 
 def family(name):
     """Its function, and the module with its structures and lot."""
-    return getattr(drawn, name), import_module(f"benchmarks.drawn.{name}")
+    return getattr(drawn, name), import_module(f"lavender.lab.suite.lots.{name}")
 
 
 @pytest.fixture(scope="module", params=drawn.__all__)

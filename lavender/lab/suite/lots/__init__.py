@@ -6,7 +6,7 @@
 A seed gives the same bits in every version: published figures name their seeds.
 """
 
-from benchmarks.drawn.drawn import drawn
-from benchmarks.drawn.wild import wild
+from lavender.lab.suite.lots.drawn import drawn
+from lavender.lab.suite.lots.wild import wild
 
 __all__ = ["drawn", "wild"]
