@@ -27,11 +27,11 @@ import click
 import numpy as np
 
 import lavender as lv
-from benchmarks import drawn
 from benchmarks.made import forms
 from benchmarks.output import markdown, out_option, write_json
 from lavender import suite
 from lavender.judge.residuals import nothing_to_do
+from lavender.lab.suite import lots
 from lavender.problem import Problem
 from lavender.sim.scene.gallery import SCENES
 from lavender.solvers import newton
@@ -141,10 +141,10 @@ PARTS: dict[str, Part] = {
 def problems(args: Asked) -> Iterator[tuple[str, Problem]]:
     """Name and problem of all that is asked for."""
     for name in args.sets:
-        if name in drawn.__all__:
+        if name in lots.__all__:
             first, last = map(int, args.seeds.split(":"))
             for seed in range(first, last):
-                yield f"{name}({seed})", getattr(drawn, name)(seed=seed, rows=args.rows).problem
+                yield f"{name}({seed})", getattr(lots, name)(seed=seed, rows=args.rows).problem
         elif name == "scenes":
             for scene in SCENES:
                 simulation = lv.Simulation(lv.Scene(scene, solver="newton"))

@@ -20,8 +20,8 @@ __all__ = ["cli", "main"]
 #: Name -> the module that has the command.
 COMMANDS = {
     name: f"lavender.cli.{name}"
-    for name in ("audit", "bench", "cases", "check", "doctor", "explain", "export", "phenomena", "prove", "record",
-                 "reference", "report", "run", "solve", "solvers", "tune")
+    for name in ("audit", "bench", "cases", "check", "doctor", "explain", "export", "phenomena", "problems", "prove",
+                 "record", "reference", "report", "run", "solve", "solvers", "tune")
 } | dict.fromkeys(("view", "web"), "lavender.sim.web.command")  # fmt: skip
 
 

@@ -20,7 +20,6 @@ import copy
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -39,6 +38,7 @@ from lavender.lab.report.sheet import Part, Sheet
 from lavender.lab.report.table import Table
 from lavender.lab.report.text import seconds, size, times
 from lavender.lab.worlds import Runs, flew_apart, states_of
+from lavender.problem.derived import cached_property
 from lavender.solving.many import residual_many
 
 __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]

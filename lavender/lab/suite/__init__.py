@@ -17,7 +17,7 @@ from collections.abc import Iterator
 
 from lavender.base.errors import UnknownName
 from lavender.lab.suite import friction, hard
-from lavender.lab.suite.case import FAMILIES, Case, Reference, parse, spell
+from lavender.lab.suite.case import FAMILIES, MAX_SIZE, Case, Reference, parse, spell
 from lavender.lab.suite.families import (
     box_stack,
     boxed_friction,
@@ -35,6 +35,7 @@ from lavender.lab.suite.steps import engine_step, walking
 
 __all__ = [
     "FAMILIES",
+    "MAX_SIZE",
     "SETS",
     "Case",
     "Reference",

@@ -37,7 +37,7 @@ def engine_step(scene: str = "pyramid", at: int = 30) -> Draft:
 def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1, seed: int = 0) -> Draft:
     """Predictive control of a walk: n jerks of the centre of mass that keep the pressure inside of the feet.
 
-    min 1/2 |z - z_ref|^2 + 1/2 1e-6 |u|^2 over jerks u [m/s^3], z = c - (height/g) c'' the centre of pressure [m], in
+    min 1/2 |z - z_ref|^2 + 1/2 1e-4 |u|^2 over jerks u [m/s^3], z = c - (height/g) c'' the centre of pressure [m], in
     the foot of each instant: 2 n bounded rows over n variables (P.-B. Wieber 2006, Humanoids, 137-142, eqs. 7-10).
     """
     at_least(1, n=n)
@@ -54,7 +54,7 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
         free[k], by_jerk[k] = pressure @ state, pressure @ ways
     middle = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
     problem = Problem.from_qp(
-        by_jerk.T @ by_jerk + 1e-6 * np.eye(n),
+        by_jerk.T @ by_jerk + 1e-4 * np.eye(n),
         by_jerk.T @ (free - middle),
         G=np.vstack([by_jerk, -by_jerk]),
         h=np.concatenate([middle + 0.5 * foot - free, free - middle + 0.5 * foot]),

@@ -12,6 +12,7 @@ Which structures are for judging was drawn by lot, below: rates and lines of the
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -339,9 +340,10 @@ def drawn(seed: int = 0, rows: int = 3000, part: str = "all") -> Draft:
     if rolls:
         law, form = str(rng.choice(LAWS[1:3])), "rows"
         made = problem_of(rng, world, bodies, law).rows
-        more = {"tangents": 2, "rolling": 10.0 ** rng.uniform(-3.0, -1.0), "friction": law}
-        spin = {"patch_radius": 0.02} if rng.random() < 0.5 else {}
-        problem = Problem.from_rows(made, mu=rng.uniform(0.2, 0.9), **more, **spin)
+        assert made is not None
+        more: dict[str, Any] = {"tangents": 2, "rolling": 10.0 ** rng.uniform(-3.0, -1.0), "friction": law}
+        more |= {"patch_radius": 0.02} if rng.random() < 0.5 else {}
+        problem = Problem.from_rows(made, mu=rng.uniform(0.2, 0.9), **more)
     else:
         problem, form = given_as(rng, problem_of(rng, world, bodies, law, soft), form)
     return Draft(problem, f"{name}, masses {masses}, friction {law}, given as {form}: drawn, not chosen")

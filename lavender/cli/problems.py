@@ -1,0 +1,92 @@
+"""`lavender problems`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lavender.cli.options import EXIT_UNMET, console, one_thread
+
+__all__ = ["problems"]
+
+
+@click.command()
+@click.argument("groups", nargs=-1, metavar="[@SET]...")
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), help="Write every problem as a file here."
+)
+@click.option(
+    "--check", is_flag=True, help="Make every problem again and compare its numbers with the manifest."
+)
+@click.option(
+    "--secret", help="Problems drawn by seeds of this word instead: whoever knows it makes the same."
+)
+@click.option("--count", default=50, show_default=True, help="How many a secret draws.")
+@click.option(
+    "--certify",
+    type=click.Path(dir_okay=False, path_type=Path),
+    help="Prove what can be proved of each and write this manifest: minutes, with the extra `proof`.",
+)
+@click.option(
+    "--page", type=click.Path(dir_okay=False, path_type=Path), help="Write the catalogue as markdown."
+)
+def problems(
+    groups: tuple[str, ...],
+    out: Path | None,
+    check: bool,
+    secret: str | None,
+    count: int,
+    certify: Path | None,
+    page: Path | None,
+) -> None:
+    """List, make or check the problem set: names, numbers, and what is proved of each solution.
+
+    Without an option, a line for each problem of the named sets; all sets if none is named.
+
+    Exit code 1: a problem has other numbers than the manifest says.
+    """
+    from lavender.lab import collection, suite
+    from lavender.lab.bench.record import file_name
+
+    one_thread()
+    names = [group.removeprefix("@") for group in groups]
+    for name in names:
+        suite.cases(f"@{name}")  # an unknown set is refused first
+    if certify is not None:
+        made = []
+        for entry, _ in collection.entries(names):
+            click.echo(f"{entry.name}: {entry.known}{'; ' if entry.reason else ''}{entry.reason}")
+            made.append(entry)
+        collection.save(made, certify)
+        return
+    if secret is not None:
+        chosen = collection.hidden(secret, count)
+    else:
+        found = [e for e in collection.load() if not names or e.group in names]
+        chosen = [e.name for e in found]
+        if page is not None:
+            page.write_text(collection.page(found), encoding="utf-8")
+        if check:
+            wrong = list(collection.changed(found))
+            for line in wrong:
+                click.echo(line)
+            click.echo(f"{len(found) - len(wrong)} of {len(found)} problems are the same")
+            if wrong:
+                raise click.exceptions.Exit(EXIT_UNMET)
+            return
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for name in chosen:
+            (case,) = suite.cases(name)
+            case.problem.save(out / f"{file_name(name)}.npz")
+        click.echo(f"{len(chosen)} problems in {out}")
+    elif secret is not None:
+        click.echo("\n".join(chosen))
+    elif page is None:
+        to = console()
+        for e in found:
+            tell = f"enclosed within {e.radius:.1e} m/s" if e.radius is not None else e.known
+            more = ", one motion" if e.unique else f", at least {e.motions} motions" if e.motions > 1 else ""
+            line = f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {tell}{more}"
+            to.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,223 @@
+"""A problem set that others can cite: the sets of the suite, and what is known of each problem's solution.
+
+    enclosed    an exact solution is proved to lie within `radius` m/s of an answer (`lavender.prove`)
+    infeasible  a certificate that there is none, checked by the judge
+    open        neither: `reason` says what is in the way
+
+`manifest.json` beside this file has a line for each problem; its `sha` is of all numbers, so that anybody can make the
+problem from its name and see that it is the same. A hidden set is drawn by seeds that a secret gives: whoever is told
+the secret after a comparison makes the same problems.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lavender.base.errors import CapabilityError, InputError
+from lavender.judge.solution import Status
+from lavender.lab import suite
+from lavender.lab.bench.cases import fingerprint
+from lavender.lab.motion import motions
+from lavender.lab.proof import prove
+from lavender.problem import Problem
+from lavender.solving.solve import solve
+
+__all__ = [
+    "MANIFEST",
+    "Entry",
+    "certified",
+    "changed",
+    "difficulty",
+    "entries",
+    "hidden",
+    "load",
+    "page",
+    "save",
+]
+
+MANIFEST = Path(__file__).with_name("manifest.json")
+PROVED = 1000  # rows up to which a proof is tried, seconds to a minute each
+SEARCHED = 60  # rows under Coulomb's law up to which other motions are looked for
+SWEEPS = 10_000  # of PGS, at most
+SECONDS = 30.0  # of `auto`, to the answer that a proof begins from
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One problem of the set and what is known of it."""
+
+    name: str
+    group: str
+    sha: str  # of its numbers
+    rows: int
+    law: str
+    form: str  # rows (bodies), matrix, generalized (J and M)
+    sweeps: int | None = (
+        None  # of PGS to 1e-3 of doing nothing; None: not within 10,000, or it does not take the problem
+    )
+    known: str = "open"  # enclosed, infeasible or open
+    radius: float | None = None  # m/s, of every row of the enclosed solution
+    unique: bool = False  # proved to be the only motion
+    motions: int = 0  # found, at least; 0: not looked for
+    apart: float | None = None  # m/s between two of them
+    reason: str = ""
+
+
+def certified(problem: Problem, name: str, group: str) -> Entry:
+    """The entry of a problem, with a proof or a certificate where there is one. Needs the extra `proof`."""
+    entry = Entry(
+        name=name,
+        group=group,
+        sha=fingerprint(problem),
+        rows=problem.m,
+        law=problem.law,
+        form=problem.operator,
+        sweeps=difficulty(problem),
+    )
+    told = asdict(entry)
+    if problem.m > PROVED:
+        return Entry(**told | {"reason": f"more than {PROVED} rows: not tried"})
+    answer = solve(problem, "auto", tol=1e-12, time_limit=SECONDS)
+    if answer.status is Status.INFEASIBLE:
+        return Entry(**told | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
+    try:
+        found = prove(problem, answer)
+    except CapabilityError as error:
+        return Entry(**told | {"reason": str(error)})
+    told |= {"reason": found.reason, "unique": found.unique}
+    if found.proven:
+        told |= {"known": "enclosed", "radius": found.velocity_radius}
+    if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:
+        several = motions(problem.disk)
+        told |= {"motions": len(several), "apart": several.spread, "unique": bool(several.unique)}
+    return Entry(**told)
+
+
+def difficulty(problem: Problem) -> int | None:
+    """Sweeps that `pgs` takes to a thousandth of the error of doing nothing, `Entry.sweeps`."""
+    try:
+        found = solve(problem, "pgs", tol=1e-3, max_iter=SWEEPS)
+    except CapabilityError:
+        return None
+    return found.iterations if found.success else None
+
+
+def hidden(secret: str, count: int) -> list[str]:
+    """Names of `count` problems drawn by seeds of SHA-256 over the secret and a number.
+
+    Raises
+    ------
+    InputError
+        An empty secret, or a count below 1.
+    """
+    if not secret or count < 1:
+        raise InputError(f"secret is {secret!r} and count {count}; a word and at least 1 are needed")
+    seeds = [
+        int.from_bytes(hashlib.sha256(f"{secret}/{i}".encode()).digest()[:4], "big") % suite.MAX_SIZE
+        for i in range(count)
+    ]
+    families = ("wild", "drawn", "drawn_rolling")
+    return [f"{families[i % 3]}(seed={seed}, rows=3000)" for i, seed in enumerate(seeds)]
+
+
+def entries(
+    groups: Iterable[str], make: Callable[[Problem, str, str], Entry] = certified
+) -> Iterator[tuple[Entry, Problem]]:
+    """Every problem of these sets, with its entry by `make`; all sets if none is named."""
+    for group in [g.removeprefix("@") for g in groups] or suite.SETS:
+        for case in suite.cases(f"@{group}"):
+            yield make(case.problem, case.name, group), case.problem
+
+
+def save(found: Iterable[Entry], path: Path | str) -> None:
+    """Write a manifest."""
+    usual = {f.name: f.default for f in fields(Entry)}
+    lines = [{k: v for k, v in asdict(e).items() if v != usual[k]} for e in found]
+    text = ",\n ".join(json.dumps(line, ensure_ascii=False) for line in lines)
+    Path(path).write_text(f"[{text}]\n", encoding="utf-8")
+
+
+def load(path: Path | str = MANIFEST) -> list[Entry]:
+    """Read a manifest.
+
+    Raises
+    ------
+    InputError
+        Not a manifest, with what is wrong.
+    """
+    known = {f.name for f in fields(Entry)}
+    try:
+        lines: list[dict[str, Any]] = json.loads(Path(path).read_text(encoding="utf-8"))
+        return [Entry(**{k: v for k, v in line.items() if k in known}) for line in lines]
+    except (OSError, ValueError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is no manifest of problems: {error}") from None
+
+
+def changed(found: Iterable[Entry]) -> Iterator[str]:
+    """Make every problem again by its name; a line for each that has other numbers."""
+    for entry in found:
+        (case,) = suite.cases(entry.name)
+        if (now := fingerprint(case.problem)) != entry.sha:
+            yield f"{entry.name}: {now} here, {entry.sha} in the manifest"
+
+
+def page(found: list[Entry]) -> str:
+    """The catalogue: what is known of how many, and the problems that have no solution, several, or none known."""
+    count = Counter(e.known for e in found)
+    radius = max((e.radius for e in found if e.radius is not None), default=0.0)
+    unique = sum(e.unique for e in found)
+    first = (
+        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
+        f"within {radius:.0e} m/s of a known answer; for {unique} no other motion exists; {count['infeasible']} have "
+        "no solution, with a certificate."
+    )
+    how = (
+        "`lavender problems` makes them from their names, `lavender problems --check` compares every number with "
+        "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page."
+    )
+    columns = (
+        "Rows from the least to the most; sweeps of PGS to a thousandth of the error of doing nothing, in the median "
+        f"({SWEEPS:,} where it does not get there or does not take the problem); problems by law; and what is known. "
+        "Open are problems on the border of two states, where no proof by signs exists, and those of more than "
+        f"{PROVED:,} rows, which were not tried."
+    )
+    laws = sorted({e.law for e in found})
+    out = [
+        "# Catalogue",
+        first,
+        how,
+        columns,
+        "| set | problems | rows | sweeps | "
+        + " | ".join(laws)
+        + " | enclosed | one motion | infeasible | open |",
+        "|---|---|---|---|" + "---|" * (len(laws) + 4),
+    ]
+    for group in dict.fromkeys(e.group for e in found):
+        own = [e for e in found if e.group == group]
+        cells = [f"`@{group}`", len(own), f"{min(e.rows for e in own)} to {max(e.rows for e in own)}"]
+        cells.append(f"{np.median([SWEEPS if e.sweeps is None else e.sweeps for e in own]):.0f}")
+        cells += [sum(e.law == law for e in own) for law in laws]
+        cells += [sum(e.known == "enclosed" for e in own), sum(e.unique for e in own)]
+        cells += [sum(e.known == known for e in own) for known in ("infeasible", "open")]
+        out.append("| " + " | ".join(map(str, cells)) + " |")
+    several = [e for e in found if e.motions > 1]
+    for title, chosen, tell in (
+        ("No solution", [e for e in found if e.known == "infeasible"], lambda e: e.reason),
+        ("Several motions", several, lambda e: f"at least {e.motions}, up to {e.apart:.1e} m/s apart"),
+        ("Open", [e for e in found if e.known == "open"], lambda e: e.reason),
+    ):
+        out += [
+            f"## {title}",
+            f"{len(chosen)} problems." if not chosen else "| problem | rows | |\n|---|---|---|",
+        ]
+        out += [f"| `{e.name}` | {e.rows} | {tell(e)} |" for e in chosen]
+    text = "\n\n".join(out)
+    return text.replace(" |\n\n|", " |\n|").replace("|\n\n| `", "|\n| `") + "\n"

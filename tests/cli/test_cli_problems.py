@@ -1,0 +1,39 @@
+"""`lavender problems`."""
+
+from dataclasses import replace
+
+import lavender as lv
+from lavender.lab import collection
+
+
+def test_a_set_is_listed_written_and_checked(lavender, tmp_path, monkeypatch):
+    code, out, _ = lavender("problems", "@walking")
+    assert code == 0 and out.count("@walking walking(seed=") == out.count("enclosed within") == 12
+    code, out, _ = lavender("problems", "@walking", "--out", tmp_path / "set")
+    files = sorted((tmp_path / "set").glob("*.npz"))
+    assert code == 0 and len(files) == 12 and "12 problems" in out
+    names = {lv.load(path).name for path in files}
+    assert names == {e.name for e in collection.load() if e.group == "walking"}
+    assert lavender("problems", "@walking", "--check")[:2] == (0, "12 of 12 problems are the same\n")
+
+    first, *rest = (e for e in collection.load() if e.group == "walking")
+    collection.save([replace(first, sha="0" * 16), *rest], tmp_path / "other.json")
+    changed = collection.load(tmp_path / "other.json")
+    monkeypatch.setattr(collection, "load", lambda: changed)
+    code, out, _ = lavender("problems", "--check")
+    assert code == 1 and out.startswith(first.name) and "11 of 12" in out
+
+
+def test_who_knows_the_secret_makes_the_same(lavender, tmp_path):
+    code, out, _ = lavender("problems", "--secret", "apple", "--count", 3)
+    assert (code, out.split("\n")[:-1]) == (0, collection.hidden("apple", 3))
+    assert lavender("problems", "--secret", "apple", "--count", 2, "--out", tmp_path / "a")[0] == 0
+    assert len(list((tmp_path / "a").iterdir())) == 2
+    assert lavender("problems", "@nobody")[0] == 2
+
+
+def test_a_manifest_is_made_with_proofs(lavender, tmp_path, monkeypatch):
+    monkeypatch.setattr(collection.suite, "SETS", {"walking": ("walking(n=4)", "walking(n=5)")})
+    code, out, _ = lavender("problems", "@walking", "--certify", tmp_path / "m.json")
+    assert code == 0 and out.count(": enclosed") == 2
+    assert [e.rows for e in collection.load(tmp_path / "m.json")] == [8, 10]

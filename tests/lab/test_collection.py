@@ -1,0 +1,78 @@
+"""The problem set: made again by its names with the same numbers, and what its manifest says is so."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import lavender as lv
+from lavender import suite
+from lavender.lab import collection
+from lavender.lab.bench.cases import resolve
+
+ENTRIES = collection.load()
+
+
+def test_the_manifest_has_every_problem_of_every_set_in_order():
+    assert [e.name for e in ENTRIES] == [suite.case(n).name for names in suite.SETS.values() for n in names]
+
+
+@pytest.mark.parametrize("start", range(5))
+def test_problems_are_made_again_with_the_same_numbers(start):
+    chosen = [e for e in ENTRIES[start::15] if e.rows < 2000]
+    assert list(collection.changed(chosen)) == []
+    wrong = replace(chosen[0], sha="0" * 16)
+    (line,) = collection.changed([wrong])
+    assert wrong.name in line and wrong.sha in line
+
+
+@pytest.mark.parametrize("entry", [e for e in ENTRIES if e.rows <= 40][::6], ids=lambda e: e.name)
+def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
+    pytest.importorskip("flint")
+    (case,) = suite.cases(entry.name)
+    found = collection.certified(case.problem, entry.name, entry.group)
+    assert (found.known, found.unique, found.sweeps) == (entry.known, entry.unique, entry.sweeps)
+    # An answer ends where the floor of another BLAS lets it.
+    assert found.radius is None or found.radius <= max(100.0 * entry.radius, 1e-9)
+
+
+def test_the_page_is_that_of_the_manifest():
+    text = (Path(__file__).resolve().parents[2] / "docs" / "catalogue.md").read_text(encoding="utf-8")
+    assert text == collection.page(ENTRIES)
+
+
+def test_a_manifest_comes_back_as_it_was_written(tmp_path):
+    collection.save(ENTRIES, tmp_path / "m.json")
+    assert collection.load(tmp_path / "m.json") == ENTRIES
+    for text in ("{", "[1]", '[{"name": "x"}]'):
+        (tmp_path / "m.json").write_text(text)
+        with pytest.raises(lv.InputError, match="no manifest"):
+            collection.load(tmp_path / "m.json")
+
+
+def test_a_secret_draws_the_same_problems_and_another_word_others():
+    names = collection.hidden("apple", 6)
+    assert collection.hidden("apple", 9)[:6] == names
+    assert not set(names) & set(collection.hidden("pear", 6))
+    assert all(suite.case(name).problem.m > 0 for name in names)
+    for bad in (("", 3), ("apple", 0)):
+        with pytest.raises(lv.InputError, match="at least 1"):
+            collection.hidden(*bad)
+
+
+def test_a_set_is_named_by_its_sign_wherever_cases_are():
+    assert [item.name for item in resolve("@walking")] == [e.name for e in ENTRIES if e.group == "walking"]
+    with pytest.raises(lv.UnknownName, match=r"unknown set .*did you mean .walking"):
+        resolve("@walkin")
+
+
+def test_walking_is_the_quadratic_program_that_it_says():
+    """A foot so wide that nothing binds is the program without rows; in the usual ones pressures are at the rim."""
+    wide = suite.walking(foot=1e3).problem
+    q = wide.qp.q
+    np.testing.assert_allclose(wide.generalized.mass @ lv.solve_qp(wide).x, -q, atol=1e-9 * np.abs(q).max())
+    for seed in range(4):
+        found = lv.solve_qp(suite.walking(seed=seed).problem, tol=1e-10)
+        assert found.solution.success
+        assert 0 < np.count_nonzero(found.z > 1e-9) < 16
