@@ -3,35 +3,54 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
 
+if TYPE_CHECKING:
+    from lavender.base.arrays import FloatArray
+    from lavender.problem import Problem
+
 __all__ = ["reference"]
 
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILES | FOLDERS...")
-def reference(files: tuple[str, ...]) -> None:
+@click.option(
+    "--prove", "proven", is_flag=True, help="Only exact solutions that are enclosed with proof, rounded."
+)
+def reference(files: tuple[str, ...], proven: bool) -> None:
     """Solve each problem to the floor and write the solution beside its file.
 
     `lavender report --motion` then uses pile.npz.reference instead of solving pile.npz again. The content of such a
-    file is judged before it is used.
+    file is judged before it is used. With `--prove` (extra `proof`) motion errors are then those to an exact solution,
+    which owes nothing to any solver.
 
-    Exits with 1 when nothing solves a problem, or a file met in a folder cannot be read.
+    Exits with 1 when nothing solves a problem or proves a solution, or a file met in a folder cannot be read.
     """
     from lavender.lab import bench, motion
+    from lavender.lab.proof import prove, require
+
+    def enclosed(problem: Problem) -> tuple[FloatArray, str]:
+        found = prove(problem.disk, motion.reference(problem.disk).impulse)
+        if found.impulse is None:
+            raise InputError(f"not proven: {found.reason}")
+        return found.impulse, f"proof: an exact solution within {found.velocity_radius:.1e} m/s"
 
     one_thread()
+    if proven:
+        require()
     out = console()
     unmet = missing = 0
     for item in bench.resolve(files):
         try:
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is no file; a reference is written beside one")
-            written = motion.save_reference(item.problem, item.source)
+            exact = enclosed(item.problem) if proven else ()
+            written = motion.save_reference(item.problem, item.source, *exact)
             told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
             with going_on():
                 out.print(told, highlight=False, markup=False, soft_wrap=True)

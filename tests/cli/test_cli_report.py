@@ -173,6 +173,28 @@ def test_references_are_written_beside_files_and_used(tmp_path, monkeypatch, cap
     assert used[0].accepted
 
 
+def test_a_proven_reference_is_what_a_report_measures_motions_from(tmp_path, capsys):
+    pytest.importorskip("flint")
+    path = tmp_path / "pile.npz"
+    lv.suite.case("stack(n=8)").problem.save(path)
+    with pytest.raises(SystemExit) as end:
+        main(["reference", "--prove", str(path)])
+    assert end.value.code == 0
+    assert "proof: an exact solution within" in capsys.readouterr().out
+    found = lv.motion.load_reference(lv.load(path), path)
+    assert found.solver.startswith("proof") and found.residual.at_floor
+    plan = bench.Plan(levels=(1e-3, 1e-9), budgets=(), repeats=1, orders=(), motion=True)
+    coarse, fine = (r.motion for r in bench.run([path], ["pgs"], plan))
+    assert 0.0 < fine < 1e-3 * coarse
+
+    # On the border of two states: a solution is found, but no proof by signs.
+    lv.suite.case("threshold").problem.save(tmp_path / "border.npz")
+    with pytest.raises(SystemExit) as end:
+        main(["reference", "--prove", str(tmp_path / "border.npz")])
+    assert end.value.code == 1 and "not proven" in capsys.readouterr().out
+    assert not (tmp_path / "border.npz.reference").exists()
+
+
 def test_nothing_solves_it_is_an_exit_code(tmp_path):
     lv.io.save(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), tmp_path / "impossible.npz")
     for words, code in (([str(tmp_path / "impossible.npz")], 1), (["stack(n=4)"], 1)):

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.io import npz
 from lavender.io.stored import writable, write_bytes
@@ -25,12 +26,16 @@ def _beside(path: str | PathLike[str]) -> Path:
     return path.with_name(path.name + SUFFIX)
 
 
-def save_reference(problem: Problem, path: str | PathLike[str]) -> Path:
-    """Solve for a problem's reference, unless it is kept, and write it beside the problem's file `path`.
+def save_reference(
+    problem: Problem, path: str | PathLike[str], impulse: FloatArray | None = None, source: str = "given"
+) -> Path:
+    """Write a problem's reference beside its file `path`: an impulse (m,) [N s] and who says so, else the one kept.
 
-    InputError where nothing solved the problem: then there is nothing to keep.
+    If none is kept, it is solved for. InputError where nothing solved the problem: then there is nothing to keep.
     """
     out = writable(_beside(path))
+    if impulse is not None:
+        kept(problem.disk).reference = judged(problem.disk, impulse, source)
     found = reference(problem.disk)
     if not found.accepted:
         raise InputError(f"{path}: nothing reached the floor ({found}); there is no reference to write")
