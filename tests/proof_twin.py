@@ -18,7 +18,8 @@ from fractions import Fraction
 import numpy as np
 
 import lavender as lv
-from lavender.lab import proof
+from lavender.lab.proof import prove
+from lavender.lab.proof.search import Search
 
 getcontext().prec = 60
 SLACK = Fraction(
@@ -199,7 +200,7 @@ class Centre:
     """Catches the balls that a proof ends with, as Fractions of their middles."""
 
     def __enter__(self):
-        self.told = proof.Search.told
+        self.told = Search.told
 
         def told(search, lam, w):
             self.x = [
@@ -208,11 +209,11 @@ class Centre:
             self.radius = max((float(q.rad()) for q in lam if isinstance(q, search.flint.arb)), default=0.0)
             return self.told(search, lam, w)
 
-        proof.Search.told = told
+        Search.told = told
         return self
 
     def __exit__(self, *_):
-        proof.Search.told = self.told
+        Search.told = self.told
 
 
 def _parts(flint, q):
@@ -236,7 +237,7 @@ def attack(seed):
         b = problem.b * (1 + rng.integers(-1, 2, problem.m) * 2.0**-52)
         problem = problem.updated(b=b) if problem.operator == "matrix" else problem
     with Centre() as centre:
-        found = proof.prove(problem, given)
+        found = prove(problem, given)
     label = f"{'border' if border else 'strict'} {way}"
     if not found.proven:
         return label, False, None if found.reason else "no reason"

@@ -9,7 +9,9 @@ import scipy.sparse as sp
 
 import lavender as lv
 from lavender import suite
-from lavender.lab import proof
+from lavender.lab.proof import search
+from lavender.lab.proof.numbers import Balls
+from lavender.lab.proof.operator import Operator
 from tests import proof_twin
 from tests.random_problems import random_contact_problem
 
@@ -207,7 +209,7 @@ def sign_of_upper_end(x):
 
 @pytest.mark.parametrize(("name", "turned"), [("upper_end", lower_end), ("sign_of", sign_of_upper_end)])
 def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, turned):
-    monkeypatch.setattr(proof, name, turned)
+    monkeypatch.setattr(search, name, turned)
     assert not told_of_hairs() or any(proof_twin.attack(seed)[2] for seed in range(50))
 
 
@@ -221,8 +223,8 @@ def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
 
 def test_a_ball_about_zero_counts():
     """w of a row that another moves by at most 1: [-1, 1] holds it."""
-    operator = proof.Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
-    w = operator.slack(proof.Balls(flint), [flint.arb(0, 1), flint.arb(0)])
+    operator = Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
+    w = operator.slack(Balls(flint), [flint.arb(0, 1), flint.arb(0)])
     assert w[1].contains(0.75) and w[0].contains(-1.5)
 
 

@@ -1,57 +1,37 @@
-"""Proofs that an exact solution stands beside an answer: how far away at most, in balls of interval arithmetic.
-
-On the case of each block (a row inside its bounds or at one of them; a contact open or loaded, each part of its
-friction sticking or sliding) the conditions are equations in the impulses that are not fixed by the case,
-
-    free, loaded, sticks     w_i = A_i lambda - b_i = 0
-    loaded, cone law         w_n = sum_g s_g,    s_g = |c w_g| over the sliding parts g, c the reach of its rows
-    slides                   lambda_i s_g + c_i^2 w_i lambda_n = 0                                        (1)
-
-and inequalities in the rest: lambda within its bounds, w >= 0 at a lower one, |lambda_g / c| <= lambda_n, and where a
-contact is open w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a
-box X around x~,
-
-    K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
-
-(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), in ball arithmetic on the problem's float64 numbers as exact ones; where
-each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target included,
-keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
-Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
-exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
-else it is named as on the border of two cases.
-
-Needs python-flint (extra `proof`).
-"""
+"""The search for cases of blocks whose equations have a solution, and its enclosure."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray, read_only
-from lavender.base.errors import CapabilityError, SolverUnavailable
-from lavender.base.later import lapack
+from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
-from lavender.judge.solution import Solution
 from lavender.lab.motion import uniqueness
-from lavender.problem import Problem, check_problem
+from lavender.lab.proof.dependence import Tangled, dependencies, pivots
+from lavender.lab.proof.numbers import UNIT, Balls, Rationals, largest, sign_of, squared, upper_end
+from lavender.lab.proof.operator import Operator
+from lavender.problem import Problem
 from lavender.problem.cones import ROW
 
-__all__ = ["Enclosure", "prove"]
+__all__ = ["EXTENT", "LARGEST", "PRECISE", "RATIONAL", "ROUNDS", "SLOW", "SMALL", "Enclosure", "Search"]
 
-BITS = (128, 256)  # of the balls: what the first leave undecided the second try
-UNIT = 2.0**-53
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
+
 LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
+
 PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
+
 SLOW = 1e-9  # of the largest b: a speed that an answer may have where the solution sticks
+
 SMALL = 32  # unknowns that are not parted into islands
+
 ROUNDS = 30  # changes of cases, as in an active-set method
+
 EXTENT = 10  # enlargements of X
 
 
@@ -82,74 +62,6 @@ class Enclosure:
         )
 
 
-def prove(problem: Problem, solution: Any) -> Enclosure:
-    """Enclose an exact solution of the problem near an answer, with a proof.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its float64 numbers count as exact: A and b, or J, M^-1 or M, compliance, b, bounds and coefficients; of bodies
-        J as float64 has it.
-    solution : Solution or (m,) array_like, N s
-        The answer, of any solver; near enough to tell which contacts stick, slide and are open.
-
-    Returns
-    -------
-    Enclosure
-        Not proven is a result: `reason` says which block is undecided, or what else was in the way.
-
-    Raises
-    ------
-    SolverUnavailable
-        python-flint is not installed.
-    CapabilityError
-        More than LARGEST unknowns that are coupled with each other.
-
-    Notes
-    -----
-    R. Krawczyk 1969, Computing 4, 187-201; A. Neumaier 1990, Interval Methods for Systems of Equations; F. Johansson
-    2017, Arb, IEEE Trans. Computers 66, 1281-1292.
-
-    Examples
-    --------
-    >>> import lavender as lv
-    >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
-    >>> found = lv.prove(problem, lv.solve(problem, "pgs", tol=1e-9))
-    >>> found.proven, found.unique, found.velocity_radius < 1e-8
-    (True, True, True)
-    """
-    check_problem(problem)
-    given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
-    for bits in BITS:
-        with _balls(bits) as flint:
-            search = Search(flint, problem, given)
-            found = search.run()
-        if found.proven or search.singular:
-            break
-    return found
-
-
-def require() -> None:
-    """Raise SolverUnavailable where python-flint is not installed."""
-    with _balls(BITS[0]):
-        pass
-
-
-@contextmanager
-def _balls(bits: int) -> Iterator[Any]:
-    try:
-        import flint
-    except ImportError:
-        raise SolverUnavailable(
-            "prove needs python-flint (interval arithmetic): pip install 'lavender-contact[proof]'"
-        ) from None
-    before, flint.ctx.prec = flint.ctx.prec, bits
-    try:
-        yield flint
-    finally:
-        flint.ctx.prec = before
-
-
 @dataclass
 class _Part:
     rows: list[int]
@@ -175,164 +87,6 @@ class _Undecided(Exception):
     def __init__(self, reason: str, borders: tuple[str, ...] = ()) -> None:
         super().__init__(reason)
         self.borders = borders
-
-
-class Operator:
-    """A of float64 numbers that are taken as exact: its rows times impulses, and blocks of it, in numbers of a kind."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.problem: Any = problem
-        self.rows = problem.csr if problem.matrix is not None else problem.jacobian
-        if problem.matrix is None and problem.rows is not None:
-            self.inverse = problem.rows.inverse_mass_matrix().tocsr()
-        self.transposed = self.rows.T.tocsr() if problem.matrix is None else None
-        self.target, self.v = self._targets()
-        self._mass: dict[Any, Any] = {}  # M^-1, by kind of number
-        self._bias: dict[Any, list[Any]] = {}  # b
-
-    def _targets(self) -> tuple[FloatArray, FloatArray | None]:
-        """What b was made of, target - J v*: a target that is nothing but rounding is 0. (b, None) of a matrix."""
-        problem = self.problem
-        if problem.matrix is not None:
-            return problem.b, None
-        v = problem.rows.v_free.ravel() if problem.generalized is None else problem.generalized.v_free
-        target = problem.b + self.rows @ v
-        dust = 4.0 * UNIT * (abs(self.rows) @ abs(v) * (1 + np.diff(self.rows.indptr)) + abs(problem.b))
-        return np.where(abs(target) <= dust, 0.0, target), v
-
-    def soft(self, row: int) -> bool:
-        return self.transposed is not None and bool(self.problem.compliance[row] > 0.0)
-
-    def bias(self, kind: Any) -> list[Any]:
-        """b of exact numbers."""
-        if type(kind) in self._bias:
-            return self._bias[type(kind)]
-        out = [kind.number(x) for x in self.target.tolist()]
-        if self.v is not None:
-            moved = _times(kind, self.rows, [kind.number(x) for x in self.v.tolist()], None)
-            out = [x - y for x, y in zip(out, moved, strict=True)]
-        self._bias[type(kind)] = out
-        return out
-
-    def weighed(self, kind: Any, right: Any) -> Any:
-        """M^-1 times a matrix of balls or rationals (nv, k)."""
-        generalized = self.problem.generalized
-        if generalized is None:
-            return _matrix(kind, self.inverse) * right
-        if type(kind) not in self._mass:
-            self._mass[type(kind)] = _matrix(kind, generalized.mass).inv()
-        return self._mass[type(kind)] * right
-
-    def block(self, kind: Any, which: Any) -> Any:
-        """A of these rows and columns."""
-        if self.transposed is None:
-            return _matrix(kind, self.rows[which][:, which])
-        part = self.rows[which]
-        used = np.unique(part.indices)
-        if self.problem.generalized is None:
-            inner = self.inverse[used][:, used]
-            j = _matrix(kind, part[:, used])
-            a = j * _matrix(kind, inner) * j.transpose()
-        else:
-            j = _matrix(kind, part)
-            a = j * self.weighed(kind, j.transpose())
-        for k, i in enumerate(which.tolist()):
-            a[k, k] += kind.number(float(self.problem.compliance[i]))
-        return a
-
-    def pattern(self, which: Any) -> Any:
-        """Where A of these rows and columns may be other than 0: float64 may round a sum of products to 0."""
-        if self.transposed is None:
-            return (self.rows[which][:, which] != 0).astype(float)
-        generalized = self.problem.generalized
-        inner = (self.inverse if generalized is None else sp.csr_array(generalized.mass)) != 0
-        if generalized is not None:
-            label = sp.csgraph.connected_components(inner, directed=False)[1]
-            inner = sp.coo_array((np.ones(len(label)), (np.arange(len(label)), label))).tocsr()
-            inner = inner @ inner.T
-        j = (self.rows[which] != 0).astype(float)
-        return j @ inner.astype(float) @ j.T
-
-    def slack(self, kind: Any, impulse: list[Any]) -> list[Any]:
-        """w = A lambda - b of all rows."""
-        problem, number = self.problem, kind.number
-        # A ball about 0 is not 0; `!=` would have to be certain.
-        at = np.flatnonzero(~np.array([x == 0 for x in impulse], bool))
-        if self.transposed is None:
-            a = _times(kind, self.rows, impulse, at)
-        else:
-            pulled = _times(kind, self.transposed, impulse, at)
-            if problem.generalized is None:
-                moved = _times(kind, self.inverse, pulled, None)
-            else:
-                moved = self.weighed(kind, kind.matrix(len(pulled), 1, pulled)).entries()
-            a = _times(kind, self.rows, moved, None)
-        theta = [0.0] * problem.m if problem.compliance is None else problem.compliance.tolist()
-        return [
-            x + number(t) * y - b if t else x - b
-            for x, t, y, b in zip(a, theta, impulse, self.bias(kind), strict=True)
-        ]
-
-    def semidefinite(self) -> bool:
-        """Proof that x.A x >= 0 for every x, of exact numbers."""
-        problem = self.problem
-        if problem.matrix is not None:
-            return _semidefinite(problem.dense())
-        if problem.generalized is not None:
-            return _semidefinite(problem.generalized.mass.toarray())
-        return bool((problem.rows.inv_mass >= 0.0).all()) and _semidefinite(problem.rows.inv_inertia)
-
-
-def _semidefinite(a: FloatArray) -> bool:
-    """Whether Cholesky of symmetric matrices (..., n, n) less c I runs through, c what it may round.
-
-    S. M. Rump 2006, Verification of positive definiteness, BIT 46, 433-452: c = g tr(A) / (1 - g), g = (n + 2) UNIT.
-    """
-    if not (a == np.swapaxes(a, -1, -2)).all():
-        return False
-    n = a.shape[-1]
-    eye, empty = np.eye(n), ~(a != 0.0).any(axis=-1)
-    scale = abs(a).max(axis=(-1, -2), keepdims=True, initial=0.0)
-    a = a / np.exp2(np.ceil(np.log2(np.where(scale > 0.0, scale, 1.0)))) + empty[..., None] * eye
-    trace = np.trace(a, axis1=-2, axis2=-1)[..., None, None]
-    try:
-        # Twice as much: of the trace, of the subtraction and of what underflows, too.
-        np.linalg.cholesky(a - 2.0 * (n + 3) * UNIT * np.maximum(trace, 1.0) * eye)
-    except np.linalg.LinAlgError:
-        return False
-    return True
-
-
-class Balls:
-    def __init__(self, flint: Any) -> None:
-        self.number, self.matrix = flint.arb, flint.arb_mat
-
-
-class _Rationals:
-    def __init__(self, flint: Any) -> None:
-        self.matrix, self._flint = flint.fmpq_mat, flint
-
-    def number(self, x: float) -> Any:
-        return self._flint.fmpq(*x.as_integer_ratio())
-
-
-def _matrix(kind: Any, a: Any) -> Any:
-    dense = a.toarray()
-    return kind.matrix(*dense.shape, [kind.number(x) for x in dense.ravel().tolist()])
-
-
-def _times(kind: Any, a: Any, x: list[Any], at: Any) -> list[Any]:
-    # Sparse times vector; `at`: the entries of x that are not zero.
-    out, zero = [], kind.number(0.0)
-    live = None if at is None else np.isin(a.indices, at)
-    data, indices, ptr = a.data.tolist(), a.indices.tolist(), a.indptr.tolist()
-    for i in range(a.shape[0]):
-        total = zero
-        for k in range(ptr[i], ptr[i + 1]):
-            if (live is None or live[k]) and data[k] != 0.0:
-                total = total + kind.number(data[k]) * x[indices[k]]
-        out.append(total)
-    return out
 
 
 class Search:
@@ -378,6 +132,7 @@ class Search:
         return out
 
     def run(self) -> Enclosure:
+        """Change cases until a solution is enclosed, or say why none is."""
         try:
             tried: set[tuple[Any, ...]] = set()
             before: tuple[Any, ...] = ()
@@ -401,7 +156,7 @@ class Search:
                     borders = self._changed(lam, w)
                     exactly = bool(borders) and self.exact
                 if exactly:
-                    borders = self._changed(*self._solve(_Rationals(self.flint)))
+                    borders = self._changed(*self._solve(Rationals(self.flint)))
                 if borders == []:
                     return self.told(lam, w)
                 if borders:
@@ -454,7 +209,7 @@ class Search:
         slides = any(part.slides for block in self.blocks if block.loaded for part in block.parts or ())
         self.exact = not slides and max(map(len, islands), default=0) <= RATIONAL
         for which in islands:
-            if isinstance(kind, _Rationals):
+            if isinstance(kind, Rationals):
                 right = kind.matrix(len(which), 1, [-base[r] for r in which.tolist()])
                 for r, x in zip(
                     which.tolist(), self.operator.block(kind, which).solve(right).entries(), strict=True
@@ -495,15 +250,15 @@ class Search:
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
-        first, numerical = _pivots(j[rows].toarray())
+        first, numerical = pivots(j[rows].toarray())
         if numerical == len(rows) and not len(touching):
             return unknown
         own = rows[first]
         while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
             rows = np.concatenate([own, touching])
             try:
-                found = _dependencies(self.flint, j[rows], self.operator.target[rows])
-            except _Tangled as tangled:
+                found = dependencies(self.flint, j[rows], self.operator.target[rows])
+            except Tangled as tangled:
                 if len(touching):
                     touching = touching[:0]
                     continue
@@ -626,7 +381,7 @@ class Search:
                     raise self._singular(which, near(x, speeds)) from None
             move = (inverse * value).mid()
             x = (x - move).mid()
-            size, last, moved = _largest(x), moved, _largest(move)
+            size, last, moved = largest(x), moved, largest(move)
             enough = moved <= 2.0 ** (-0.75 * self.flint.ctx.prec) * size
             if step > 1 and (enough or (precise and step > 9 and moved > 0.1 * last)):
                 break
@@ -638,7 +393,7 @@ class Search:
             raise _Recase
         newton = inverse * value
         radius = [2.0 * upper_end(q) for q in newton.entries()]
-        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * _largest(x) + 2.0**-900
+        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * largest(x) + 2.0**-900
         wide = [max(q, 1e-6 * least) for q in radius]
         for _ in range(EXTENT):
             ball = matrix(n, 1, [number(0.0, q) for q in wide])
@@ -729,7 +484,7 @@ class Search:
                         border.append(block)
                 continue
             speeds = [
-                sum((_squared(number(c) * w[k]) for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
+                sum((squared(number(c) * w[k]) for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
                 for p in block.parts
             ]
             if not block.loaded:
@@ -757,7 +512,7 @@ class Search:
                 if part.slides:
                     continue  # |lambda / c| = lambda_n by (1), against w by its sign
                 y = sum(
-                    (_squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)),
+                    (squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)),
                     0 * lam[r],
                 )
                 sign = sign_of(lam[r] * lam[r] - y)
@@ -773,6 +528,7 @@ class Search:
         return square.sqrt() if square > 0 else square.abs_upper().sqrt() * self.flint.arb(0.5, 0.5)
 
     def told(self, lam: list[Any], w: list[Any]) -> Enclosure:
+        """The enclosure of balls of impulses and slacks."""
         kind = Balls(self.flint)
         own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
         off = max((upper_end(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
@@ -795,123 +551,9 @@ class Search:
         )
 
 
-class _Tangled(Exception):
-    """Rows that depend on each other to rounding, by no simple quotients."""
-
-
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
 
 
 def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")
-
-
-def upper_end(x: Any) -> float:
-    """No less than |x| for any number of a ball; the float of an upper end may be rounded down."""
-    up = abs(x).upper()
-    return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
-
-
-def _largest(x: Any) -> float:
-    return max((abs(float(q)) for q in x.entries()), default=0.0)
-
-
-def _squared(x: Any) -> Any:
-    return x * x
-
-
-def sign_of(x: Any) -> int:
-    """+1 where certainly x >= 0, -1 where certainly x < 0, else 0."""
-    return 1 if x >= 0 else -1 if x < 0 else 0
-
-
-def _pivots(j: FloatArray) -> tuple[Any, int]:
-    """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
-    size = np.maximum(np.sqrt((j * j).sum(axis=1)), np.finfo(float).tiny)
-    unit = j / size[:, None]
-    _, order, rank, _ = lapack.dpstrf(unit @ unit.T, tol=1e-10)
-    return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
-
-
-PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
-
-
-def _dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
-    """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
-
-    Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
-    them; else what these are made of is read modulo the prime as quotients of whole numbers, and held to J in rational
-    numbers. Rows of no target contradict nothing.
-    """
-    _, label = sp.csgraph.connected_components(
-        sp.block_array([[None, j != 0], [(j != 0).T, None]]).astype(float), directed=False
-    )
-    kept, contradict = [], []
-    for k in np.unique(label[: j.shape[0]]):
-        rows = np.flatnonzero(label[: j.shape[0]] == k)
-        columns = np.flatnonzero(label[j.shape[0] :] == k)
-        for prime in PRIMES:
-            found = _dependent(flint, j[rows][:, columns], target[rows], prime)
-            if found is not None:
-                break
-        else:
-            raise _Tangled(rows)
-        kept.append(rows[found[0]])
-        contradict.append(rows[found[1]])
-    return np.sort(np.concatenate(kept)), np.sort(np.concatenate(contradict))
-
-
-def _dependent(flint: Any, j: Any, target: FloatArray, prime: int) -> tuple[list[int], list[int]] | None:
-    m, n = j.shape
-    dense = [[_residue(x, prime) if x else 0 for x in row] for row in j.T.toarray().tolist()]
-    entries = [x for row in dense for x in row]
-    if prime < 2**64:
-        reduced, rank = flint.nmod_mat(n, m, entries, prime).rref()
-    else:
-        reduced, rank = flint.fmpz_mod_mat(n, m, entries, flint.fmpz_mod_ctx(prime)).rref()
-    kept: list[int] = []
-    for k in range(m):
-        if len(kept) < rank and int(reduced[len(kept), k]) != 0:
-            kept.append(k)
-    others = sorted(set(range(m)) - set(kept))
-    if not others or (rank == n and not target.any()):
-        return kept, []
-    number = _exact(flint)
-    exact = [
-        dict(zip(j.indices[s:e].tolist(), map(number, j.data[s:e].tolist()), strict=True))
-        for s, e in zip(j.indptr[:-1].tolist(), j.indptr[1:].tolist(), strict=True)
-    ]
-    goal, contradict = [number(x) for x in target.tolist()], []
-    for k in others:
-        rest, left = dict(exact[k]), goal[k]
-        for i, base in enumerate(kept):
-            c = int(reduced[i, k])
-            if c:
-                share = flint.fmpq(*_quotient(c, prime))
-                left = left - share * goal[base]
-                for column, x in exact[base].items():
-                    rest[column] = rest.get(column, 0) - share * x
-        if any(x != 0 for x in rest.values()):
-            return None
-        if left != 0:
-            contradict.append(k)
-    return kept, contradict
-
-
-def _exact(flint: Any) -> Any:
-    return lambda x: flint.fmpq(*x.as_integer_ratio())
-
-
-def _residue(x: float, prime: int) -> int:
-    top, bottom = x.as_integer_ratio()
-    return top * pow(bottom, -1, prime) % prime
-
-
-def _quotient(c: int, prime: int) -> tuple[int, int]:
-    """The quotient of least size that is c modulo the prime (half an extended Euclid; Wang 1981)."""
-    a, b, u, v = prime, c, 0, 1
-    while b * b > prime:
-        q = a // b
-        a, b, u, v = b, a - q * b, v, u - q * v
-    return (b, v) if v > 0 else (-b, -v)

@@ -1,0 +1,90 @@
+"""Proofs that an exact solution stands beside an answer: how far away at most, in balls of interval arithmetic.
+
+On the case of each block (a row inside its bounds or at one of them; a contact open or loaded, each part of its
+friction sticking or sliding) the conditions are equations in the impulses that are not fixed by the case,
+
+    free, loaded, sticks     w_i = A_i lambda - b_i = 0
+    loaded, cone law         w_n = sum_g s_g,    s_g = |c w_g| over the sliding parts g, c the reach of its rows
+    slides                   lambda_i s_g + c_i^2 w_i lambda_n = 0                                        (1)
+
+and inequalities in the rest: lambda within its bounds, w >= 0 at a lower one, |lambda_g / c| <= lambda_n, and where a
+contact is open w_n >= 0 (Coulomb) or w_n >= sum |c w_g| (cone law). With x~ an approximate zero, Y ~ F'(x~)^-1 and a
+box X around x~,
+
+    K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
+
+(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), in ball arithmetic on the problem's float64 numbers as exact ones; where
+each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target included,
+keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
+Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
+exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
+else it is named as on the border of two cases.
+
+Needs python-flint (extra `proof`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lavender.judge.solution import Solution
+from lavender.lab.proof.numbers import balls
+from lavender.lab.proof.search import Enclosure, Search
+from lavender.problem import Problem, check_problem
+
+__all__ = ["Enclosure", "prove", "require"]
+
+BITS = (128, 256)  # of the balls: what the first leave undecided the second try
+
+
+def prove(problem: Problem, solution: Any) -> Enclosure:
+    """Enclose an exact solution of the problem near an answer, with a proof.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its float64 numbers count as exact: A and b, or J, M^-1 or M, compliance, b, bounds and coefficients; of bodies
+        J as float64 has it.
+    solution : Solution or (m,) array_like, N s
+        The answer, of any solver; near enough to tell which contacts stick, slide and are open.
+
+    Returns
+    -------
+    Enclosure
+        Not proven is a result: `reason` says which block is undecided, or what else was in the way.
+
+    Raises
+    ------
+    SolverUnavailable
+        python-flint is not installed.
+    CapabilityError
+        More than LARGEST unknowns that are coupled with each other.
+
+    Notes
+    -----
+    R. Krawczyk 1969, Computing 4, 187-201; A. Neumaier 1990, Interval Methods for Systems of Equations; F. Johansson
+    2017, Arb, IEEE Trans. Computers 66, 1281-1292.
+
+    Examples
+    --------
+    >>> import lavender as lv
+    >>> problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
+    >>> found = lv.prove(problem, lv.solve(problem, "pgs", tol=1e-9))
+    >>> found.proven, found.unique, found.velocity_radius < 1e-8
+    (True, True, True)
+    """
+    check_problem(problem)
+    given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
+    for bits in BITS:
+        with balls(bits) as flint:
+            search = Search(flint, problem, given)
+            found = search.run()
+        if found.proven or search.singular:
+            break
+    return found
+
+
+def require() -> None:
+    """Raise SolverUnavailable where python-flint is not installed."""
+    with balls(BITS[0]):
+        pass

@@ -1,0 +1,108 @@
+"""Rows that depend on others exactly: found modulo a prime, held to J in rational numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lavender.base.arrays import FloatArray
+from lavender.base.later import lapack
+from lavender.base.later import sparse as sp
+
+__all__ = ["PRIMES", "Tangled", "dependencies", "pivots"]
+
+
+class Tangled(Exception):
+    """Rows that depend on each other to rounding, by no simple quotients."""
+
+
+def pivots(j: FloatArray) -> tuple[Any, int]:
+    """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
+    size = np.maximum(np.sqrt((j * j).sum(axis=1)), np.finfo(float).tiny)
+    unit = j / size[:, None]
+    _, order, rank, _ = lapack.dpstrf(unit @ unit.T, tol=1e-10)
+    return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
+
+
+PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
+
+
+def dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
+    """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
+
+    Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
+    them; else what these are made of is read modulo the prime as quotients of whole numbers, and held to J in rational
+    numbers. Rows of no target contradict nothing.
+    """
+    _, label = sp.csgraph.connected_components(
+        sp.block_array([[None, j != 0], [(j != 0).T, None]]).astype(float), directed=False
+    )
+    kept, contradict = [], []
+    for k in np.unique(label[: j.shape[0]]):
+        rows = np.flatnonzero(label[: j.shape[0]] == k)
+        columns = np.flatnonzero(label[j.shape[0] :] == k)
+        for prime in PRIMES:
+            found = _dependent(flint, j[rows][:, columns], target[rows], prime)
+            if found is not None:
+                break
+        else:
+            raise Tangled(rows)
+        kept.append(rows[found[0]])
+        contradict.append(rows[found[1]])
+    return np.sort(np.concatenate(kept)), np.sort(np.concatenate(contradict))
+
+
+def _dependent(flint: Any, j: Any, target: FloatArray, prime: int) -> tuple[list[int], list[int]] | None:
+    m, n = j.shape
+    dense = [[_residue(x, prime) if x else 0 for x in row] for row in j.T.toarray().tolist()]
+    entries = [x for row in dense for x in row]
+    if prime < 2**64:
+        reduced, rank = flint.nmod_mat(n, m, entries, prime).rref()
+    else:
+        reduced, rank = flint.fmpz_mod_mat(n, m, entries, flint.fmpz_mod_ctx(prime)).rref()
+    kept: list[int] = []
+    for k in range(m):
+        if len(kept) < rank and int(reduced[len(kept), k]) != 0:
+            kept.append(k)
+    others = sorted(set(range(m)) - set(kept))
+    if not others or (rank == n and not target.any()):
+        return kept, []
+    number = _exact(flint)
+    exact = [
+        dict(zip(j.indices[s:e].tolist(), map(number, j.data[s:e].tolist()), strict=True))
+        for s, e in zip(j.indptr[:-1].tolist(), j.indptr[1:].tolist(), strict=True)
+    ]
+    goal, contradict = [number(x) for x in target.tolist()], []
+    for k in others:
+        rest, left = dict(exact[k]), goal[k]
+        for i, base in enumerate(kept):
+            c = int(reduced[i, k])
+            if c:
+                share = flint.fmpq(*_quotient(c, prime))
+                left = left - share * goal[base]
+                for column, x in exact[base].items():
+                    rest[column] = rest.get(column, 0) - share * x
+        if any(x != 0 for x in rest.values()):
+            return None
+        if left != 0:
+            contradict.append(k)
+    return kept, contradict
+
+
+def _exact(flint: Any) -> Any:
+    return lambda x: flint.fmpq(*x.as_integer_ratio())
+
+
+def _residue(x: float, prime: int) -> int:
+    top, bottom = x.as_integer_ratio()
+    return top * pow(bottom, -1, prime) % prime
+
+
+def _quotient(c: int, prime: int) -> tuple[int, int]:
+    """The quotient of least size that is c modulo the prime (half an extended Euclid; Wang 1981)."""
+    a, b, u, v = prime, c, 0, 1
+    while b * b > prime:
+        q = a // b
+        a, b, u, v = b, a - q * b, v, u - q * v
+    return (b, v) if v > 0 else (-b, -v)
