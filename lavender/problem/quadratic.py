@@ -33,6 +33,7 @@ from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, stacked
+from lavender_ext.core.checks import largest
 from lavender_ext.judge.measure import all_finite
 
 IntpArray = npt.NDArray[np.intp]
@@ -105,14 +106,14 @@ class QPSolution:
     def primal_residual(self) -> float:
         """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
         short, free = self.qp.target - self._parts[1], self.qp.free
-        return float(max(np.abs(short[:free]).max(initial=0.0), short[free:].max(initial=0.0)))
+        return max(largest(short[:free]), float(short[free:].max(initial=0.0)))
 
     @property
     def dual_residual(self) -> float:
         """max |P x + q + A^T y + G^T z + z_box|, or the largest negative z where that is more."""
         px, _, force = self._parts
         wrong = -self.impulse[self.qp.free :].min(initial=0.0)
-        return float(max(np.abs(px + self.qp.q - force).max(initial=0.0), wrong))
+        return max(largest(px + self.qp.q - force), float(wrong))
 
     @property
     def duality_gap(self) -> float:
@@ -129,13 +130,13 @@ class QPSolution:
         """
         px, jx, force = self._parts
         q, target = self.qp.q, self.qp.target
-        rows = max(np.abs(target).max(initial=0.0), np.abs(jx).max(initial=0.0))
-        if not target.any():  # x = 0 may be the solution
+        wanted = largest(target)
+        rows = max(wanted, largest(jx))
+        if wanted == 0.0:  # x = 0 may be the solution
             of = self.qp.generalized
-            rows = max(rows, FLAT * np.abs(of.velocity_of(of.v_free)).max(initial=0.0))
-        heaviest = np.abs(self.qp.generalized.operator.mass[2]).max(initial=0.0)
-        curved = FLAT * heaviest * np.abs(self.x).max(initial=0.0)
-        forces = max(curved, *(np.abs(part).max(initial=0.0) for part in (px, q, force)))
+            rows = max(rows, FLAT * largest(of.velocity_of(of.v_free)))
+        curved = FLAT * largest(self.qp.generalized.operator.mass[2]) * largest(self.x)
+        forces = max(curved, largest(px), largest(q), largest(force))
         energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
         wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
         return float(max(found / size if size > 0.0 else found for found, size in wrong))

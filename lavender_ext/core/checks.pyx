@@ -48,6 +48,18 @@ def plain(value, tuple shape, bint finite, bint copy):
     return made
 
 
+def largest(const double[::1] x):
+    """max |x_i|: 0 without entries, NaN where one is."""
+    cdef Py_ssize_t i
+    cdef double s = 0.0
+    for i in range(x.shape[0]):
+        if not fabs(x[i]) <= s:
+            s = fabs(x[i])
+            if s != s:
+                break
+    return s
+
+
 def has_negative(const double[::1] x):
     """Whether any number is below 0."""
     cdef Py_ssize_t i
