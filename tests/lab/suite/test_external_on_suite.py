@@ -62,7 +62,7 @@ def test_no_backend_begins_what_it_could_not_even_be_handed_in_time(name, monkey
         patch.setattr(qp_solver.QPSolver, "prepare", None)
         late = lv.solve(problem, name, time_limit=1e-3)
     assert late.status is lv.Status.TIME_LIMIT and "set up" in late.message
-    assert late.setup_time < 1e-3 and not late.work
+    assert not late.work
     assert late.impulse.tobytes() == problem.start().tobytes()
 
 
