@@ -241,6 +241,8 @@ class Derivative:
 
     def refuse_alone(self, words: str) -> None:
         """Of what changes one row of several that share a load."""
+        if not self._singular:
+            return
         off = np.flatnonzero(~self.unique.target)
         if len(off):
             some = ", ".join(self.problem.row_name(int(i)) for i in off[:3])
@@ -274,27 +276,37 @@ class Derivative:
         p = self.problem
         if velocity is None and impulse is None and slack is None:
             raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
-        x = y = given = None
+        plain = self._plain and slack is None
+        made = self._linear.adjoint(velocity, impulse) if plain else None
+        if made is not None:
+            return Gradient(self, made)
+        x = y = None
+        c = np.zeros(p.m) if impulse is None else as_array("impulse", impulse, (p.m,))
         if velocity is not None:
             y = as_array("velocity", velocity, self._velocities()).reshape(-1)
-        if impulse is not None:
-            given = as_array("impulse", impulse, (p.m,))
-        c = np.zeros(p.m) if given is None else given.copy()
         if slack is not None:
             x = as_array("slack", slack, (p.m,))
-            c += self._a(x, True)
-        if self._plain and x is None:
-            q, s, *moved = self._linear.adjoint(y, c)
-            return Gradient(self, q, s, y, given, moved)
+        return Gradient(self, self._linear.adjoint(y, c) if plain else self._adjoint(y, c, x))
+
+    def _adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
+        """(q, s (m), f, p (nv), c (m)) of (4), end to end, with f = y - J^T s; no f and p of a matrix."""
+        p, right = self.problem, c.copy()
+        if x is not None:
+            right += self._a(x, True)
         if y is not None:
-            c += self._along(self._through_mass(y))
-        scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)
+            right += self._along(self._through_mass(y))
+        scaled, q = (right / self._root)[self._places], np.zeros(p.m)
         # Slacks and velocities are unique where A is that of bodies and the law is convex.
-        if p.matrix is not None or p.law == "coulomb" or impulse is not None:
+        if p.matrix is not None or p.law == "coulomb" or c.any():
             self._refuse_undetermined(scaled)
-        q[at] = self._solver.solve(scaled, True)
+        q[self._places] = self._solver.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
-        return Gradient(self, q, s if x is None else s - x, y, given)
+        if x is not None:
+            s -= x
+        if p.matrix is not None:
+            return np.concatenate([q, s, c])
+        f = (0.0 if y is None else y) - self._wrench(s)
+        return np.concatenate([q, s, f, self._through_mass(f), c])
 
     def _refuse_undetermined(self, c: FloatArray) -> None:
         if not self._singular:

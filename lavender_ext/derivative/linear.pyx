@@ -5,8 +5,8 @@ Where the equations are of J and M, with cotangents c of lambda and y of v (equa
     G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
 """
 from libc.math cimport fabs
-from libc.stdint cimport int8_t, int32_t, int64_t
-from libc.string cimport memcpy
+from libc.stdint cimport int8_t, int32_t
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
@@ -31,18 +31,16 @@ CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "fr
 
 
 cdef public void lav_adjoint(const blocks_t* b, const natural_t* x, const generalized_t* g, int32_t rows,
-                             const int32_t* place, const double* lu, const int32_t* swap, const double* y, double* c,
-                             double* q, double* s, double* f, double* p) noexcept nogil:
-    """(1) but for q on rows outside the factor; c (m) is changed, y (n) may be NULL, then f = -J^T s."""
+                             const int32_t* place, const double* lu, const int32_t* swap, const double* y,
+                             const double* c, double* q, double* s, double* f, double* p) noexcept nogil:
+    """(1) but for q on rows outside the factor; y (n) and c (m) may be NULL, for 0."""
     cdef int32_t i, m = b.n_rows
     if y != NULL:
         memcpy(p, y, g.n * sizeof(double))
         tree_solve(g, p)
-        for i in range(m):
-            c[i] += jac_row(g, i, p)
     for i in range(m):
         if place[i] >= 0:
-            s[place[i]] = c[i] / x.root[i]
+            s[place[i]] = ((c[i] if c != NULL else 0.0) + (jac_row(g, i, p) if y != NULL else 0.0)) / x.root[i]
     lu_solve_back(rows, lu, swap, s)
     for i in range(m):
         q[i] = s[place[i]] if place[i] >= 0 else 0.0
@@ -54,6 +52,27 @@ cdef public void lav_adjoint(const blocks_t* b, const natural_t* x, const genera
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
     memcpy(p, f, g.n * sizeof(double))
     tree_solve(g, p)
+
+
+cdef bint is_plain(given, Py_ssize_t n, const double** to):
+    """Whether it is None, `to` NULL then, or an array (n,) of finite numbers that lie together."""
+    cdef const double[::1] x
+    cdef double nought = 0.0                            # or becomes NaN
+    cdef Py_ssize_t i
+    to[0] = NULL
+    if given is None:
+        return True
+    try:
+        x = given
+    except (TypeError, ValueError):
+        return False
+    if x.shape[0] != n:
+        return False
+    for i in range(n):
+        nought += 0.0 * x[i]
+    if n:
+        to[0] = &x[0]
+    return nought == 0.0
 
 
 cdef class Linear:
@@ -159,26 +178,27 @@ cdef class Linear:
             lu_solve(self.rows, self.lu, self.swap, &out[0])
         return out_
 
-    def adjoint(self, y_, c_):
-        """(q (m,), s (m,), f (n,), p (n,)) of (1), y (n,) or None, c (m,), which is changed. Of J and M, with a factor."""
-        cdef double[::1] c = c_
-        cdef const double[::1] y
-        cdef const double* given = NULL
-        cdef int32_t m = self.b.n_rows, n = self.data.general.n
-        out_ = np.empty(2 * (m + n) + 1)
-        cdef double[::1] out = out_
-        if y_ is not None:
-            y = y_
-            given = &y[0] if n else NULL
-        if n:
-            with nogil:
-                self.back(given, &c[0] if m else NULL, &out[0])
-        return out_[:m], out_[m:2 * m], out_[2 * m:2 * m + n], out_[2 * m + n:2 * (m + n)]
+    def adjoint(self, velocity, impulse):
+        """(q, s (m), f, p (n), c (m)) of (1), end to end, of y (n,) and c, None for 0. Of J and M, with a factor.
 
-    cdef void back(self, const double* y, double* c, double* out) noexcept nogil:
+        None where y or c is no such array or not finite: the long way finds the words.
+        """
         cdef int32_t m = self.b.n_rows, n = self.data.general.n
-        lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out, out + m,
-                    out + 2 * m, out + 2 * m + n)
+        cdef const double* y
+        cdef const double* c
+        if not (is_plain(velocity, n, &y) and is_plain(impulse, m, &c)):
+            return None
+        out_ = np.empty(3 * m + 2 * n)
+        cdef double[::1] made = out_
+        cdef double* out = &made[0] if made.shape[0] else NULL
+        with nogil:
+            lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out,
+                        out + m, out + 2 * m, out + 2 * m + n)
+            if c != NULL:
+                memcpy(out + 2 * (m + n), c, m * sizeof(double))
+            else:
+                memset(out + 2 * (m + n), 0, m * sizeof(double))
+        return out_
 
     def times(self, v_, bint back=False, bint edge=False):
         """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
@@ -251,19 +271,6 @@ cdef class Linear:
         for i in range(self.b.n_rows):
             out[i] = self.place_[i]
         return out_
-
-
-def adjoint_all(list linears, const int64_t[::1] at_y, const double[::1] y, const int64_t[::1] at_c, double[::1] c,
-                const int64_t[::1] at_out, double[::1] out):
-    """`adjoint` of many, each with J and M and a factor: y, c and what is returned end to end from the places given."""
-    cdef Linear one
-    cdef Py_ssize_t i
-    cdef const double* from_
-    for i in range(len(linears)):
-        one = <Linear>linears[i]
-        from_ = &y[0] + at_y[i] if y.shape[0] else NULL
-        if one.data.general.n:
-            one.back(from_, &c[0] + at_c[i] if c.shape[0] else NULL, &out[0] + at_out[i])
 
 
 def wrench(Data p, const double[::1] lam, double[:, ::1] f):
