@@ -93,7 +93,7 @@ class Derivative:
         disk, general = problem.disk, problem.generalized
         self._regular = linear.prepare(disk.csr_data if general is None else disk.metric)
         # The kernel has all that `vjp` needs, in the order given.
-        self._plain = self._regular and general is not None and general.order is None and disk is problem
+        self._plain = self._regular and (general is None or general.order is None) and disk is problem
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -276,17 +276,13 @@ class Derivative:
         p = self.problem
         if velocity is None and impulse is None and slack is None:
             raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
-        plain = self._plain and slack is None
-        made = self._linear.adjoint(velocity, impulse) if plain else None
+        made = self._linear.adjoint(velocity, impulse, slack) if self._plain else None
         if made is not None:
             return Gradient(self, made)
-        x = y = None
+        y = None if velocity is None else as_array("velocity", velocity, self._velocities()).reshape(-1)
         c = np.zeros(p.m) if impulse is None else as_array("impulse", impulse, (p.m,))
-        if velocity is not None:
-            y = as_array("velocity", velocity, self._velocities()).reshape(-1)
-        if slack is not None:
-            x = as_array("slack", slack, (p.m,))
-        return Gradient(self, self._linear.adjoint(y, c) if plain else self._adjoint(y, c, x))
+        x = None if slack is None else as_array("slack", slack, (p.m,))
+        return Gradient(self, (self._linear.adjoint if self._plain else self._adjoint)(y, c, x))
 
     def _adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
         """(q, s (m), f, p (nv), c (m)) of (4), end to end, with f = y - J^T s; no f and p of a matrix."""

@@ -1,8 +1,12 @@
 """An answer, judged and linearised (`natural.pxd`), with a factor of its equations where these are few; for Python.
 
-Where the equations are of J and M, with cotangents c of lambda and y of v (equation (4) of lavender/gradient/__init__.py),
+With cotangents c of lambda, x of w and y of v (equation (4) of lavender/gradient/__init__.py), of J and M or bodies
 
-    G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
+    G^T q = D^-1/2 (c + C x + J M^-1 (y + J^T x)),   s = D^-1/2 P^T q - x,   f = y - J^T s,   p = M^-1 f    (1)
+
+with C the compliance, and of a matrix
+
+    G^T q = D^-1/2 (c + A^T x),   s = D^-1/2 P^T q - x                                                      (2)
 """
 from libc.math cimport fabs
 from libc.stdint cimport int8_t, int32_t
@@ -10,10 +14,11 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.block cimport ROW, blocks_t, n_directions, n_turns
-from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.core.block cimport ROW, blocks_t
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
 from lavender_ext.core.problem cimport Data, Room, room_for
-from lavender_ext.core.velocity cimport contact_wrench, joint_wrench
+from lavender_ext.core.rows cimport rows_times
+from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
                                               natural_t, place_rows, scaled_csr, scaled_general, system_rows)
@@ -30,28 +35,70 @@ cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G c
 CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
 
 
-cdef public void lav_adjoint(const blocks_t* b, const natural_t* x, const generalized_t* g, int32_t rows,
-                             const int32_t* place, const double* lu, const int32_t* swap, const double* y,
-                             const double* c, double* q, double* s, double* f, double* p) noexcept nogil:
-    """(1) but for q on rows outside the factor; y (n) and c (m) may be NULL, for 0."""
-    cdef int32_t i, m = b.n_rows
-    if y != NULL:
-        memcpy(p, y, g.n * sizeof(double))
-        tree_solve(g, p)
+cdef void push(const view_t* v, const double* lam, double* f) noexcept nogil:
+    # f (n) = J^T lam
+    if v.g != NULL:
+        jac_push(v.g, lam, f)
+    elif v.r != NULL:
+        rows_wrench(&v.p, v.r, lam, f)
+
+
+cdef void through_mass(const view_t* v, int32_t n, const double* f, double* p) noexcept nogil:
+    # p (n) = M^-1 f
+    memcpy(p, f, n * sizeof(double))
+    if v.g != NULL:
+        tree_solve(v.g, p)
+    elif v.r != NULL:
+        wrenches_to_velocity(v.r, p)
+
+
+cdef void turned(const view_t* v, const double* x, double* out) noexcept nogil:
+    # out (m) = A^T x of a matrix
+    cdef int32_t i, k
+    memset(out, 0, v.p.n_rows * sizeof(double))
+    for i in range(v.p.n_rows):
+        for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
+            out[v.a.indices[k]] += v.a.data[k] * x[i]
+
+
+cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, const int32_t* place, const double* lu,
+                             const int32_t* swap, int32_t n, const double* y, const double* c, const double* x,
+                             double* q, double* s, double* f, double* p) noexcept nogil:
+    """(1) or (2) but for q on rows outside the factor; y (n), c (m) and x (m) may be NULL, for 0."""
+    cdef int32_t i, m = v.p.n_rows
+    cdef const double* soft = NULL if v.a != NULL else v.g.compliance if v.g != NULL else v.r.compliance
+    memset(q, 0, m * sizeof(double))
+    if v.a != NULL and x != NULL:
+        turned(v, x, q)
+    elif y != NULL or x != NULL:
+        memset(f, 0, n * sizeof(double))
+        if x != NULL:
+            push(v, x, f)
+        if y != NULL:
+            for i in range(n):
+                f[i] += y[i]
+        through_mass(v, n, f, p)
+        if v.r != NULL:
+            rows_times(&v.p, v.r, p, q)
+        else:
+            for i in range(m):
+                q[i] = jac_row(v.g, i, p)
+        if x != NULL:
+            for i in range(m):
+                q[i] += soft[i] * x[i]
     for i in range(m):
         if place[i] >= 0:
-            s[place[i]] = ((c[i] if c != NULL else 0.0) + (jac_row(g, i, p) if y != NULL else 0.0)) / x.root[i]
+            s[place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.root[i]
     lu_solve_back(rows, lu, swap, s)
     for i in range(m):
         q[i] = s[place[i]] if place[i] >= 0 else 0.0
-    block_times(x, b, x.p, q, True, s)
+    block_times(a, &v.p, a.p, q, True, s)
     for i in range(m):
-        s[i] /= x.root[i]
-    jac_push(g, s, f)
-    for i in range(g.n):
+        s[i] = s[i] / a.root[i] - (x[i] if x != NULL else 0.0)
+    push(v, s, f)
+    for i in range(n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
-    memcpy(p, f, g.n * sizeof(double))
-    tree_solve(g, p)
+    through_mass(v, n, f, p)
 
 
 cdef bint is_plain(given, Py_ssize_t n, const double** to):
@@ -178,22 +225,24 @@ cdef class Linear:
             lu_solve(self.rows, self.lu, self.swap, &out[0])
         return out_
 
-    def adjoint(self, velocity, impulse):
-        """(q, s (m), f, p (n), c (m)) of (1), end to end, of y (n,) and c, None for 0. Of J and M, with a factor.
+    def adjoint(self, velocity, impulse, slack):
+        """(q, s (m), f, p (n), c (m)) of (1), end to end, of y (n,), c and x, None for 0; of (2) n is 0. With a factor.
 
-        None where y or c is no such array or not finite: the long way finds the words.
+        None where y, c or x is no such array or not finite: the long way finds the words.
         """
-        cdef int32_t m = self.b.n_rows, n = self.data.general.n
+        cdef view_t v = self.judge.view()
+        cdef int32_t m = self.b.n_rows, n = v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
         cdef const double* y
         cdef const double* c
-        if not (is_plain(velocity, n, &y) and is_plain(impulse, m, &c)):
+        cdef const double* x
+        if not (is_plain(velocity, n, &y) and is_plain(impulse, m, &c) and is_plain(slack, m, &x)):
             return None
         out_ = np.empty(3 * m + 2 * n)
         cdef double[::1] made = out_
         cdef double* out = &made[0] if made.shape[0] else NULL
         with nogil:
-            lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out,
-                        out + m, out + 2 * m, out + 2 * m + n)
+            lav_adjoint(&v, &self.x, self.rows, self.place_, self.lu, self.swap, n, y, c, x, out, out + m, out + 2 * m,
+                        out + 2 * m + n)
             if c != NULL:
                 memcpy(out + 2 * (m + n), c, m * sizeof(double))
             else:
@@ -275,15 +324,7 @@ cdef class Linear:
 
 def wrench(Data p, const double[::1] lam, double[:, ::1] f):
     """f (n, 6) = J^T lam of bodies."""
-    cdef int32_t i, c, size
-    f[:, :] = 0.0
-    if p.blocks.n_rows == 0 or p.rows.n_bodies == 0:
-        return
-    with nogil:
-        for i in range(p.rows.n_joints):
-            joint_wrench(&p.blocks, &p.rows, i, &lam[0], &f[0, 0])
-        for c in range(p.rows.n_contacts):
-            i = p.rows.n_joints + c
-            size = p.blocks.ptr[i + 1] - p.blocks.ptr[i]
-            contact_wrench(&p.rows, c, n_directions(p.blocks.kind[i], size), n_turns(p.blocks.kind[i], size),
-                           &lam[p.blocks.ptr[i]], &f[0, 0])
+    if p.blocks.n_rows and p.rows.n_bodies:
+        rows_wrench(&p.blocks, &p.rows, &lam[0], &f[0, 0])
+    else:
+        f[:, :] = 0.0
