@@ -11,14 +11,12 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
-from lavender.base.later import sparse as sp
 from lavender.gradient.chains import Bodies, Parts
 from lavender.gradient.result import BODIES, HIGH, INPUTS, LOW, Gradient
 from lavender.gradient.system import System
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
 from lavender.problem import Problem, check_problem
-from lavender.problem.cones import ROW
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
 from lavender_ext.derivative.linear import Linear, wrench
@@ -26,7 +24,6 @@ from lavender_ext.derivative.linear import Linear, wrench
 __all__ = ["Derivative", "Tangent", "Unique", "derivative"]
 
 ACCEPTED = 1e-8  # relative residual of an answer that is differentiated, or its floor
-DENSE = 400  # rows of the system up to which it is dense
 UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
 CONTRADICTS = 1e-3  # of the lengths of a change and of a probe: what the two have in common
 MANY = 10.0  # errors of the answer within which a switch counts as one: they are estimates of first order
@@ -91,9 +88,11 @@ class Derivative:
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
         self.problem, self._impulse, self._linear = problem, impulse, linear
         disk, general = problem.disk, problem.generalized
-        self._regular = linear.prepare(disk.csr_data if general is None else disk.metric)
+        self._system = System(disk, linear)
         # The kernel has all that `vjp` needs, in the order given.
-        self._plain = self._regular and (general is None or general.order is None) and disk is problem
+        self._plain = (
+            self._system.of_kernel and disk is problem and (general is None or general.order is None)
+        )
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -117,36 +116,6 @@ class Derivative:
         if p.rows is None:
             raise CapabilityError("this problem was given as a matrix; velocities need J and M")
         return p.rows.n_bodies, 6
-
-    @cached_property
-    def _system(self) -> System:
-        """Where the kernel has no factor: many rows, or rows that repeat others."""
-        n, p = self._linear, self.problem
-        if n.rows <= DENSE:
-            return System(n.matrix, n.rows)
-        at, scale = self._places, sp.diags_array(1.0 / self._root[self._places])
-        pi, one = self._p_matrix(), sp.eye_array(n.rows)
-        h = scale @ p.csr[at][:, at] @ scale
-        return System(lambda shift: sp.csc_array(one - pi + pi @ (h + shift * one)), n.rows)
-
-    @property
-    def _solver(self) -> Any:
-        return self._linear if self._regular else self._system
-
-    @property
-    def _singular(self) -> bool:
-        return not self._regular and self._system.singular
-
-    def _p_matrix(self) -> sp.csr_array:
-        c = self.problem.cones
-        block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-        alone = (c.kind == ROW)[block]
-        width = np.where(alone, 1, np.diff(c.ptr)[block])
-        indptr = np.concatenate([[0], np.cumsum(width)])
-        first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
-        columns = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], width)
-        found = sp.csr_array((self._linear.p, columns, indptr), shape=(c.n_rows, c.n_rows))
-        return sp.csr_array(found[self._places][:, self._places])
 
     # -- products --------------------------------------------------------------------------------
 
@@ -229,9 +198,9 @@ class Derivative:
         out[at] = 0.0
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
         right = (r - known)[at]
-        if exactly and self._singular and self._contradicts(right):
+        if exactly and self._system.singular and self._contradicts(right):
             self.refuse_alone("no derivative along this change exists")
-        out[at] = self._solver.solve(right)
+        out[at] = self._system.solve(right)
         return out
 
     def _contradicts(self, right: FloatArray) -> bool:
@@ -241,7 +210,7 @@ class Derivative:
 
     def refuse_alone(self, words: str) -> None:
         """Of what changes one row of several that share a load."""
-        if not self._singular:
+        if not self._system.singular:
             return
         off = np.flatnonzero(~self.unique.target)
         if len(off):
@@ -295,7 +264,7 @@ class Derivative:
         # Slacks and velocities are unique where A is that of bodies and the law is convex.
         if p.matrix is not None or p.law == "coulomb" or c.any():
             self._refuse_undetermined(scaled)
-        q[self._places] = self._solver.solve(scaled, True)
+        q[self._places] = self._system.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
         if x is not None:
             s -= x
@@ -305,7 +274,7 @@ class Derivative:
         return np.concatenate([q, s, f, self._through_mass(f), c])
 
     def _refuse_undetermined(self, c: FloatArray) -> None:
-        if not self._singular:
+        if not self._system.singular:
             return
         size = float(np.linalg.norm(c))
         if any(abs(float(x @ c)) > UNMOVED * size for x in self._null):
@@ -420,7 +389,7 @@ class Derivative:
 
     @cached_property
     def _null(self) -> FloatArray:
-        return self._system.probes(False) if self._singular else np.zeros((0, self._linear.rows))
+        return self._system.probes(False)
 
     @cached_property
     def unique(self) -> Unique:
@@ -436,7 +405,7 @@ class Derivative:
             impulse &= np.abs(x) <= UNMOVED * size
             slack &= moved <= UNMOVED * size
             velocity = velocity and bool(moved.max() <= UNMOVED * size)
-        for q in self._system.probes(True) if self._singular else ():
+        for q in self._system.probes(True):
             x = np.zeros(m)
             x[at] = q
             target &= np.abs(self._linear.times(x, True)) <= UNMOVED * np.abs(x).max()

@@ -22,12 +22,10 @@ from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
                                               natural_t, place_rows, scaled_csr, scaled_general, system_rows)
-from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve, lu_solve_back
+from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back
+from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
-
-cdef enum:
-    SMALL = 64                  # rows up to which the factor is made here; LAPACK's is faster beyond
 
 cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
 
@@ -89,7 +87,7 @@ cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, 
     for i in range(m):
         if place[i] >= 0:
             s[place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.root[i]
-    lu_solve_back(rows, lu, swap, s)
+    dense_lu_solve_back(rows, lu, swap, s)
     for i in range(m):
         q[i] = s[place[i]] if place[i] >= 0 else 0.0
     block_times(a, &v.p, a.p, q, True, s)
@@ -125,8 +123,8 @@ cdef bint is_plain(given, Py_ssize_t n, const double** to):
 cdef class Linear:
     """An impulse (m,) [N s], judged by the data that the judge reads, and linearised.
 
-    `impulse` is kept as it is. The judge's reference must be known to the data. `regular`: `solve` and `adjoint` have
-    a factor; else `prepare` was not called, or G is singular, or it has more rows than are factored here.
+    `impulse` is kept as it is. The judge's reference must be known to the data. `solve` and `adjoint` are of the factor
+    that `prepare` found.
     """
     cdef blocks_t b
     cdef natural_t x
@@ -173,26 +171,38 @@ cdef class Linear:
         self.relative = relative_of(&s, self.w, m, judge.start_energy, judge.start_velocity)
         self.floor = relative(s.floor_energy, s.floor_velocity, judge.start_energy, judge.start_velocity)
 
-    def prepare(self, Data data):
-        """Factor G with A of the data, in rows or J and M, where it has few rows; whether there is a factor."""
+    def prepare(self, Data data, double shift=0.0):
+        """Factor G of H + shift, A of the data in rows or J and M; whether there is a factor."""
         cdef int32_t i, n = self.rows
         cdef double least = 1.0 / 0.0, most = 0.0, x
+        cdef Room room
         self.data = data
-        if n == 0 or n > SMALL:
-            self.regular = n == 0
-            return self.regular
+        if n == 0:
+            self.regular = True
+            return True
         self.factor = room_for((<Py_ssize_t>n * n) * sizeof(double) + n * sizeof(int32_t))
+        room = room_for(<Py_ssize_t>n * PANEL * sizeof(double))
         self.lu = <double*>self.factor.at
-        self.swap = <int32_t*>(self.lu + n * n)
-        self.form(self.lu, 0.0)
+        self.swap = <int32_t*>(self.lu + <Py_ssize_t>n * n)
+        self.form(self.lu, shift)
         with nogil:
-            if lu_factor(n, self.lu, self.swap):
+            if dense_lu(has_wide(), n, self.lu, self.swap, <double*>room.at):
                 for i in range(n):
-                    x = fabs(self.lu[i * n + i])
+                    x = fabs(self.lu[<Py_ssize_t>i * n + i])
                     least = x if x < least else least
                     most = x if x > most else most
         self.regular = least > SINGULAR * most and most > 0.0
         return self.regular
+
+    @property
+    def slides(self):
+        """Whether some row of G is not that of H: some contact slides, or is without friction."""
+        cdef int32_t i, j
+        for i in range(self.b.n_blocks):
+            for j in range(self.b.ptr[i], self.b.ptr[i + 1]):
+                if self.place_[j] >= 0 and self.x.case_[j] == SLIDES:
+                    return True
+        return False
 
     cdef void form(self, double* g, double shift):
         cdef int32_t n = self.rows, i
@@ -207,12 +217,12 @@ cdef class Linear:
                 h[<Py_ssize_t>i * n + i] += shift
             system_rows(&self.x, &self.b, n, self.place_, h, g)
 
-    def matrix(self, double shift=0.0):
-        """G (n, n) on the rows with a place, of H + shift."""
+    def matrix(self):
+        """G (n, n) on the rows with a place."""
         out_ = np.empty((self.rows, self.rows))
         cdef double[:, ::1] out = out_
         if self.rows:
-            self.form(&out[0, 0], shift)
+            self.form(&out[0, 0], 0.0)
         return out_
 
     def solve(self, r, bint back=False):
@@ -220,9 +230,9 @@ cdef class Linear:
         out_ = r.copy()
         cdef double[::1] out = out_
         if self.rows and back:
-            lu_solve_back(self.rows, self.lu, self.swap, &out[0])
+            dense_lu_solve_back(self.rows, self.lu, self.swap, &out[0])
         elif self.rows:
-            lu_solve(self.rows, self.lu, self.swap, &out[0])
+            dense_lu_solve(self.rows, self.lu, self.swap, &out[0])
         return out_
 
     def adjoint(self, velocity, impulse, slack):
