@@ -12,14 +12,14 @@ from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
 from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, HIGH, INPUTS, LOW, Gradient
-from lavender.gradient.system import System
+from lavender.gradient.result import BODIES, INPUTS, Gradient
+from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
 from lavender.problem import Problem, check_problem
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
-from lavender_ext.derivative.linear import Linear, wrench
+from lavender_ext.derivative.linear import CASES, Linear, wrench
 
 __all__ = ["Derivative", "Tangent", "Unique", "derivative"]
 
@@ -88,11 +88,13 @@ class Derivative:
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
         self.problem, self._impulse, self._linear = problem, impulse, linear
         disk, general = problem.disk, problem.generalized
-        self._system = System(disk, linear)
+        regular = prepared(disk, linear) if linear.rows <= SMALL else self._system.of_kernel
         # The kernel has all that `vjp` needs, in the order given.
-        self._plain = (
-            self._system.of_kernel and disk is problem and (general is None or general.order is None)
-        )
+        self._plain = regular and disk is problem and (general is None or general.order is None)
+
+    @cached_property
+    def _system(self) -> System:
+        return System(self.problem.disk, self._linear)
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -176,6 +178,13 @@ class Derivative:
     @cached_property
     def _parts(self) -> Parts:
         return Parts(self.problem)
+
+    @cached_property
+    def _acting(self) -> FloatArray:
+        # (2, m) how much lower and upper bounds act: of lower = upper, which move together, half each
+        case, c = self._linear.case, self.problem.cones
+        acts = np.array([case == CASES["low"], case == CASES["high"]], np.float64)
+        return np.where(acts.any(axis=0) & (c.lower == c.upper), 0.5, acts)
 
     @cached_property
     def _axes(self) -> tuple[Any, FloatArray, FloatArray]:
@@ -309,10 +318,8 @@ class Derivative:
         r, push = np.zeros(p.m), np.zeros(p.m)  # push: dA lambda - db
         for name in ("b", "target"):
             push -= given.get(name, 0.0)
-        case = self._linear.case
-        for name, at in (("lower", LOW), ("upper", HIGH)):
-            if name in given:
-                r += np.where(case == at, self._root * given[name], 0.0)
+        for name, acts in zip(("lower", "upper"), self._acting, strict=True):
+            r += acts * self._root * given.get(name, 0.0)
         wanted = [given.get(name) for name in ("mu", "patch_radius", "rolling")]
         if any(x is not None for x in wanted):
             r += self._by_reach(self._parts.reaches(*wanted))

@@ -12,11 +12,9 @@ from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
-from lavender_ext.derivative.linear import CASES
 
-__all__ = ["BODIES", "HIGH", "INPUTS", "LOW", "Gradient"]
+__all__ = ["BODIES", "INPUTS", "Gradient"]
 
-LOW, HIGH = CASES["low"], CASES["high"]
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
 INPUTS = {
@@ -78,15 +76,16 @@ class Gradient:
     def __getattr__(self, name: str) -> Any:
         if name not in INPUTS:
             raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
-        operator, kept = self._of.problem.operator, self.__dict__
+        of, kept = self._of, self.__dict__
+        operator = of.problem.operator
         if operator not in INPUTS[name]:
             raise CapabilityError(
                 f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
             )
-        if name in ALONE:
-            self._of.refuse_alone(f"no derivative by {name} exists here")
+        if not of._plain and name in ALONE:
+            of.refuse_alone(f"no derivative by {name} exists here")
         if name in BODIES:
-            kept.update(self._of._bodies.back(self))
+            kept.update(of._bodies.back(self))
         else:
             kept[name] = getattr(self, f"_by_{name}")()
         return kept[name]
@@ -108,15 +107,11 @@ class Gradient:
         assert compliance is not None
         return np.asarray(self._c + o._along(self._moved[1]) - compliance * self._s)
 
-    def _by_lower(self, acts: int = LOW) -> FloatArray:
-        o = self._of
-        c, case = o.problem.cones, o._linear.case
-        bound = (case == LOW) | (case == HIGH)
-        half = 0.5 * self._pull
-        return np.where(bound & (c.lower == c.upper), half, np.where(case == acts, self._pull, 0.0))
+    def _by_lower(self) -> FloatArray:
+        return self._of._acting[0] * self._pull
 
     def _by_upper(self) -> FloatArray:
-        return self._by_lower(HIGH)
+        return self._of._acting[1] * self._pull
 
     @cached_property
     def _reach(self) -> FloatArray:

@@ -18,7 +18,7 @@ from lavender.solvers.newton_systems.systems import is_full
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.sparse import SparsePanels, free_part
 
-__all__ = ["System"]
+__all__ = ["SMALL", "System", "prepared"]
 
 SINGULAR = 1e-12  # least pivot over the largest, from which on rows count as repeating others
 SHIFT = 1e-11  # eps of (6)
@@ -33,6 +33,13 @@ DENSE = (
 Solve = Callable[[FloatArray, bool], FloatArray]
 
 
+def prepared(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
+    """Whether the kernel has a dense factor."""
+    data = problem.csr_data if problem.generalized is None else problem.metric
+    found: bool = linear.prepare(data, shift)
+    return found
+
+
 class System:
     """A factor of G on the rows that are not its identity; solves with it and with its transpose.
 
@@ -41,28 +48,28 @@ class System:
 
     def __init__(self, problem: Problem, linear: Linear) -> None:
         self.problem, self.linear, self.n = problem, linear, linear.rows
-        # What the judge reads of J and M has what their G is made of.
-        self._data: Any = problem.metric if problem.generalized is not None else None
         few = self.n > SMALL and not linear.slides and problem.is_symmetric
         if few and not is_full(problem.csr.nnz, problem.m, True):
             factor = self._panels
         else:
             factor = self._dense if self.n <= DENSE else self._superlu
-        once = factor(0.0)
+        # Of few rows `prepared` was tried.
+        tried = self.n <= SMALL
+        once = linear.solve if tried and linear.regular else None if tried else factor(0.0)
         self.singular = once is None
         self.of_kernel = once is not None and factor == self._dense
-        self._once = once if once is not None else factor(SHIFT)
-        if self._once is None:
+        if once is None:
+            self.g: Any = linear.matrix() if factor == self._dense else self._matrix(0.0)
+            once = factor(SHIFT)
+        if once is None:
             raise CapabilityError(
                 f"the equations of this solution's states have no factor, shifted by {SHIFT:g} of their diagonal "
                 "either: an A that is indefinite, or states that are wrong"
             )
-        if self.singular:
-            self.g: Any = linear.matrix() if factor == self._dense else self._matrix(0.0)
+        self._once = once
 
     def _dense(self, shift: float) -> Solve | None:
-        data = self.problem.csr_data if self._data is None else self._data
-        return self.linear.solve if self.linear.prepare(data, shift) else None
+        return self.linear.solve if prepared(self.problem, self.linear, shift) else None
 
     def _h(self) -> tuple[Any, Any, FloatArray]:
         # H on the rows of G in compressed rows
@@ -103,7 +110,6 @@ class System:
 
     def solve(self, r: FloatArray, back: bool = False) -> FloatArray:
         """Solve G x = r, or G^T x = r."""
-        assert self._once is not None
         x = self._once(r, back)
         if self.singular:
             g = self.g.T if back else self.g
@@ -118,7 +124,6 @@ class System:
         """(PROBES, n) vectors that G, or G^T, maps to rounding, of a random share; of a regular one none."""
         if not self.singular:
             return np.zeros((0, self.n))
-        assert self._once is not None
         g, out = (self.g.T if back else self.g), []
         for x in np.random.default_rng(0).standard_normal((PROBES, self.n)):
             for _ in range(TURNS):
