@@ -11,22 +11,19 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
-from lavender.base.later import sparse as sp
 from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, HIGH, INPUTS, LOW, Gradient
-from lavender.gradient.system import System
+from lavender.gradient.result import BODIES, INPUTS, Gradient
+from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
 from lavender.problem import Problem, check_problem
-from lavender.problem.cones import ROW
 from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
-from lavender_ext.derivative.linear import Linear, wrench
+from lavender_ext.derivative.linear import CASES, Linear, wrench
 
 __all__ = ["Derivative", "Tangent", "Unique", "derivative"]
 
 ACCEPTED = 1e-8  # relative residual of an answer that is differentiated, or its floor
-DENSE = 400  # rows of the system up to which it is dense
 UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
 CONTRADICTS = 1e-3  # of the lengths of a change and of a probe: what the two have in common
 MANY = 10.0  # errors of the answer within which a switch counts as one: they are estimates of first order
@@ -91,9 +88,13 @@ class Derivative:
     def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
         self.problem, self._impulse, self._linear = problem, impulse, linear
         disk, general = problem.disk, problem.generalized
-        self._regular = linear.prepare(disk.csr_data if general is None else disk.metric)
+        regular = prepared(disk, linear) if linear.rows <= SMALL else self._system.of_kernel
         # The kernel has all that `vjp` needs, in the order given.
-        self._plain = self._regular and general is not None and general.order is None and disk is problem
+        self._plain = regular and disk is problem and (general is None or general.order is None)
+
+    @cached_property
+    def _system(self) -> System:
+        return System(self.problem.disk, self._linear)
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -117,36 +118,6 @@ class Derivative:
         if p.rows is None:
             raise CapabilityError("this problem was given as a matrix; velocities need J and M")
         return p.rows.n_bodies, 6
-
-    @cached_property
-    def _system(self) -> System:
-        """Where the kernel has no factor: many rows, or rows that repeat others."""
-        n, p = self._linear, self.problem
-        if n.rows <= DENSE:
-            return System(n.matrix, n.rows)
-        at, scale = self._places, sp.diags_array(1.0 / self._root[self._places])
-        pi, one = self._p_matrix(), sp.eye_array(n.rows)
-        h = scale @ p.csr[at][:, at] @ scale
-        return System(lambda shift: sp.csc_array(one - pi + pi @ (h + shift * one)), n.rows)
-
-    @property
-    def _solver(self) -> Any:
-        return self._linear if self._regular else self._system
-
-    @property
-    def _singular(self) -> bool:
-        return not self._regular and self._system.singular
-
-    def _p_matrix(self) -> sp.csr_array:
-        c = self.problem.cones
-        block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-        alone = (c.kind == ROW)[block]
-        width = np.where(alone, 1, np.diff(c.ptr)[block])
-        indptr = np.concatenate([[0], np.cumsum(width)])
-        first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
-        columns = np.arange(indptr[-1]) + np.repeat(first - indptr[:-1], width)
-        found = sp.csr_array((self._linear.p, columns, indptr), shape=(c.n_rows, c.n_rows))
-        return sp.csr_array(found[self._places][:, self._places])
 
     # -- products --------------------------------------------------------------------------------
 
@@ -209,6 +180,13 @@ class Derivative:
         return Parts(self.problem)
 
     @cached_property
+    def _acting(self) -> FloatArray:
+        # (2, m) how much lower and upper bounds act: of lower = upper, which move together, half each
+        case, c = self._linear.case, self.problem.cones
+        acts = np.array([case == CASES["low"], case == CASES["high"]], np.float64)
+        return np.where(acts.any(axis=0) & (c.lower == c.upper), 0.5, acts)
+
+    @cached_property
     def _axes(self) -> tuple[Any, FloatArray, FloatArray]:
         # Rows of ellipses, where root_j = c / e_j: what de_j changes in z and, through P, in y.
         rows = np.flatnonzero(np.repeat(self._parts.ellipse, np.diff(self.problem.cones.ptr)))
@@ -229,9 +207,9 @@ class Derivative:
         out[at] = 0.0
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
         right = (r - known)[at]
-        if exactly and self._singular and self._contradicts(right):
+        if exactly and self._system.singular and self._contradicts(right):
             self.refuse_alone("no derivative along this change exists")
-        out[at] = self._solver.solve(right)
+        out[at] = self._system.solve(right)
         return out
 
     def _contradicts(self, right: FloatArray) -> bool:
@@ -241,6 +219,8 @@ class Derivative:
 
     def refuse_alone(self, words: str) -> None:
         """Of what changes one row of several that share a load."""
+        if not self._system.singular:
+            return
         off = np.flatnonzero(~self.unique.target)
         if len(off):
             some = ", ".join(self.problem.row_name(int(i)) for i in off[:3])
@@ -274,30 +254,36 @@ class Derivative:
         p = self.problem
         if velocity is None and impulse is None and slack is None:
             raise InputError("give velocity=, impulse= or slack=: what the scalar weighs of the solution")
-        x = y = given = None
-        if velocity is not None:
-            y = as_array("velocity", velocity, self._velocities()).reshape(-1)
-        if impulse is not None:
-            given = as_array("impulse", impulse, (p.m,))
-        c = np.zeros(p.m) if given is None else given.copy()
-        if slack is not None:
-            x = as_array("slack", slack, (p.m,))
-            c += self._a(x, True)
-        if self._plain and x is None:
-            q, s, *moved = self._linear.adjoint(y, c)
-            return Gradient(self, q, s, y, given, moved)
+        made = self._linear.adjoint(velocity, impulse, slack) if self._plain else None
+        if made is not None:
+            return Gradient(self, made)
+        y = None if velocity is None else as_array("velocity", velocity, self._velocities()).reshape(-1)
+        c = np.zeros(p.m) if impulse is None else as_array("impulse", impulse, (p.m,))
+        x = None if slack is None else as_array("slack", slack, (p.m,))
+        return Gradient(self, (self._linear.adjoint if self._plain else self._adjoint)(y, c, x))
+
+    def _adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
+        """(q, s (m), f, p (nv), c (m)) of (4), end to end, with f = y - J^T s; no f and p of a matrix."""
+        p, right = self.problem, c.copy()
+        if x is not None:
+            right += self._a(x, True)
         if y is not None:
-            c += self._along(self._through_mass(y))
-        scaled, at, q = (c / self._root)[self._places], self._places, np.zeros(p.m)
+            right += self._along(self._through_mass(y))
+        scaled, q = (right / self._root)[self._places], np.zeros(p.m)
         # Slacks and velocities are unique where A is that of bodies and the law is convex.
-        if p.matrix is not None or p.law == "coulomb" or impulse is not None:
+        if p.matrix is not None or p.law == "coulomb" or c.any():
             self._refuse_undetermined(scaled)
-        q[at] = self._solver.solve(scaled, True)
+        q[self._places] = self._system.solve(scaled, True)
         s = self._linear.times(q, True) / self._root
-        return Gradient(self, q, s if x is None else s - x, y, given)
+        if x is not None:
+            s -= x
+        if p.matrix is not None:
+            return np.concatenate([q, s, c])
+        f = (0.0 if y is None else y) - self._wrench(s)
+        return np.concatenate([q, s, f, self._through_mass(f), c])
 
     def _refuse_undetermined(self, c: FloatArray) -> None:
-        if not self._singular:
+        if not self._system.singular:
             return
         size = float(np.linalg.norm(c))
         if any(abs(float(x @ c)) > UNMOVED * size for x in self._null):
@@ -332,10 +318,8 @@ class Derivative:
         r, push = np.zeros(p.m), np.zeros(p.m)  # push: dA lambda - db
         for name in ("b", "target"):
             push -= given.get(name, 0.0)
-        case = self._linear.case
-        for name, at in (("lower", LOW), ("upper", HIGH)):
-            if name in given:
-                r += np.where(case == at, self._root * given[name], 0.0)
+        for name, acts in zip(("lower", "upper"), self._acting, strict=True):
+            r += acts * self._root * given.get(name, 0.0)
         wanted = [given.get(name) for name in ("mu", "patch_radius", "rolling")]
         if any(x is not None for x in wanted):
             r += self._by_reach(self._parts.reaches(*wanted))
@@ -412,7 +396,7 @@ class Derivative:
 
     @cached_property
     def _null(self) -> FloatArray:
-        return self._system.probes(False) if self._singular else np.zeros((0, self._linear.rows))
+        return self._system.probes(False)
 
     @cached_property
     def unique(self) -> Unique:
@@ -428,7 +412,7 @@ class Derivative:
             impulse &= np.abs(x) <= UNMOVED * size
             slack &= moved <= UNMOVED * size
             velocity = velocity and bool(moved.max() <= UNMOVED * size)
-        for q in self._system.probes(True) if self._singular else ():
+        for q in self._system.probes(True):
             x = np.zeros(m)
             x[at] = q
             target &= np.abs(self._linear.times(x, True)) <= UNMOVED * np.abs(x).max()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,11 +12,9 @@ from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
-from lavender_ext.derivative.linear import CASES
 
-__all__ = ["BODIES", "HIGH", "INPUTS", "LOW", "Gradient"]
+__all__ = ["BODIES", "INPUTS", "Gradient"]
 
-LOW, HIGH = CASES["low"], CASES["high"]
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
 INPUTS = {
@@ -54,36 +51,44 @@ class Gradient:
     only the part along it does.
     """
 
-    def __init__(
-        self,
-        of: Any,
-        q: FloatArray,
-        s: FloatArray,
-        y: FloatArray | None,
-        c: FloatArray | None,
-        moved: Sequence[FloatArray] | None = None,  # v_free, p
-    ) -> None:
-        self._of, self._q, self._s, self._y, self._c = of, q, s, y, c
-        self._kept: dict[str, Any] = {}
-        if moved is not None:
-            self._kept["v_free"], self.__dict__["_p"] = moved
+    def __init__(self, of: Any, made: FloatArray) -> None:
+        self._of, self._made = of, made  # q, s (m), f, p (nv), c (m)
+
+    @property
+    def _q(self) -> FloatArray:
+        return self._made[: self._of.problem.m]
+
+    @property
+    def _s(self) -> FloatArray:
+        m = self._of.problem.m
+        return self._made[m : 2 * m]
+
+    @cached_property
+    def _moved(self) -> FloatArray:
+        # f and p (2, nv) of (4)
+        m = self._of.problem.m
+        return self._made[2 * m : len(self._made) - m].reshape(2, -1)
+
+    @property
+    def _c(self) -> FloatArray:
+        return self._made[len(self._made) - self._of.problem.m :]
 
     def __getattr__(self, name: str) -> Any:
         if name not in INPUTS:
             raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
-        if name not in self._kept:
-            operator = self._of.problem.operator
-            if operator not in INPUTS[name]:
-                raise CapabilityError(
-                    f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
-                )
-            if name in ALONE:
-                self._of.refuse_alone(f"no derivative by {name} exists here")
-            if name in BODIES:
-                self._kept |= self._of._bodies.back(self)
-            else:
-                self._kept[name] = getattr(self, f"_by_{name}")()
-        return self._kept[name]
+        of, kept = self._of, self.__dict__
+        operator = of.problem.operator
+        if operator not in INPUTS[name]:
+            raise CapabilityError(
+                f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
+            )
+        if not of._plain and name in ALONE:
+            of.refuse_alone(f"no derivative by {name} exists here")
+        if name in BODIES:
+            kept.update(of._bodies.back(self))
+        else:
+            kept[name] = getattr(self, f"_by_{name}")()
+        return kept[name]
 
     def _by_b(self) -> FloatArray:
         return self._s
@@ -91,29 +96,22 @@ class Gradient:
     _by_target = _by_b
 
     def _by_v_free(self) -> FloatArray:
-        o = self._of
-        found = -o._wrench(self._s)
-        return (found if self._y is None else self._y + found).reshape(o._velocities())
+        return self._moved[0].reshape(self._of._velocities())
 
     @cached_property
     def _pull(self) -> FloatArray:
         # by an impulse that is moved and held: c + A^T-part of what its push changes
-        o, c = self._of, 0.0 if self._c is None else self._c
-        matrix, compliance = o.problem.matrix, o.problem.compliance
+        o, matrix, compliance = self._of, self._of.problem.matrix, self._of.problem.compliance
         if matrix is not None:
-            return np.asarray(c - matrix.T @ self._s)
+            return np.asarray(self._c - matrix.T @ self._s)
         assert compliance is not None
-        return np.asarray(c + o._along(self._p) - compliance * self._s)
+        return np.asarray(self._c + o._along(self._moved[1]) - compliance * self._s)
 
-    def _by_lower(self, acts: int = LOW) -> FloatArray:
-        o = self._of
-        c, case = o.problem.cones, o._linear.case
-        bound = (case == LOW) | (case == HIGH)
-        half = 0.5 * self._pull
-        return np.where(bound & (c.lower == c.upper), half, np.where(case == acts, self._pull, 0.0))
+    def _by_lower(self) -> FloatArray:
+        return self._of._acting[0] * self._pull
 
     def _by_upper(self) -> FloatArray:
-        return self._by_lower(HIGH)
+        return self._of._acting[1] * self._pull
 
     @cached_property
     def _reach(self) -> FloatArray:
@@ -151,21 +149,15 @@ class Gradient:
             return _on(o.problem.matrix, (-self._s, o._impulse))
         return -np.outer(self._s, o._impulse)
 
-    @cached_property
-    def _p(self) -> FloatArray:
-        # p of (4)
-        o = self._of
-        z = o._moved(self._s)
-        return -z if self._y is None else o._through_mass(self._y) - z
-
     def _pairs(self, name: str) -> list[tuple[FloatArray, FloatArray]]:
         # (5) of A, J or M as a sum of u v^T
         o = self._of
         if name == "A":
             return [(-self._s, o._impulse)]
+        p = self._moved[1]
         if name == "J":
-            return [(o._impulse, self._p), (-self._s, o._velocity)]
-        return [(-0.5 * self._p, o._change), (-0.5 * o._change, self._p)]
+            return [(o._impulse, p), (-self._s, o._velocity)]
+        return [(-0.5 * p, o._change), (-0.5 * o._change, p)]
 
     def _by_J(self) -> sp.csr_array:
         return _on(self._of.problem.jacobian, *self._pairs("J"))

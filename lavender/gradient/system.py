@@ -1,4 +1,4 @@
-"""The linear system of a derivative where the kernel has no factor of it: many rows, or rows that repeat others."""
+"""The linear system of a derivative: its factor by what suits it, and what solves it where rows repeat others."""
 
 from __future__ import annotations
 
@@ -9,54 +9,107 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
-from lavender.base.later import lapack
+from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
+from lavender.problem import Problem
+from lavender.problem.cones import ROW
+from lavender.solvers._factor import WIDE
+from lavender.solvers.newton_systems.systems import is_full
+from lavender_ext.derivative.linear import Linear
+from lavender_ext.factor.sparse import SparsePanels, free_part
 
-__all__ = ["System"]
+__all__ = ["SMALL", "System", "prepared"]
 
 SINGULAR = 1e-12  # least pivot over the largest, from which on rows count as repeating others
 SHIFT = 1e-11  # eps of (6)
 TURNS = 8  # of (6): what is 1e-11 of the diagonal is off by 2^-8 then, what is 1e-9 by 1e-16
 ENOUGH = 1e-14  # of the largest entry, below which a turn changes nothing
 PROBES = 2  # random vectors that show what is not determined
+SMALL = 64  # rows up to which the system is dense, whatever A is
+DENSE = (
+    400  # rows up to which it is dense where A is no symmetric matrix with few entries, or a contact slides
+)
+
+Solve = Callable[[FloatArray, bool], FloatArray]
+
+
+def prepared(problem: Problem, linear: Linear, shift: float = 0.0) -> bool:
+    """Whether the kernel has a dense factor."""
+    data = problem.csr_data if problem.generalized is None else problem.metric
+    found: bool = linear.prepare(data, shift)
+    return found
 
 
 class System:
-    """A factor of G on the rows that are not its identity; solves with it and with its transpose."""
+    """A factor of G on the rows that are not its identity; solves with it and with its transpose.
 
-    def __init__(self, shifted: Callable[[float], Any], n: int) -> None:
-        self.g, self.n = shifted(0.0), n
-        self.is_dense = isinstance(self.g, np.ndarray)
-        self.singular = n > 0 and not self._factor(self.g)
-        if self.singular and not self._factor(shifted(SHIFT)):
+    `of_kernel`: the factor is the kernel's own, and G is regular.
+    """
+
+    def __init__(self, problem: Problem, linear: Linear) -> None:
+        self.problem, self.linear, self.n = problem, linear, linear.rows
+        few = self.n > SMALL and not linear.slides and problem.is_symmetric
+        if few and not is_full(problem.csr.nnz, problem.m, True):
+            factor = self._panels
+        else:
+            factor = self._dense if self.n <= DENSE else self._superlu
+        # Of few rows `prepared` was tried.
+        tried = self.n <= SMALL
+        once = linear.solve if tried and linear.regular else None if tried else factor(0.0)
+        self.singular = once is None
+        self.of_kernel = once is not None and factor == self._dense
+        if once is None:
+            self.g: Any = linear.matrix() if factor == self._dense else self._matrix(0.0)
+            once = factor(SHIFT)
+        if once is None:
             raise CapabilityError(
                 f"the equations of this solution's states have no factor, shifted by {SHIFT:g} of their diagonal "
                 "either: an A that is indefinite, or states that are wrong"
             )
+        self._once = once
 
-    def _factor(self, g: Any) -> bool:
-        if self.is_dense:
-            # of the transpose, as LAPACK sees rows
-            self._lu, self._swap, _ = lapack.dgetrf(g.T, overwrite_a=False)
-            pivots = np.abs(self._lu.ravel(order="K")[:: self.n + 1])
-        else:
-            try:
-                self._sparse = sparse_lu(g)
-            except RuntimeError:
-                return False
-            pivots = np.abs(self._sparse.U.diagonal())
-        return bool(pivots.min() > SINGULAR * pivots.max())  # NaN: no
+    def _dense(self, shift: float) -> Solve | None:
+        return self.linear.solve if prepared(self.problem, self.linear, shift) else None
 
-    def _once(self, r: FloatArray, back: bool) -> FloatArray:
-        if self.is_dense:
-            x: FloatArray = lapack.dgetrs(self._lu, self._swap, r, trans=0 if back else 1)[0]
-            return x
-        return self._sparse.solve(r, trans="T" if back else "N")
+    def _h(self) -> tuple[Any, Any, FloatArray]:
+        # H on the rows of G in compressed rows
+        a, n = self.problem.csr, self.linear
+        indptr, indices, data = free_part(a.indptr, a.indices, a.data, n.place, self.n)
+        root = n.root[n.place >= 0]
+        return indptr, indices, data / (np.repeat(root, np.diff(indptr)) * root[indices])
+
+    def _panels(self, shift: float) -> Solve | None:
+        # G = H, symmetric
+        indptr, indices, data = self._h()
+        panels = SparsePanels(indptr, indices, False, WIDE)
+        lost = panels.factor(data, np.ones(self.n), shift, SINGULAR)
+        return None if lost else lambda r, back: panels.solve(r)
+
+    def _matrix(self, shift: float) -> Any:
+        indptr, indices, data = self._h()
+        h = sp.csr_array((data, indices, indptr), shape=(self.n, self.n))
+        c, one = self.problem.cones, sp.eye_array(self.n)
+        block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
+        alone = (c.kind == ROW)[block]
+        ends = np.concatenate([[0], np.cumsum(np.where(alone, 1, np.diff(c.ptr)[block]))])
+        first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
+        columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], np.diff(ends))
+        at = np.flatnonzero(self.linear.place >= 0)
+        p = sp.csr_array((self.linear.p, columns, ends), shape=(c.n_rows, c.n_rows))[at][:, at]
+        return sp.csc_array(one - p + p @ (h + shift * one))
+
+    def _superlu(self, shift: float) -> Solve | None:
+        try:
+            found = sparse_lu(self._matrix(shift))
+        except RuntimeError:
+            return None
+        pivots = np.abs(found.U.diagonal())
+        if not pivots.min() > SINGULAR * pivots.max():
+            return None
+        return lambda r, back: found.solve(r, trans="T" if back else "N")
 
     def solve(self, r: FloatArray, back: bool = False) -> FloatArray:
         """Solve G x = r, or G^T x = r."""
-        if self.n == 0:
-            return r.copy()
         x = self._once(r, back)
         if self.singular:
             g = self.g.T if back else self.g

@@ -82,22 +82,27 @@ cdef inline void wrenches_to_velocity(const rows_t* r, double* v) noexcept nogil
         inv += 9
 
 
-cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
-    """v = M^-1 J^T lam (n, 6) of all blocks, by (1)."""
+cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* lam, double* f) noexcept nogil:
+    """f = J^T lam (n, 6) of all blocks."""
     cdef int32_t i, j, c, nt, turns
     for i in range(6 * r.n_bodies):
-        v[i] = 0.0
+        f[i] = 0.0
     for i in range(r.n_joints):
-        joint_wrench(p, r, i, lam, v)
+        joint_wrench(p, r, i, lam, f)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
         nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
         turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
-            contact_wrench(r, c, nt, turns, lam + j, v)
+            contact_wrench(r, c, nt, turns, lam + j, f)
         elif nt == 2:
-            contact_wrench(r, c, 2, 0, lam + j, v)
+            contact_wrench(r, c, 2, 0, lam + j, f)
         else:
-            contact_wrench(r, c, 0, 0, lam + j, v)
+            contact_wrench(r, c, 0, 0, lam + j, f)
+
+
+cdef inline void rows_velocity(const blocks_t* p, const rows_t* r, const double* lam, double* v) noexcept nogil:
+    """v = M^-1 J^T lam (n, 6) of all blocks, by (1)."""
+    rows_wrench(p, r, lam, v)
     wrenches_to_velocity(r, v)

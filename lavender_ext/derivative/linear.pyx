@@ -1,28 +1,31 @@
 """An answer, judged and linearised (`natural.pxd`), with a factor of its equations where these are few; for Python.
 
-Where the equations are of J and M, with cotangents c of lambda and y of v (equation (4) of lavender/gradient/__init__.py),
+With cotangents c of lambda, x of w and y of v (equation (4) of lavender/gradient/__init__.py), of J and M or bodies
 
-    G^T q = D^-1/2 (c + J M^-1 y),   s = D^-1/2 P^T q,   f = y - J^T s,   p = M^-1 f                        (1)
+    G^T q = D^-1/2 (c + C x + J M^-1 (y + J^T x)),   s = D^-1/2 P^T q - x,   f = y - J^T s,   p = M^-1 f    (1)
+
+with C the compliance, and of a matrix
+
+    G^T q = D^-1/2 (c + A^T x),   s = D^-1/2 P^T q - x                                                      (2)
 """
 from libc.math cimport fabs
-from libc.stdint cimport int8_t, int32_t, int64_t
-from libc.string cimport memcpy
+from libc.stdint cimport int8_t, int32_t
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.block cimport ROW, blocks_t, n_directions, n_turns
-from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.core.block cimport ROW, blocks_t
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
 from lavender_ext.core.problem cimport Data, Room, room_for
-from lavender_ext.core.velocity cimport contact_wrench, joint_wrench
+from lavender_ext.core.rows cimport rows_times
+from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
                                               natural_t, place_rows, scaled_csr, scaled_general, system_rows)
-from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve, lu_solve_back
+from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back
+from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
-
-cdef enum:
-    SMALL = 64                  # rows up to which the factor is made here; LAPACK's is faster beyond
 
 cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
 
@@ -30,37 +33,98 @@ cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G c
 CASES = {"open": OPEN, "closed": CLOSED, "sticks": STICKS, "slides": SLIDES, "free": FREE, "low": LOW, "high": HIGH}
 
 
-cdef public void lav_adjoint(const blocks_t* b, const natural_t* x, const generalized_t* g, int32_t rows,
-                             const int32_t* place, const double* lu, const int32_t* swap, const double* y, double* c,
+cdef void push(const view_t* v, const double* lam, double* f) noexcept nogil:
+    # f (n) = J^T lam
+    if v.g != NULL:
+        jac_push(v.g, lam, f)
+    elif v.r != NULL:
+        rows_wrench(&v.p, v.r, lam, f)
+
+
+cdef void through_mass(const view_t* v, int32_t n, const double* f, double* p) noexcept nogil:
+    # p (n) = M^-1 f
+    memcpy(p, f, n * sizeof(double))
+    if v.g != NULL:
+        tree_solve(v.g, p)
+    elif v.r != NULL:
+        wrenches_to_velocity(v.r, p)
+
+
+cdef void turned(const view_t* v, const double* x, double* out) noexcept nogil:
+    # out (m) = A^T x of a matrix
+    cdef int32_t i, k
+    memset(out, 0, v.p.n_rows * sizeof(double))
+    for i in range(v.p.n_rows):
+        for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
+            out[v.a.indices[k]] += v.a.data[k] * x[i]
+
+
+cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, const int32_t* place, const double* lu,
+                             const int32_t* swap, int32_t n, const double* y, const double* c, const double* x,
                              double* q, double* s, double* f, double* p) noexcept nogil:
-    """(1) but for q on rows outside the factor; c (m) is changed, y (n) may be NULL, then f = -J^T s."""
-    cdef int32_t i, m = b.n_rows
-    if y != NULL:
-        memcpy(p, y, g.n * sizeof(double))
-        tree_solve(g, p)
-        for i in range(m):
-            c[i] += jac_row(g, i, p)
+    """(1) or (2) but for q on rows outside the factor; y (n), c (m) and x (m) may be NULL, for 0."""
+    cdef int32_t i, m = v.p.n_rows
+    cdef const double* soft = NULL if v.a != NULL else v.g.compliance if v.g != NULL else v.r.compliance
+    memset(q, 0, m * sizeof(double))
+    if v.a != NULL and x != NULL:
+        turned(v, x, q)
+    elif y != NULL or x != NULL:
+        memset(f, 0, n * sizeof(double))
+        if x != NULL:
+            push(v, x, f)
+        if y != NULL:
+            for i in range(n):
+                f[i] += y[i]
+        through_mass(v, n, f, p)
+        if v.r != NULL:
+            rows_times(&v.p, v.r, p, q)
+        else:
+            for i in range(m):
+                q[i] = jac_row(v.g, i, p)
+        if x != NULL:
+            for i in range(m):
+                q[i] += soft[i] * x[i]
     for i in range(m):
         if place[i] >= 0:
-            s[place[i]] = c[i] / x.root[i]
-    lu_solve_back(rows, lu, swap, s)
+            s[place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.root[i]
+    dense_lu_solve_back(rows, lu, swap, s)
     for i in range(m):
         q[i] = s[place[i]] if place[i] >= 0 else 0.0
-    block_times(x, b, x.p, q, True, s)
+    block_times(a, &v.p, a.p, q, True, s)
     for i in range(m):
-        s[i] /= x.root[i]
-    jac_push(g, s, f)
-    for i in range(g.n):
+        s[i] = s[i] / a.root[i] - (x[i] if x != NULL else 0.0)
+    push(v, s, f)
+    for i in range(n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
-    memcpy(p, f, g.n * sizeof(double))
-    tree_solve(g, p)
+    through_mass(v, n, f, p)
+
+
+cdef bint is_plain(given, Py_ssize_t n, const double** to):
+    """Whether it is None, `to` NULL then, or an array (n,) of finite numbers that lie together."""
+    cdef const double[::1] x
+    cdef double nought = 0.0                            # or becomes NaN
+    cdef Py_ssize_t i
+    to[0] = NULL
+    if given is None:
+        return True
+    try:
+        x = given
+    except (TypeError, ValueError):
+        return False
+    if x.shape[0] != n:
+        return False
+    for i in range(n):
+        nought += 0.0 * x[i]
+    if n:
+        to[0] = &x[0]
+    return nought == 0.0
 
 
 cdef class Linear:
     """An impulse (m,) [N s], judged by the data that the judge reads, and linearised.
 
-    `impulse` is kept as it is. The judge's reference must be known to the data. `regular`: `solve` and `adjoint` have
-    a factor; else `prepare` was not called, or G is singular, or it has more rows than are factored here.
+    `impulse` is kept as it is. The judge's reference must be known to the data. `solve` and `adjoint` are of the factor
+    that `prepare` found.
     """
     cdef blocks_t b
     cdef natural_t x
@@ -107,26 +171,38 @@ cdef class Linear:
         self.relative = relative_of(&s, self.w, m, judge.start_energy, judge.start_velocity)
         self.floor = relative(s.floor_energy, s.floor_velocity, judge.start_energy, judge.start_velocity)
 
-    def prepare(self, Data data):
-        """Factor G with A of the data, in rows or J and M, where it has few rows; whether there is a factor."""
+    def prepare(self, Data data, double shift=0.0):
+        """Factor G of H + shift, A of the data in rows or J and M; whether there is a factor."""
         cdef int32_t i, n = self.rows
         cdef double least = 1.0 / 0.0, most = 0.0, x
+        cdef Room room
         self.data = data
-        if n == 0 or n > SMALL:
-            self.regular = n == 0
-            return self.regular
+        if n == 0:
+            self.regular = True
+            return True
         self.factor = room_for((<Py_ssize_t>n * n) * sizeof(double) + n * sizeof(int32_t))
+        room = room_for(<Py_ssize_t>n * PANEL * sizeof(double))
         self.lu = <double*>self.factor.at
-        self.swap = <int32_t*>(self.lu + n * n)
-        self.form(self.lu, 0.0)
+        self.swap = <int32_t*>(self.lu + <Py_ssize_t>n * n)
+        self.form(self.lu, shift)
         with nogil:
-            if lu_factor(n, self.lu, self.swap):
+            if dense_lu(has_wide(), n, self.lu, self.swap, <double*>room.at):
                 for i in range(n):
-                    x = fabs(self.lu[i * n + i])
+                    x = fabs(self.lu[<Py_ssize_t>i * n + i])
                     least = x if x < least else least
                     most = x if x > most else most
         self.regular = least > SINGULAR * most and most > 0.0
         return self.regular
+
+    @property
+    def slides(self):
+        """Whether some row of G is not that of H: some contact slides, or is without friction."""
+        cdef int32_t i, j
+        for i in range(self.b.n_blocks):
+            for j in range(self.b.ptr[i], self.b.ptr[i + 1]):
+                if self.place_[j] >= 0 and self.x.case_[j] == SLIDES:
+                    return True
+        return False
 
     cdef void form(self, double* g, double shift):
         cdef int32_t n = self.rows, i
@@ -141,12 +217,12 @@ cdef class Linear:
                 h[<Py_ssize_t>i * n + i] += shift
             system_rows(&self.x, &self.b, n, self.place_, h, g)
 
-    def matrix(self, double shift=0.0):
-        """G (n, n) on the rows with a place, of H + shift."""
+    def matrix(self):
+        """G (n, n) on the rows with a place."""
         out_ = np.empty((self.rows, self.rows))
         cdef double[:, ::1] out = out_
         if self.rows:
-            self.form(&out[0, 0], shift)
+            self.form(&out[0, 0], 0.0)
         return out_
 
     def solve(self, r, bint back=False):
@@ -154,31 +230,34 @@ cdef class Linear:
         out_ = r.copy()
         cdef double[::1] out = out_
         if self.rows and back:
-            lu_solve_back(self.rows, self.lu, self.swap, &out[0])
+            dense_lu_solve_back(self.rows, self.lu, self.swap, &out[0])
         elif self.rows:
-            lu_solve(self.rows, self.lu, self.swap, &out[0])
+            dense_lu_solve(self.rows, self.lu, self.swap, &out[0])
         return out_
 
-    def adjoint(self, y_, c_):
-        """(q (m,), s (m,), f (n,), p (n,)) of (1), y (n,) or None, c (m,), which is changed. Of J and M, with a factor."""
-        cdef double[::1] c = c_
-        cdef const double[::1] y
-        cdef const double* given = NULL
-        cdef int32_t m = self.b.n_rows, n = self.data.general.n
-        out_ = np.empty(2 * (m + n) + 1)
-        cdef double[::1] out = out_
-        if y_ is not None:
-            y = y_
-            given = &y[0] if n else NULL
-        if n:
-            with nogil:
-                self.back(given, &c[0] if m else NULL, &out[0])
-        return out_[:m], out_[m:2 * m], out_[2 * m:2 * m + n], out_[2 * m + n:2 * (m + n)]
+    def adjoint(self, velocity, impulse, slack):
+        """(q, s (m), f, p (n), c (m)) of (1), end to end, of y (n,), c and x, None for 0; of (2) n is 0. With a factor.
 
-    cdef void back(self, const double* y, double* c, double* out) noexcept nogil:
-        cdef int32_t m = self.b.n_rows, n = self.data.general.n
-        lav_adjoint(&self.b, &self.x, &self.data.general, self.rows, self.place_, self.lu, self.swap, y, c, out, out + m,
-                    out + 2 * m, out + 2 * m + n)
+        None where y, c or x is no such array or not finite: the long way finds the words.
+        """
+        cdef view_t v = self.judge.view()
+        cdef int32_t m = self.b.n_rows, n = v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
+        cdef const double* y
+        cdef const double* c
+        cdef const double* x
+        if not (is_plain(velocity, n, &y) and is_plain(impulse, m, &c) and is_plain(slack, m, &x)):
+            return None
+        out_ = np.empty(3 * m + 2 * n)
+        cdef double[::1] made = out_
+        cdef double* out = &made[0] if made.shape[0] else NULL
+        with nogil:
+            lav_adjoint(&v, &self.x, self.rows, self.place_, self.lu, self.swap, n, y, c, x, out, out + m, out + 2 * m,
+                        out + 2 * m + n)
+            if c != NULL:
+                memcpy(out + 2 * (m + n), c, m * sizeof(double))
+            else:
+                memset(out + 2 * (m + n), 0, m * sizeof(double))
+        return out_
 
     def times(self, v_, bint back=False, bint edge=False):
         """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
@@ -253,30 +332,9 @@ cdef class Linear:
         return out_
 
 
-def adjoint_all(list linears, const int64_t[::1] at_y, const double[::1] y, const int64_t[::1] at_c, double[::1] c,
-                const int64_t[::1] at_out, double[::1] out):
-    """`adjoint` of many, each with J and M and a factor: y, c and what is returned end to end from the places given."""
-    cdef Linear one
-    cdef Py_ssize_t i
-    cdef const double* from_
-    for i in range(len(linears)):
-        one = <Linear>linears[i]
-        from_ = &y[0] + at_y[i] if y.shape[0] else NULL
-        if one.data.general.n:
-            one.back(from_, &c[0] + at_c[i] if c.shape[0] else NULL, &out[0] + at_out[i])
-
-
 def wrench(Data p, const double[::1] lam, double[:, ::1] f):
     """f (n, 6) = J^T lam of bodies."""
-    cdef int32_t i, c, size
-    f[:, :] = 0.0
-    if p.blocks.n_rows == 0 or p.rows.n_bodies == 0:
-        return
-    with nogil:
-        for i in range(p.rows.n_joints):
-            joint_wrench(&p.blocks, &p.rows, i, &lam[0], &f[0, 0])
-        for c in range(p.rows.n_contacts):
-            i = p.rows.n_joints + c
-            size = p.blocks.ptr[i + 1] - p.blocks.ptr[i]
-            contact_wrench(&p.rows, c, n_directions(p.blocks.kind[i], size), n_turns(p.blocks.kind[i], size),
-                           &lam[p.blocks.ptr[i]], &f[0, 0])
+    if p.blocks.n_rows and p.rows.n_bodies:
+        rows_wrench(&p.blocks, &p.rows, &lam[0], &f[0, 0])
+    else:
+        f[:, :] = 0.0

@@ -147,3 +147,18 @@ cdef inline void dense_lu_solve(int32_t n, const double* a, const int32_t* swap,
         t = x[k]
         x[k] = x[swap[k]]
         x[swap[k]] = t
+
+
+cdef inline void dense_lu_solve_back(int32_t n, const double* a, const int32_t* swap, double* x) noexcept nogil:
+    """x <- N^-T x after `dense_lu`: P, L, U."""
+    cdef int32_t k
+    cdef double t
+    for k in range(n):
+        t = x[k]
+        x[k] = x[swap[k]]
+        x[swap[k]] = t
+    for k in range(n):
+        take(n - k - 1, x[k], a + <int64_t>k * n + k + 1, x + k + 1)
+    for k in range(n - 1, -1, -1):
+        x[k] /= a[<int64_t>k * n + k]
+        take(k, x[k], a + <int64_t>k * n, x)

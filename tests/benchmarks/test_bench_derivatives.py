@@ -33,7 +33,14 @@ def test_a_border_is_flagged_and_nothing_is_compared_across_it():
     table = derivatives.agreement(
         [found, derivatives.compared("made", lv.Problem.contact(a, [10.0, 4.0, 0.0], mu=[0.5]))]
     )
-    assert "| made | coulomb | matrix | 2 | 50.0% | 1 | 1 of 1 | 0 of 0 |" in table
+    assert "| coulomb | matrix | 2 | 50.0% | 0 | 1 | 1 of 1 | 0 of 0 |" in table
+
+
+def test_a_direction_that_is_refused_is_flagged():
+    twice = lv.Problem.linear(np.ones((2, 2)), [1.0, 1.0])  # one row given twice
+    found = derivatives.compared("made", twice)
+    assert found.flagged == "refused" and np.isnan(found.off)
+    assert "| linear | matrix | 1 | 100.0% | 1 | 0 | 0 of 0 | 0 of 0 |" in derivatives.agreement([found])
 
 
 def test_the_command_prints_both_tables():

@@ -1,5 +1,7 @@
 """Derivatives of solutions: against differences, against their own adjoint, where they do not exist, and refusals."""
 
+import sys
+
 import numpy as np
 import pytest
 from gradient_problems import KINDS, OPERATORS, directions, drawn, moved, named
@@ -247,6 +249,8 @@ def test_equal_bounds_move_together():
     assert t.impulse == pytest.approx([1.0, -0.5])
     g = d.vjp(impulse=[0.0, 1.0])
     assert g.lower == pytest.approx([-0.25, 0.0]) and g.upper == pytest.approx([-0.25, 0.0])
+    for name in ("lower", "upper"):  # one of them: half of it, both ways
+        assert d.jvp(**{name: [1.0, 0.0]}).impulse == pytest.approx([0.5, -0.25])
 
 
 @pytest.mark.parametrize("name", ["pgs", "newton", "admm", "nncg", "direct"])
@@ -337,6 +341,44 @@ def test_many_rows_of_bodies_agree_with_their_adjoint_and_with_differences():
     ends = [moved(p, "v_free", change, x) for x in (-h, h)]
     velocities = [q.velocity(solved(q).impulse) for q in ends]
     assert (velocities[1] - velocities[0]) / (2.0 * h) == pytest.approx(moved_by, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("operator", ("csr", "asymmetric", "generalized", "bodies"))
+@pytest.mark.parametrize("kind", ("disk", "normal"))
+def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
+    p = drawn(0, kind, "cone" if operator != "asymmetric" else "coulomb", operator, 30)
+    solution, rng = solved(p), np.random.default_rng(0)
+    weights = {"impulse": rng.standard_normal(p.m), "slack": rng.standard_normal(p.m)}
+    if p.matrix is None:
+        weights["velocity"] = rng.standard_normal(p.velocity(solution.impulse).shape)
+    found = []
+    # dense by the kernel, sparse by panels or SuperLU, and the adjoint of the kernel in Python
+    for small, dense, few, plain in ((64, 400, 0.4, True), (0, 0, 2.0, False), (0, 0, 0.0, False)):
+        monkeypatch.setattr("lavender.gradient.system.SMALL", small)
+        monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "SMALL", small)
+        monkeypatch.setattr("lavender.gradient.system.DENSE", dense)
+        monkeypatch.setattr("lavender.gradient.system.is_full", lambda nnz, m, cones, few=few: few == 0.0)
+        d = lv.derivative(p, solution)
+        assert d._plain == plain
+        found.append(d.vjp(**weights))
+    assert d._linear.rows > 5
+    names = ["b", "lower", "mu"] + (["v_free", "J", "compliance"] if p.matrix is None else ["A"])
+    for name in names:
+        one, *others = (getattr(g, name) for g in found)
+        for other in others:
+            size = abs(one).max()
+            assert abs(one - other).max() <= 1e-9 * size, name
+
+
+def test_cotangents_as_lists_give_the_same_bits():
+    p = drawn(0, "disk", "cone", "generalized")
+    d, c = lv.derivative(p, solved(p)), np.random.default_rng(0).standard_normal(p.m)
+    assert np.array_equal(d.vjp(impulse=c).b, d.vjp(impulse=c.tolist()).b)
+    g = d.vjp(impulse=c)
+    before = g.lower.copy()
+    g = d.vjp(impulse=c)
+    c[:] = 0.0  # the gradient keeps its own
+    assert np.array_equal(g.lower, before)
 
 
 def test_an_order_of_elimination_changes_nothing():
