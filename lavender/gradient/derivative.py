@@ -208,7 +208,7 @@ class Derivative:
         known = self._linear.times(self._a(out / self._root) / self._root) if out.any() else 0.0
         right = (r - known)[at]
         if exactly and self._system.singular and self._contradicts(right):
-            self.refuse_alone("no derivative along this change exists")
+            self._refuse_alone("no derivative along this change exists")
         out[at] = self._system.solve(right)
         return out
 
@@ -217,7 +217,7 @@ class Derivative:
         size = CONTRADICTS * float(np.linalg.norm(right))
         return any(abs(float(q @ right)) > size * float(np.linalg.norm(q)) for q in self._system.probes(True))
 
-    def refuse_alone(self, words: str) -> None:
+    def _refuse_alone(self, words: str) -> None:
         """Of what changes one row of several that share a load."""
         if not self._system.singular:
             return

@@ -83,7 +83,7 @@ class Gradient:
                 f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
             )
         if not of._plain and name in ALONE:
-            of.refuse_alone(f"no derivative by {name} exists here")
+            of._refuse_alone(f"no derivative by {name} exists here")
         if name in BODIES:
             kept.update(of._bodies.back(self))
         else:

@@ -282,11 +282,6 @@ cdef class Linear:
         return self.numbers(self.w)
 
     @property
-    def error(self):
-        """The judge's e (m,) [N s]."""
-        return self.numbers(self.e)
-
-    @property
     def root(self):
         """D^1/2 (m,)."""
         return self.numbers(self.x.root)
