@@ -64,7 +64,11 @@ cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, 
                              double* q, double* s, double* f, double* p) noexcept nogil:
     """(1) or (2) but for q on rows outside the factor; y (n), c (m) and x (m) may be NULL, for 0."""
     cdef int32_t i, m = v.p.n_rows
-    cdef const double* soft = NULL if v.a != NULL else v.g.compliance if v.g != NULL else v.r.compliance
+    cdef const double* soft = NULL
+    if v.a == NULL and v.g != NULL:
+        soft = v.g.compliance
+    elif v.a == NULL:
+        soft = v.r.compliance
     memset(q, 0, m * sizeof(double))
     if v.a != NULL and x != NULL:
         turned(v, x, q)

@@ -353,15 +353,13 @@ def test_every_factor_gives_the_same_gradients(kind, operator, monkeypatch):
         weights["velocity"] = rng.standard_normal(p.velocity(solution.impulse).shape)
     found = []
     # dense by the kernel, sparse by panels or SuperLU, and the adjoint of the kernel in Python
-    for small, dense, few, plain in ((64, 400, 0.4, True), (0, 0, 2.0, False), (0, 0, 0.0, False)):
+    for small, dense, few in ((64, 400, 0.4), (0, 0, 2.0), (0, 0, 0.0)):
         monkeypatch.setattr("lavender.gradient.system.SMALL", small)
         monkeypatch.setattr(sys.modules["lavender.gradient.derivative"], "SMALL", small)
         monkeypatch.setattr("lavender.gradient.system.DENSE", dense)
         monkeypatch.setattr("lavender.gradient.system.is_full", lambda nnz, m, cones, few=few: few == 0.0)
         d = lv.derivative(p, solution)
-        assert d._plain == plain
         found.append(d.vjp(**weights))
-    assert d._linear.rows > 5
     names = ["b", "lower", "mu"] + (["v_free", "J", "compliance"] if p.matrix is None else ["A"])
     for name in names:
         one, *others = (getattr(g, name) for g in found)
