@@ -1,8 +1,8 @@
 """A verdict for every world of a vector environment, at every step of the training loop.
 
-With gymnasium its HalfCheetah-v5; without, hoppers in plain MuJoCo behind the same two calls, `reset` and `step`. After
-each step of the environments the states go to `from_mujoco_many` and MuJoCo's answers to `residual_many`: worlds that
-are further off than a trainer would accept are counted, and their samples could be left out.
+Needs MuJoCo: pip install mujoco. With gymnasium its HalfCheetah-v5; without, hoppers in plain MuJoCo behind the same two
+calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and MuJoCo's answers to
+`residual_many`: worlds that are further off than a trainer would accept are counted, and their samples could be left out.
 
     python examples/vector_worlds.py [WORLDS [STEPS [ITERATIONS]]]
 
@@ -12,7 +12,6 @@ ITERATIONS: of MuJoCo's solver, to see what too few of them do.
 import sys
 from time import perf_counter
 
-import mujoco as mj
 import numpy as np
 
 import lavender as lv
@@ -32,6 +31,9 @@ class Hoppers:
     """Worlds of plain MuJoCo with the calls of a vector environment of gymnasium."""
 
     def __init__(self, n, substeps=5):
+        import mujoco as mj
+
+        self.engine = mj
         self.model, self.substeps = mj.MjModel.from_xml_string(HOPPER), substeps
         self.datas = [mj.MjData(self.model) for _ in range(n)]
 
@@ -39,7 +41,7 @@ class Hoppers:
         """Each from its start, with another velocity."""
         rng = np.random.default_rng(seed)
         for data in self.datas:
-            mj.mj_resetData(self.model, data)
+            self.engine.mj_resetData(self.model, data)
             data.qvel[:] = 0.1 * rng.standard_normal(self.model.nv)
         return self.observed(), {}
 
@@ -51,7 +53,7 @@ class Hoppers:
         """Observations, rewards, who has fallen, who is out of time, and nothing more."""
         for data, action in zip(self.datas, actions, strict=True):
             data.ctrl[:] = action
-            mj.mj_step(self.model, data, self.substeps)
+            self.engine.mj_step(self.model, data, self.substeps)
         fallen = np.array([data.qpos[1] < -0.4 for data in self.datas])
         reward = np.array([data.qvel[0] for data in self.datas])
         return self.observed(), reward, fallen, np.zeros(len(fallen), bool), {}
@@ -72,6 +74,8 @@ def make(n):
 
 def states_of(model, datas):
     """(n, size): where each world stands, with its controls and its warm start."""
+    import mujoco as mj
+
     kind = mj.mjtState.mjSTATE_INTEGRATION
     states = np.empty((len(datas), mj.mj_stateSize(model, kind)))
     for state, data in zip(states, datas, strict=True):
@@ -99,7 +103,8 @@ def numbers(n=64, steps=50, iterations=None):
     return {"name": name, "seconds": spent, "errors": errors, "refused": errors > ACCEPT}
 
 
-def main(*words):
+def main():
+    words = sys.argv[1:]
     n, steps, iterations = (*map(int, words), *(64, 50, None)[len(words) :])
     found = numbers(n, steps, iterations)
     own, judge = n * steps / found["seconds"]
@@ -112,4 +117,4 @@ def main(*words):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    main()

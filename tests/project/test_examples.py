@@ -272,13 +272,14 @@ def test_residual_and_motion_error_part_as_the_theory_says():
     assert error.relative == pytest.approx(np.sqrt(1e-3 / 3000.001), rel=1e-6)
 
 
-def test_worlds_of_a_training_loop_have_a_verdict_each(capsys):
+def test_worlds_of_a_training_loop_have_a_verdict_each(capsys, monkeypatch):
     pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
     module = example("vector_worlds")
     sound, hasty = module.numbers(8, 40), module.numbers(8, 40, iterations=1)
     assert sound["errors"].shape == (40, 8) and not sound["refused"].any()
     assert hasty["refused"].any()
-    module.main("4", "3")
+    monkeypatch.setattr("sys.argv", ["vector_worlds.py", "4", "3"])
+    module.main()
     assert "12 steps, not to learn from" in capsys.readouterr().out
 
 
