@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, read_only
-from lavender.base.errors import CapabilityError, TooLarge
+from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem.data import ProblemData
 from lavender.problem.derived import cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
+from lavender_ext.core.checks import MOST
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, nothing_done
 from lavender_ext.factor import sparse
@@ -70,7 +71,7 @@ class Operators(ProblemData):
         if self.rows is None:
             return self.csr_data
         r = self.rows
-        return self._data(
+        made = self._data(
             rows=(
                 r.jac,
                 r.joint_body,
@@ -84,6 +85,8 @@ class Operators(ProblemData):
                 self.compliance,
             )
         )
+        self._check_diagonal(made)
+        return made
 
     @once
     def csr_data(self) -> Data:
@@ -105,7 +108,16 @@ class Operators(ProblemData):
             view.prepare()
         except OverflowError as error:
             raise TooLarge(f"the problem is too large: {error}") from None
+        self._check_diagonal(view)
         return view
+
+    def _check_diagonal(self, data: Data) -> None:
+        i = data.outside
+        if i >= 0:
+            raise InputError(
+                f"A_ii = J_i M^-1 J_i^T + compliance of {self.row_name(i)} (row {i}) is {data.d[i]:g} 1/kg; at most "
+                f"{MOST:g} is needed: another unit of mass, or of the row's velocity, brings it nearer to 1"
+            )
 
     def _data(self, **operator: Any) -> Data:
         return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)

@@ -60,21 +60,7 @@ cdef inline double clip(double x, double low, double high) noexcept nogil:
 
 
 cdef inline double norm2(double x, double y) noexcept nogil:
-    # sqrt(x^2 + y^2) without overflow or underflow; the plain formula where it is safe.
-    cdef double s = x * x + y * y
-    cdef double big, small
-    if 1e-280 < s < 1e280:
-        return sqrt(s)
-    x = fabs(x)
-    y = fabs(y)
-    big = x if x > y else y
-    small = y if x > y else x
-    if not big > 0.0:
-        return x + y                                    # 0, or NaN
-    if big > 1.7976931348623157e308:
-        return big
-    small = small / big
-    return big * sqrt(1.0 + small * small)
+    return sqrt(x * x + y * y)
 
 
 cdef inline double mu_r(const blocks_t* p, int32_t i) noexcept nogil:
@@ -136,8 +122,8 @@ cdef inline double relax_normal(double lam, double w, double step) noexcept nogi
 
 cdef inline void relax_tangents(double* lam, const double* w, double step, double radius,
                                 int32_t n) noexcept nogil:
-    # (3): lam, w of the n tangent rows; one scalar step for both. Squares decide where they are safe, so
-    # that a sticking contact costs no root.
+    # (3): lam, w of the n tangent rows; one scalar step for both. Squares decide, so that a sticking contact
+    # costs no root.
     cdef double x, y, s, r
     if n == 1:
         lam[0] = clip(lam[0] - w[0] * step, -radius, radius)
@@ -145,36 +131,18 @@ cdef inline void relax_tangents(double* lam, const double* w, double step, doubl
     x = lam[0] - w[0] * step
     y = lam[1] - w[1] * step
     s = x * x + y * y
-    if 1e-280 < s < 1e280:
-        if s > radius * radius:
-            r = radius / sqrt(s)
-            x = x * r
-            y = y * r
-    else:
-        r = norm2(x, y)
-        if r > radius:
-            r = radius / r
-            x = x * r
-            y = y * r
+    if s > radius * radius:
+        r = radius / sqrt(s)
+        x = x * r
+        y = y * r
     lam[0] = x
     lam[1] = y
-
-
-cdef inline double quotient(double w, double d) noexcept nogil:
-    # w / d; where it would vanish, the smallest number there is (normal, if w is), so that an error stays one.
-    cdef double x = w / d
-    if fabs(x) < 2.2250738585072014e-308 and w != 0.0:
-        if fabs(w) >= 2.2250738585072014e-308:
-            return -2.2250738585072014e-308 if w < 0.0 else 2.2250738585072014e-308
-        if x == 0.0:
-            return -5e-324 if w < 0.0 else 5e-324
-    return x
 
 
 cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     # (5) as clip(w / d, lam - high, lam - low): lam - clip(lam - w / d) would cost digits where no bound acts,
     # and would not see a bound that is huge beside w / d.
-    return clip(quotient(w, d), lam - high, lam - low)
+    return clip(w / d, lam - high, lam - low)
 
 
 cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,
@@ -183,8 +151,8 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
     if n == 1:
         e[0] = row_error(lam[0], w[0], d, -radius, radius)
     elif n == 2:
-        e[0] = quotient(w[0], d)
-        e[1] = quotient(w[1], d)
+        e[0] = w[0] / d
+        e[1] = w[1] / d
         x = lam[0] - e[0]
         y = lam[1] - e[1]
         r = norm2(x, y)
@@ -197,100 +165,35 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
 cdef inline void coulomb_error(const double* lam, const double* w, const double* d, double mu,
                                double patch_radius, double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
     # (6): one contact of 1 + nt + turns rows.
-    cdef double normal = lam[0] if lam[0] > 0.0 else 0.0, bound = mu * normal
-    cdef double inf = 1.0 / 0.0
+    cdef double normal = lam[0] if lam[0] > 0.0 else 0.0, bound = mu * normal, inf = 1.0 / 0.0
     cdef int32_t k = 1 + nt + (turns & 1)
     e[0] = row_error(lam[0], w[0], d[0], 0.0, inf)
     if nt > 0:
         tangent_error(lam + 1, w + 1, d[1], bound, nt, e + 1)
     if turns & 1:
-        bound = bound * patch_radius if bound < inf else mu * patch_radius * lam[0]     # inf * 0 would be no bound
-        e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound, bound)
+        e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound * patch_radius, bound * patch_radius)
     if turns & 2:
         tangent_error(lam + k, w + k, d[k], rolling * normal, 2, e + k)
 
 
-cdef inline double opening(double mu, double rt, double rn) noexcept nogil:
-    # mu rt / rn, where the product alone may overflow; at most the largest number.
-    cdef double a = mu * rt / rn
-    if a <= 1.7976931348623157e308:
-        return a
-    a = mu * (rt / rn)
-    return a if a <= 1.7976931348623157e308 else 1.7976931348623157e308
-
-
-cdef inline double closing(double a, double mu, double rt, double rn) noexcept nogil:
-    # 1 / a of `opening`, also where a is beyond the largest number
-    if a < 1.7976931348623157e308:
-        return 1.0 / a
-    return rn / rt / mu if mu >= 1.0 else rn / mu / rt
-
-
-cdef inline void wide_part(double yn, double a, double inverse, double t, double inv, double* s, double* sb) noexcept nogil:
-    # (yn + a t) / (1 + a^2), where a^2 or a t may overflow, and its b-fold: taken where it is the larger
-    cdef double x, y
-    if a > 1e140:
-        x = yn * inverse + t
-        y = x * (inverse / inv if inverse > inv else 1.0)
-        x = x * inverse
-    else:
-        x = (yn + a * t) / (1.0 + a * a)
-        y = x / inv
-    if x > s[0] or y > sb[0]:
-        s[0] = x
-        sb[0] = y
-
-
-cdef inline double wide_cone(double normal, double at, double in_t, double t, double as_, double in_s, double ys,
-                             double* bound_t, double* bound_s) noexcept nogil:
-    """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider.
-
-    in_t, in_s: 1 / a_t and 1 / a_s, for a itself may be beyond the largest number.
-    """
-    cdef double inv = in_t if in_t < in_s else in_s                     # 1 / b
-    cdef double p = inv / in_t if in_t > inv else 1.0, q = inv / in_s if in_s > inv else 1.0
-    cdef double sb = 0.0, c = 0.0, x, yn, size = fabs(normal)
-    size = t if t > size else size
-    size = ys if ys > size else size
-    if not 0.0 < size <= 1.7976931348623157e308:
-        size = 1.0
-    yn = normal / size                                  # (7) is homogeneous: s b must not overflow
-    t = t / size
-    ys = ys / size
-    if yn > 0.0:
-        c = yn
-        sb = yn / inv
-    wide_part(yn, at, in_t, t, inv, &c, &sb)
-    wide_part(yn, as_, in_s, ys, inv, &c, &sb)
-    x = (yn * inv + p * t + q * ys) / (inv * inv + p * p + q * q)
-    if x > sb:
-        sb = x
-        c = x * inv
-    bound_t[0] = (p * sb if at > 1e140 else at * c) * size
-    bound_s[0] = (q * sb if as_ > 1e140 else as_ * c) * size
-    return normal if c == yn else c * size
-
-
 cdef inline double weighed(double lam, double w, double d, double r) noexcept nogil:
-    # sqrt(d) (lam - w / d), r = sqrt(d); w / d alone may overflow.
-    cdef double x = quotient(w, d)
-    return r * (lam - x) if fabs(x) <= 1.7976931348623157e308 else r * lam - w / r
+    # sqrt(d) (lam - w / d), r = sqrt(d)
+    return r * (lam - w / d)
+
+
+cdef inline double share(double bound, double size) noexcept nogil:
+    # of what is longer than its bound; dust may have no size
+    return bound / size if size > 0.0 else 0.0
 
 
 cdef inline double rolling_section(const double* a, const double* t, double yn, double* bound) noexcept nogil:
     """s of (7) and a_g s in bound (3) for three parts, |y_g| = t_g <= a_g s each; a_g = 0 where one is not there.
 
     The largest of the eight candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over subsets, as before, each over the widest
-    part in it. b s with b = max(1, a_g) is what keeps its digits where a cone is wide.
+    part in it.
     """
-    cdef double b = 1.0, s = 0.0, sb = 0.0, up, down, f, most
+    cdef double s = yn if yn > 0.0 else 0.0, up, down, f, most
     cdef int32_t g, subset
-    for g in range(3):
-        if a[g] > b:
-            b = a[g]
-    if yn > 0.0:
-        s = yn
-        sb = b * yn
     for subset in range(1, 8):
         most = 1.0
         for g in range(3):
@@ -304,11 +207,10 @@ cdef inline double rolling_section(const double* a, const double* t, double yn, 
                 up += f * t[g]
                 down += f * f
         up = up / down
-        if up / most > s or up * (b / most) > sb:
+        if up / most > s:
             s = up / most
-            sb = up * (b / most)
     for g in range(3):
-        bound[g] = a[g] / b * sb if a[g] > 1e140 else a[g] * s
+        bound[g] = a[g] * s
     return s
 
 
@@ -319,7 +221,7 @@ cdef inline void project_rolling(const double* lam, const double* w, const doubl
     cdef double a[3]
     cdef double bound[3]
     cdef double y[6]
-    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), s, r, f
+    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), s, r
     cdef int32_t g, i, k = 3 + (turns & 1), j, n
     t[1] = a[1] = 0.0
     for g in range(3):
@@ -328,13 +230,13 @@ cdef inline void project_rolling(const double* lam, const double* w, const doubl
         j = 1 if g == 0 else 3 if g == 1 else k
         n = 1 if g == 1 else 2
         r = sqrt(d[j])
-        a[g] = opening(rolling if g == 2 else mu, r * (patch_radius if g == 1 else 1.0), rn)
+        a[g] = (rolling if g == 2 else mu) * (r * (patch_radius if g == 1 else 1.0)) / rn
         t[g] = 0.0
         for i in range(j, j + n):
             y[i] = weighed(lam[i], w[i], d[i], r)
             t[g] = norm2(t[g], y[i])
     s = rolling_section(a, t, yn, bound)
-    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
+    e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
     for g in range(3):
         if g == 1 and not turns & 1:
             continue
@@ -342,11 +244,9 @@ cdef inline void project_rolling(const double* lam, const double* w, const doubl
         n = 1 if g == 1 else 2
         for i in range(j, j + n):
             if t[g] > bound[g]:
-                f = t[g] * sqrt(d[i])
-                f = bound[g] / f if 1e-300 < f <= 1.7976931348623157e308 else bound[g] / t[g] / sqrt(d[i])
-                e[i] = lam[i] - f * y[i]
+                e[i] = lam[i] - share(bound[g], t[g] * sqrt(d[i])) * y[i]
             else:
-                e[i] = quotient(w[i], d[i])
+                e[i] = w[i] / d[i]
     if not (yn == yn and t[0] == t[0] and t[1] == t[1] and t[2] == t[2]):
         e[0] = yn + t[0] + t[1] + t[2]                  # NaN: comparisons above would hide it
 
@@ -362,7 +262,7 @@ cdef inline void project_error(const double* lam, const double* w, const double*
     yn = weighed(lam[0], w[0], d[0], rn)
     if nt > 0:
         rt = sqrt(d[1])
-        at = opening(mu, rt, rn)
+        at = mu * rt / rn
         y0 = weighed(lam[1], w[1], d[1], rt)
         if nt == 2:
             y1 = weighed(lam[2], w[2], d[2], rt)
@@ -370,79 +270,47 @@ cdef inline void project_error(const double* lam, const double* w, const double*
     if spin:
         rs = sqrt(d[js])
         as_ = mu * patch_radius * rs / rn
-        if not as_ <= 1.7976931348623157e308:
-            as_ = opening(mu * (rs / rn), patch_radius, 1.0)
         ys = weighed(lam[js], w[js], d[js], rs)
-    if at > 1e140 or as_ > 1e140:
-        s = wide_cone(yn, at, closing(at, mu, rt, rn), t, as_, closing(as_, mu * patch_radius, rs, rn), fabs(ys),
-                      &bound_t, &bound_s)
-    else:
-        s = yn if yn > 0.0 else 0.0
-        c = (yn + at * t) / (1.0 + at * at)
-        if c > s:
-            s = c
-        c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
-        if c > s:
-            s = c
-        c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
-        if c > s:
-            s = c
-        bound_t = at * s
-        bound_s = as_ * s
+    s = yn if yn > 0.0 else 0.0
+    c = (yn + at * t) / (1.0 + at * at)
+    if c > s:
+        s = c
+    c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
+    if c > s:
+        s = c
+    c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
+    if c > s:
+        s = c
+    bound_t = at * s
+    bound_s = as_ * s
     # e = lam - Pi: w / d where the projection moves nothing.
-    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
+    e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
     if nt > 0:
         if t > bound_t:
-            f = t * rt
-            f = bound_t / f if 1e-300 < f <= 1.7976931348623157e308 else bound_t / t / rt
+            f = share(bound_t, t * rt)
             e[1] = lam[1] - f * y0
             if nt == 2:
                 e[2] = lam[2] - f * y1
         else:
             for i in range(1, 1 + nt):
-                e[i] = quotient(w[i], d[i])
+                e[i] = w[i] / d[i]
     if spin:
         if ys > bound_s:
             e[js] = lam[js] - bound_s / rs
         elif ys < -bound_s:
             e[js] = lam[js] + bound_s / rs
         else:
-            e[js] = quotient(w[js], d[js])
+            e[js] = w[js] / d[js]
     if not (yn == yn and t == t and ys == ys):
         e[0] = yn + t + ys                              # NaN: comparisons above would hide it
 
 
-cdef inline void project_parts(const double* lam, const double* w, const double* d, double mu, double patch_radius,
-                               double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
+cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu, double patch_radius,
+                            double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
     if turns & 2:
         project_rolling(lam, w, d, mu, patch_radius, rolling, turns, e)
     else:
         project_error(lam, w, d, mu, patch_radius, nt, turns, e)
-
-
-cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu, double patch_radius,
-                            double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
-    # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide, and
-    # 2^-600 times both where some w / sqrt(d) would overflow.
-    cdef double up = 1.0
-    cdef double big[12]
-    cdef int32_t i, n = 1 + nt + turns
-    cdef bint small = True
-    for i in range(n):
-        small = small and fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]
-        if fabs(w[i]) > 1e140 and fabs(w[i]) / sqrt(d[i]) > 1.7976931348623157e308:
-            up = 2.409919865102884e-181                 # 2^-600
-    if small:
-        up = 4.149515568880993e180                      # 2^600
-    if up == 1.0:
-        project_parts(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
-        return
-    for i in range(n):
-        big[i] = up * lam[i]
-        big[6 + i] = up * w[i]
-    project_parts(big, big + 6, d, mu, patch_radius, rolling, nt, turns, e)
-    for i in range(n):
-        e[i] = quotient(e[i], up)
 
 
 cdef inline int32_t round_group(int32_t tangent) noexcept nogil:
@@ -525,7 +393,7 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
         a[g] = mu * sqrt(d[i]) / rn
     zone = round_section(t, a, yn, &r, &inside)
     for i in range(1 + nt):
-        e[i] = lam[i] if zone < 0 else quotient(w[i], d[i])
+        e[i] = lam[i] if zone < 0 else w[i] / d[i]
     if zone == 0:
         # lam - Pi as w / d and what the projection adds, where that is the smaller part
         e[0] = (e[0] if yn > 0.0 else lam[0]) - r / rn

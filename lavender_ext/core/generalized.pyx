@@ -174,7 +174,7 @@ cdef class Operator:
             out[i] = jac_row(&self.g, i, &x[0]) if self.g.n else 0.0
 
     def bias(self, const double[::1] v, const double[::1] target):
-        """b = target - J v (m,), a new array; what overflows is left to whoever reads it."""
+        """b = target - J v (m,), a new array; what leaves the door's range is left to whoever reads it."""
         cdef int32_t i
         made = new(self.g.m)
         cdef double[::1] out = made

@@ -1,7 +1,7 @@
 """A problem's derived numbers: diagonal d, velocity weight nu, sweep step, coupling of a contact's rows.
 
-    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row: the mean of the positive
-              d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
+    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row, its largest below 1e-60: the mean of the
+              others' d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
               the two that roll                                                                   (1)
     nu_i    = d_i; on a row that spins or rolls d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
     step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive;
@@ -20,6 +20,7 @@ from lavender_ext.core.block cimport (CONE, CONTACT_BOX, CONTACT_ROLLING, COULOM
                                       n_directions, n_tangents, n_turns, roll_at)
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.door cimport first_outside, least
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
@@ -48,7 +49,9 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             if a.indices[q] == i:
                 diag += a.data[q]
         d[i] = diag if diag > 1e-10 * big else big
-        empty[i] = big == 0.0
+        empty[i] = big < least()
+        if empty[i]:
+            d[i] = 0.0
         n_empty += empty[i]
         step[i] = big                                   # held for (3) below
         if d[i] > 0.0:
@@ -153,15 +156,15 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         if p.kind[i] == CONTACT_ROLLING:
             step[end - 2] = largest_eigenvalue(d[end - 2], off[1], d[end - 1])
     for j in range(p.n_rows):
-        empty[j] = d[j] == 0.0                          # what overflowed is not empty
+        empty[j] = fabs(d[j]) < least()
+        if empty[j]:
+            d[j] = 0.0
         n_empty += empty[j]
         if d[j] > 0.0:
             n_positive += 1
             total += d[j] / p.n_rows
     mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
     for j in range(p.n_rows):
-        if d[j] != d[j]:
-            d[j] = 1.0 / 0.0                            # its products overflow: nothing measures it
         if not d[j] > 0.0:
             d[j] = mean
     for i in range(p.n_blocks):
@@ -189,8 +192,8 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         row = y + g.pval[b]
         for i in range(g.prow[b], g.prow[b + 1]):
             d[i] = dot(row, row, nc) + g.compliance[i]
-            empty[i] = not d[i] > 0.0
-            if d[i] > 0.0:
+            empty[i] = d[i] < least()
+            if not empty[i]:
                 n_positive += 1
                 total += d[i] / p.n_rows
             else:
@@ -478,6 +481,11 @@ cdef class Data:
         if self._step is None:
             self._step = _read_only(self.part(2))
         return self._step
+
+    @property
+    def outside(self):
+        """The first row whose d is beyond what core/door.pxd allows, or -1."""
+        return first_outside(self.blocks.d, self.blocks.n_rows)
 
     @property
     def n_rows(self):

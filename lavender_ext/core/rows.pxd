@@ -16,7 +16,6 @@ through these couplings, and writes both bodies once, omega by the stored I^-1 (
 
     w_t after the normal's step = t.u + A_tn (change of lam_n), and so on.                     (4)
 """
-from libc.float cimport DBL_MAX
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
@@ -451,8 +450,8 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
 
 
 cdef inline double reciprocal(double x) noexcept nogil:
-    # 1/x kept finite where x is denormal.
-    return 1.0 / x if x * DBL_MAX > 1.0 else DBL_MAX
+    # 1 / d; 0 of a row that nothing moves
+    return 1.0 / x if x > 0.0 else 0.0
 
 
 cdef inline double largest_eigenvalue(double a, double b, double c) noexcept nogil:

@@ -10,8 +10,7 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, norm2,
-                                      quotient, roll_at)
+from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, roll_at)
 
 
 cdef struct score_t:
@@ -23,22 +22,15 @@ cdef struct score_t:
     int32_t finite              # 0 where e holds a NaN or an infinity
 
 
-cdef struct tally_t:            # plain sums and squares: kept where they can neither have over- nor underflown
-    double energy               # sum (d e) e, for e^2 alone may vanish beside a d of 1e160
+cdef struct tally_t:
+    double energy               # sum (d e) e
     double fast                 # max (d e) (nu e)
     int32_t worst
-
-
-cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
-    double scale
-    double ssq
 
 
 cdef struct floor_t:            # of F, what rounding leaves of a slack
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
-    sum_t total                 # sum F^2 / d, scaled: neither over- nor underflows
-    double big                  # max F sqrt(nu / d)
 
 
 cdef inline double unit_roundoff() noexcept nogil:
@@ -66,22 +58,6 @@ cdef inline double relative(double energy, double velocity, double start_energy,
     """(1)"""
     cdef double x = ratio(energy, start_energy), y = ratio(velocity, start_velocity)
     return x if x > y else y
-
-
-cdef inline void add_square(sum_t* s, double x) noexcept nogil:
-    cdef double r
-    x = fabs(x)
-    if x > s.scale:
-        r = s.scale / x
-        s.ssq = 1.0 + s.ssq * r * r
-        s.scale = x
-    elif x > 0.0:
-        r = x / s.scale
-        s.ssq += r * r
-
-
-cdef inline double root(const sum_t* s) noexcept nogil:
-    return s.scale * sqrt(s.ssq)
 
 
 cdef inline tally_t nothing() noexcept nogil:
@@ -152,43 +128,26 @@ cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tall
         tally_contact(p, j, n_tangents(p.kind[i], end - j), n_apart(p.kind[i], end - j), e, s)
 
 
-cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
-    return 1e-250 < energy < 1e250 and 1e-250 < fast < 1e250
+cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
+    """The first row whose error is no number, or -1."""
+    cdef int32_t i
+    for i in range(m):
+        if not fabs(e[i]) < 1.0 / 0.0:
+            return i
+    return -1
 
 
 cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
     """The two sums over e (m); the floor entries are left alone."""
-    cdef int32_t i, j, k, nt, roll
-    cdef double v, big = -1.0
-    cdef sum_t total = sum_t(0.0, 0.0)
+    out.energy = sqrt(s.energy)
+    out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     out.worst = s.worst
-    out.finite = 1
-    if is_plain(s.energy, s.fast):
-        out.energy = sqrt(s.energy)
-        out.velocity = sqrt(s.fast)
-        return
-    out.worst = -1
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
-        for k in range(j, p.ptr[i + 1]):
-            add_square(&total, sqrt(p.d[k]) * e[k])
-            if is_pair(nt, roll, k - j - 1):
-                continue                                # the pair counts once, below
-            v = norm2(e[k], e[k + 1]) if is_pair(nt, roll, k - j) else fabs(e[k])
-            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
-            if v > big:
-                big = v
-                out.worst = k
-            elif v != v and out.finite:
-                out.finite = 0
-                out.worst = k
-                big = 1.0 / 0.0
-    if big > 1.7976931348623157e308:
-        out.finite = 0
-    out.energy = root(&total)
-    out.velocity = big if big > 0.0 else 0.0
+    out.finite = out.energy + out.velocity < 1.0 / 0.0
+    if not out.finite:
+        out.velocity = 1.0 / 0.0
+        out.worst = lost_row(e, p.n_rows)
+        if out.worst < 0:
+            out.worst = s.worst
 
 
 cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
@@ -204,8 +163,7 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
     """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
     cdef int32_t i, j, k, nt, roll
-    cdef double x, t, sum_ = 0.0, fast = 0.0, big = 0.0
-    cdef sum_t total = sum_t(0.0, 0.0)
+    cdef double t, sum_ = 0.0, fast = 0.0
     for i in range(p.n_blocks):
         j = p.ptr[i]
         nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
@@ -218,24 +176,8 @@ cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocit
             t = t * p.nu[k]
             if t > fast:
                 fast = t
-    if is_plain(sum_, fast):
-        energy[0] = sqrt(sum_)
-        velocity[0] = sqrt(fast)
-        return
-    for i in range(p.n_blocks):                         # scaled: 1e-200 does not vanish
-        j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
-        for k in range(j, p.ptr[i + 1]):
-            x = p.b[k] / sqrt(p.d[k])
-            add_square(&total, x)
-            if is_pair(nt, roll, k - j):
-                x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
-            x = fabs(x) * sqrt(p.nu[k])
-            if x > big:
-                big = x
-    energy[0] = root(&total)
-    velocity[0] = big
+    energy[0] = sqrt(sum_)
+    velocity[0] = sqrt(fast)
 
 
 cdef inline bint hides(double floor) noexcept nogil:
@@ -254,19 +196,12 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
 
 
 cdef inline floor_t no_floor() noexcept nogil:
-    return floor_t(0.0, 0.0, sum_t(0.0, 0.0), 0.0)
+    return floor_t(0.0, 0.0)
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint scaled, floor_t* s) noexcept nogil:
-    """What rounding leaves of row k, size = (|A| |lam|)_k; all rows, and once more, scaled, where `floor_ends` says no."""
-    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t
-    if scaled:
-        add_square(&s.total, f / sqrt(p.d[k]))
-        t = f * (sqrt(p.nu[k]) / sqrt(p.d[k]))
-        if t > s.big:
-            s.big = t
-        return
-    t = f / p.d[k]
+cdef inline void add_floor(const blocks_t* p, int32_t k, double size, floor_t* s) noexcept nogil:
+    """What rounding leaves of row k, size = (|A| |lam|)_k."""
+    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t = f / p.d[k]
     s.energy += t * f
     t = p.nu[k] * t * f
     if t > s.fast:
@@ -274,7 +209,7 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint
 
 
 cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
-                                 const double* size, const bint scaled, floor_t* s) noexcept nogil:
+                                 const double* size, floor_t* s) noexcept nogil:
     """`add_floor` of a block's rows; size from its first row on, of at least |A_kk| |lam_k|.
 
     Where the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
@@ -285,16 +220,13 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
     cdef double x, own
     for k in range(n):
         x = size[k]
-        if (is_pair(nt, roll, k) or is_pair(nt, roll, k - 1)) and e[j + k] != quotient(w[j + k], p.d[j + k]):
+        if (is_pair(nt, roll, k) or is_pair(nt, roll, k - 1)) and e[j + k] != w[j + k] / p.d[j + k]:
             own = p.d[j + k] * fabs(lam[j + k])
             x = own if own > x else x
-        add_floor(p, j + k, x, scaled, s)
+        add_floor(p, j + k, x, s)
 
 
-cdef inline bint floor_ends(const floor_t* s, const bint scaled, score_t* out) noexcept nogil:
-    """The floor entries of out; False where plain sums have left the range of squares."""
-    if not scaled and not is_plain(s.energy, s.fast):
-        return False
-    out.floor_energy = root(&s.total) if scaled else sqrt(s.energy)
-    out.floor_velocity = s.big if scaled else sqrt(s.fast)
-    return True
+cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
+    """The floor entries of out."""
+    out.floor_energy = sqrt(s.energy)
+    out.floor_velocity = sqrt(s.fast)

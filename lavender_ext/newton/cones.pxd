@@ -190,11 +190,11 @@ cdef inline void cone_divide(const double* v, const double* c, int32_t n, double
 
 
 cdef inline bint is_low(const elements_t* e, int32_t j) noexcept nogil:
-    return e.lower[j] > -1.7976931348623157e308
+    return e.lower[j] > -1.0 / 0.0
 
 
 cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
-    return e.upper[j] < 1.7976931348623157e308
+    return e.upper[j] < 1.0 / 0.0
 
 
 cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t which, const double* hz, double* c) noexcept nogil:

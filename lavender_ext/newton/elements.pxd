@@ -62,7 +62,7 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
                 inv[k * n + j] = inv[best * n + j]
                 inv[best * n + j] = x
         x = a[k * n + k]
-        x = 1.0 / x if fabs(x) > 1e-300 else 0.0
+        x = 1.0 / x if fabs(x) > 0.0 else 0.0
         for j in range(n):
             a[k * n + j] *= x
             inv[k * n + j] *= x

@@ -24,7 +24,7 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
     worst violation is `dual` times z's, because most rows carry load in the end.
     """
     cdef int32_t i, j, which, n
-    cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
+    cdef double worst_z = -1.0 / 0.0, worst_u = -1.0 / 0.0, size = 0.0, x, degree = 0.0, width
     cdef double c[4]
     for j in range(e.m):
         size += z[j] * z[j] + (hz[j] - e.g[j]) * (hz[j] - e.g[j])

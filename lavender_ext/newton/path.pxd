@@ -32,10 +32,12 @@ from lavender_ext.newton.system cimport OF_NATURAL, all_finite, solve_natural, s
 
 cdef inline double exponential(double x) noexcept nogil:
     """e^x to 1e-15 by a sum, with the same bits on every machine: those of the C library differ."""
-    cdef double k = floor(x * 1.4426950408889634 + 0.5), r, term = 1.0, total = 1.0
+    cdef double k, r, term = 1.0, total = 1.0
     cdef int i, _i, n
-    if not -700.0 < x < 700.0:
-        return 0.0 if x < 0.0 else 1e304
+    if x < -700.0:
+        return 0.0
+    x = x if x < 700.0 else 700.0
+    k = floor(x * 1.4426950408889634 + 0.5)
     n = <int>k
     r = x - k * 0.6931471803691238 - k * 1.9082149292705877e-10  # ln 2 in two parts
     for i in range(1, 16):
@@ -151,7 +153,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             continue
         first = cone_at(e, i, which) - e.ptr[i]
         a = ratio(e, i, which)
-        r, q = a * normal, 1e-300
+        r, q = a * normal, 0.0
         for k in range(first, first + n):
             q += (z[k] - s[k]) * (z[k] - s[k])
         q = sqrt(q)
@@ -169,7 +171,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             rest[k * nr] = -p[k * nr]
             ft[k] = -x * (fr * a * rise(y, tau) - r * rise(d, wide) / (m * m))
             for l in range(first, first + n):
-                own = x * (z[l] - s[l]) / (q * q)
+                own = x * (z[l] - s[l]) / (q * q) if q > 0.0 else 0.0
                 rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own
                 p[k * nr + l] = (1.0 if k == l else 0.0) - rest[k * nr + l]
 
@@ -238,14 +240,14 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
             if size < 1:
                 continue
             first = cone_at(e, i, which)
-            r, q = ratio(e, i, which) * plus(y, tau), 1e-300
+            r, q = ratio(e, i, which) * plus(y, tau), 0.0
             along = square = 0.0
             for k in range(first, first + size):
                 q += n.t1[k] * n.t1[k]
                 along += n.t1[k] * d[k]
                 square += d[k] * d[k]
             q = sqrt(q)
-            along /= q
+            along = along / q if q > 0.0 else 0.0
             x = fabs(ratio(e, i, which) * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * wide)
             worst = worst if x <= worst else x
             square -= along * along

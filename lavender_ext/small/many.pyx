@@ -14,6 +14,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
@@ -77,7 +78,7 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     cdef ssize_t m = j.p.n_rows
-    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
+    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, j.begin)
 
 
 cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
@@ -139,7 +140,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
-    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
+    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE or first_outside(j.p.d, m) >= 0:
         return
     if not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
         return
@@ -452,7 +453,7 @@ cdef class Worlds:
             return self.empty(i, desk)
         known = j.made.marks != NULL
         code = LEFT
-        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
+        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 and first_outside(j.p.d, m) < 0 \
                 and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
             code, x = READY, room.real
             if j.cold:

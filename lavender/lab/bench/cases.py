@@ -480,6 +480,4 @@ def _redundant(problem: Problem) -> bool:
     scale = 1.0 / np.sqrt(problem.d)
     a = problem.dense() * scale[:, None] * scale[None, :]
     values = np.linalg.svd(a, compute_uv=False)
-    return bool(
-        values[-1] <= 1e-12 * max(values[0], 1e-300)
-    )  # far below any condition number met in practice
+    return bool(values[-1] <= 1e-12 * values[0])  # far below any condition number met in practice

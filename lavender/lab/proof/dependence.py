@@ -19,8 +19,8 @@ class Tangled(Exception):
 
 def pivots(j: FloatArray) -> tuple[Any, int]:
     """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
-    size = np.maximum(np.sqrt((j * j).sum(axis=1)), np.finfo(float).tiny)
-    unit = j / size[:, None]
+    size = np.sqrt((j * j).sum(axis=1))
+    unit = j / np.where(size > 0.0, size, 1.0)[:, None]
     _, order, rank, _ = lapack.dpstrf(unit @ unit.T, tol=1e-10)
     return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
 

@@ -424,8 +424,8 @@ class Search:
     def _inverse(self, middle: FloatArray) -> Any:
         n = len(middle)
         with np.errstate(all="ignore"):
-            scale = np.sqrt(np.maximum(abs(middle).max(axis=0), np.finfo(float).tiny))
-            row = np.maximum(abs(middle / scale).max(axis=1), np.finfo(float).tiny)
+            scale = np.sqrt(_or_one(abs(middle).max(axis=0)))
+            row = _or_one(abs(middle / scale).max(axis=1))
             try:
                 inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
             except np.linalg.LinAlgError:
@@ -557,3 +557,7 @@ class _Recase(Exception):
 
 def _listed(names: tuple[str, ...]) -> str:
     return ", ".join(names[:4]) + (" and others" if len(names) > 4 else "")
+
+
+def _or_one(x: FloatArray) -> FloatArray:
+    return np.where(x > 0.0, x, 1.0)
