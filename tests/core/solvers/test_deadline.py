@@ -15,6 +15,7 @@ from lavender.base import deadline
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Auto
+from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
 
@@ -117,6 +118,21 @@ def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeyp
                 assert claim.message and np.isfinite(found[0].impulse).all()
                 ended.append(found[0].relative <= 1e-9)
     assert any(ended) and not all(ended)
+
+
+def test_steps_that_factor_nothing_are_cheap():
+    """Each was counted as one that does: bounded rows over J and M were ended at a third of their limit."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        low = rng.uniform(-2.0, 0.0, 48)
+        cones = lv.Cones.bounded(low, low + rng.uniform(0.0, 3.0, 48))
+        jac, free = rng.normal(size=(48, 30)), rng.normal(size=30)
+        problem = lv.Problem.from_jacobian(jac, np.diag(rng.uniform(0.1, 10.0, 30)), free, cones=cones)
+        steps, factored, _, _ = AUTO.solve(problem, None, 1e-6)[1]
+        of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work)[1]
+        most = 1.25 * factored * of_step
+        assert most < 0.8 * steps * of_step
+        assert AUTO.solve(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
 
 
 @pytest.mark.parametrize("small", [AUTO, DIRECT, NEWTON], ids=lambda small: small.name)
