@@ -173,6 +173,21 @@ def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, cl
     assert [a.status for a in within] == [b.status for b in without]
 
 
+@pytest.mark.parametrize("stacked", [False, True])
+def test_what_late_worlds_take_is_counted_by_their_size(stacked, clock):
+    """Judging 150 rows over 60 velocities takes 65 us, for which 10 were kept: 10 ms took 20."""
+    worlds = [over_velocities(150, 60, seed) for seed in range(10)]
+    if stacked:
+        of = [(p.generalized.jac, p.generalized.mass, p.generalized.v_free) for p in worlds]
+        jac, mass, free = (
+            np.array([x if x.ndim == 1 else x.toarray() for x in xs]) for xs in zip(*of, strict=True)
+        )
+        worlds = lv.Batch(jac, mass, free, cones=worlds[0].cones)
+    within, without = (lv.solve_many(worlds, time_limit=limit) for limit in (5e-4, 10.0))
+    assert not within.iterations.any() and all(status is lv.Status.TIME_LIMIT for status in within.status)
+    assert without.success.all()
+
+
 def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
     problems = [dense(100, "lcp", seed) for seed in range(4)]
     first = lv.solve(problems[0])
