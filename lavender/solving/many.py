@@ -17,17 +17,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, number, places, whole_number
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
-from lavender.judge.residuals import (
-    AT_REST,
-    ENOUGH,
-    RESULT,
-    Residual,
-    judged,
-    judging_time,
-    residual,
-    setup_time,
-    verdict_of,
-)
+from lavender.judge.residuals import AT_REST, ENOUGH, Residual, judged, reading_time, residual, verdict_of
 from lavender.judge.solution import Solution, Status, uninterrupted
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.batch import Batch, check_errors
@@ -122,10 +112,8 @@ class _Many:
         if isinstance(self.problems, Batch):
             rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
             return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * columns + 4.0)))
-        return sum(
-            LATE - RESULT + setup_time(p) + judging_time(p) if data else UNREAD
-            for p, data in zip(self.problems, self._data, strict=True)
-        )
+        both = zip(self.problems, self._data, strict=True)
+        return sum(LATE + reading_time(p) if data else UNREAD for p, data in both)
 
     def _rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
