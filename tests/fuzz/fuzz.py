@@ -6,9 +6,9 @@
 Hypothesis draws the inputs and makes one that fails smaller. A worker writes each into a file before it starts on
 it, and gives itself `limit` seconds of processor time: one that it does not end is a hang, one on which it ends by
 another signal a crash, and the next worker goes on with another seed. For each place that fails, its smallest input
-becomes a line of tests/fuzz/found.jsonl; --replay runs those that are there. --guided lets libFuzzer look for inputs that
-reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit status
-is 1 where anything failed.
+becomes a line of tests/fuzz/found.jsonl; --replay runs those that are there. --guided lets libFuzzer look for inputs
+that reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit
+status is 1 where anything failed.
 """
 
 import argparse
@@ -232,7 +232,9 @@ def keep(finding):
     name, lines = signature(finding), kept()
     line = json.dumps({"name": name, **finding})
     if name not in lines or len(line) < len(lines[name]):
-        FOUND.write_text("".join(f"{line}\n" for _, line in sorted({**lines, name: line}.items())), encoding="utf-8")
+        FOUND.write_text(
+            "".join(f"{line}\n" for _, line in sorted({**lines, name: line}.items())), encoding="utf-8"
+        )
     return name
 
 
