@@ -1,7 +1,7 @@
 """One check for arrays: dtype, shape, size of numbers, privacy. Kernels behind it check nothing.
 
-What numbers may be is said in `lavender_ext/core/door.pxd`: at most 1e60 in size, and masses and their like 0 or at least
-1e-60. The same problem in other units has the same answer, so the message names a unit to change.
+What numbers may be is said in `lavender_ext/core/door.pxd`: at most 1e60 in size, and masses and their like 0 or at
+least 1e-60. The same problem in other units has the same answer, so the message names a unit to change.
 """
 
 from __future__ import annotations
@@ -237,7 +237,9 @@ def check_sizes(what: str, array: np.ndarray, unit: str = "") -> None:
     check_inside(what, array, unit)
     check_not_negative(what, flat)
     where = ", ".join(map(str, np.unravel_index(at, array.shape)))
-    raise InputError(f"{what} must be 0 or at least {LEAST:g}; entry [{where}] is {flat[at]:g}: {_advice(unit)}")
+    raise InputError(
+        f"{what} must be 0 or at least {LEAST:g}; entry [{where}] is {flat[at]:g}: {_advice(unit)}"
+    )
 
 
 def _advice(unit: str) -> str:

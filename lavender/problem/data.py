@@ -123,7 +123,9 @@ class ProblemData:
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
         if self.guess is not None:
-            put(self, "guess", as_array("guess", self.guess, (m,), unit="N s", copy=self.copy))
+            guess = as_array("guess", self.guess, (m,), finite=False, unit="N s", copy=self.copy)
+            check_finite("guess [N s]", guess)
+            put(self, "guess", guess)
         if self.key is not None:
             key = np.asarray(self.key)
             if (
@@ -303,8 +305,8 @@ def _check_rhs(b: FloatArray) -> None:
     top = largest(b)
     if 0.0 < top < LEAST:
         raise InputError(
-            f"b [m/s] is {top:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least {LEAST:g}: "
-            "another unit of length or time brings it nearer to 1"
+            f"b [m/s] is {top:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
+            f"{LEAST:g}: another unit of length or time brings it nearer to 1"
         )
 
 

@@ -151,8 +151,8 @@ class Generalized:
             at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(at)} is no more than rounding of its "
-                f"diagonal entry, or less than {LEAST:g} (another unit of mass or length brings it nearer to 1); a body "
-                "without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
+                f"diagonal entry, or less than {LEAST:g} (another unit of mass or length brings it nearer to 1); a "
+                "body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
             )
         put["operator"] = operator
 

@@ -276,7 +276,7 @@ class Rows:
 
 def tensor_size(tensors: FloatArray) -> FloatArray:
     """Largest entry of each tensor (n, 3, 3)."""
-    return np.abs(tensors).max(axis=(1, 2), initial=0.0)  # type: ignore[no-any-return]
+    return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
 
 def check_inertia(name: str, tensors: FloatArray) -> FloatArray:
