@@ -109,3 +109,24 @@ def interrupted_newton(monkeypatch) -> list[float]:
     for system in (MatrixSystem, VelocitySystem):
         monkeypatch.setattr(system, "took", interrupt)
     return looks
+
+
+def shipped(name):
+    """A module of WebAssembly of these sources, as bytes; built once for each state of the sources."""
+    from lavender.base.errors import LavenderError
+    from lavender.sim.web import pages
+
+    try:
+        return pages.module(name=name)
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def module():
+    return shipped("lavender")
+
+
+@pytest.fixture(scope="session")
+def newton_module():
+    return shipped("newton")

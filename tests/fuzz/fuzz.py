@@ -1,14 +1,14 @@
 """Hostile inputs for MINUTES: what tests/fuzz/test_fuzz.py draws for some seconds, each kind in a watched process.
 
     python tests/fuzz/fuzz.py MINUTES [--seed N] [--kinds solve,file,...] [--limit SECONDS] [--most N] [--guided]
-    python tests/fuzz/fuzz.py --replay [FILE ...]
+    python tests/fuzz/fuzz.py --replay [NAME ...]
 
 Hypothesis draws the inputs and makes one that fails smaller. A worker writes each into a file before it starts on
 it, and gives itself `limit` seconds of processor time: one that it does not end is a hang, one on which it ends by
 another signal a crash, and the next worker goes on with another seed. For each place that fails, its smallest input
-becomes a file in tests/fuzz/found/; --replay runs those that are there. --guided lets libFuzzer look for inputs that
-reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit status
-is 1 where anything failed.
+becomes a line of tests/fuzz/found.jsonl; --replay runs those that are there. --guided lets libFuzzer look for inputs
+that reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit
+status is 1 where anything failed.
 """
 
 import argparse
@@ -31,7 +31,7 @@ from pathlib import Path
 import hypothesis
 
 HERE = Path(__file__).resolve().parent
-FOUND = Path(os.environ.get("LAVENDER_FUZZ_FOUND", HERE / "found"))
+FOUND = Path(os.environ.get("LAVENDER_FUZZ_FOUND", HERE / "found.jsonl"))
 # of the time
 SHARE = {"solve": 0.3, "file": 0.1, "steps": 0.2, "snapshot": 0.1, "folder": 0.1, "door": 0.1, "promise": 0.1}
 LIMIT = 20  # s of processor time on one input
@@ -221,27 +221,34 @@ def signature(finding):
     return f"{spec['kind']}-{words}-{digest}"
 
 
+def kept():
+    """Name to line of what was found."""
+    lines = FOUND.read_text(encoding="utf-8").splitlines() if FOUND.exists() else []
+    return {json.loads(line)["name"]: line for line in lines}
+
+
 def keep(finding):
     """Its name; its input is kept, if it is the smallest of this name."""
-    FOUND.mkdir(exist_ok=True)
-    name = signature(finding)
-    path, text = FOUND / f"{name}.json", json.dumps(finding) + "\n"
-    if not path.exists() or len(text) < path.stat().st_size:
-        path.write_text(text, encoding="utf-8")
+    name, lines = signature(finding), kept()
+    line = json.dumps({"name": name, **finding})
+    if name not in lines or len(line) < len(lines[name]):
+        FOUND.write_text(
+            "".join(f"{line}\n" for _, line in sorted({**lines, name: line}.items())), encoding="utf-8"
+        )
     return name
 
 
-def replay(paths):
-    """Files of found/, each in this process; what still fails."""
+def replay(names):
+    """Those of FOUND, or all of them, each in this process; what still fails."""
     sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
     import checks
 
-    failed = 0
-    for path in paths:
-        for what, detail in checks.run(json.loads(Path(path).read_text(encoding="utf-8"))["spec"]):
-            print(f"{path}: {what}: {detail}")
+    lines, failed = kept(), 0
+    for name in names or lines:
+        for what, detail in checks.run(json.loads(lines[name])["spec"]):
+            print(f"{name}: {what}: {detail}")
             failed += 1
-    print(f"{len(paths)} inputs replayed, {failed} findings")
+    print(f"{len(names or lines)} inputs replayed, {failed} findings")
     return failed
 
 
@@ -260,10 +267,10 @@ def main():
     parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time on one input")
     parser.add_argument("--most", type=int, default=10**9, help="inputs of each kind")
     parser.add_argument("--guided", action="store_true", help="led by coverage")
-    parser.add_argument("--replay", nargs="*", metavar="FILE")
+    parser.add_argument("--replay", nargs="*", metavar="NAME")
     given = parser.parse_args()
     if given.replay is not None:
-        return 1 if replay(given.replay or sorted(FOUND.glob("*.json"))) else 0
+        return 1 if replay(given.replay) else 0
     seed = given.seed if given.seed is not None else int.from_bytes(os.urandom(6), "little")
     kinds = given.kinds.split(",") if given.kinds else list(COVERED if given.guided else SHARE)
     print(f"seed {seed}", flush=True)
