@@ -1,6 +1,6 @@
 """The zero of one island's equations: found by Newton's method in balls, enclosed by Krawczyk's test.
 
-The slope over a box is held as float64 numbers with how far they may be off, sparse, and the rows of an inverse are
+The slope over a box is held as float64 numbers with how far they may be off, and the rows of an inverse are
 solved for in portions: each sum of k products of float64 numbers p_i q_i is off by at most
 
     k UNIT / (1 - k UNIT) sum |p_i q_i|                                                                 (3)
@@ -21,13 +21,11 @@ from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.lab.proof.numbers import UNIT, largest, upper_end
-from lavender.lab.proof.operator import Bounded, Part, wider
+from lavender.lab.proof.operator import DENSE, Rounded, Part, wider
 
-__all__ = ["EXTENT", "PRECISE", "Island", "NoZero", "Sticks"]
+__all__ = ["EXTENT", "PRECISE", "BallInverse", "FloatInverse", "Island", "NoZero", "Sticks"]
 
 PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
-
-DENSE = 300  # unknowns up to which an inverse of float64 is formed; above, its rows by a sparse factor
 
 PORTION = 4_000_000  # numbers of the inverse that are held at once
 
@@ -110,7 +108,7 @@ class Island:
                     left[place[first], q] = -ds
         return left, right
 
-    def floats(self, x: list[Any], speeds: Any) -> Bounded:
+    def floats(self, x: list[Any], speeds: Any) -> Rounded:
         """The slope as float64 numbers, and how far they may be off."""
         a, n = self.part.bounded, len(x)
         if not self.sliding:
@@ -120,9 +118,9 @@ class Island:
             left.setdefault((k, k), self.number(1.0))
         (p, dp), (r, dr) = (_bounded(entries, n) for entries in (left, right))
         size = abs(p) @ abs(a.near)
-        rounding = 2.0 * (int(np.diff(p.indptr).max()) + 2) * UNIT  # (3)
+        rounding = 2.0 * (_most(p) + 2) * UNIT  # (3)
         off = abs(p) @ a.off + dp @ (abs(a.near) + a.off) + dr + rounding * (size + abs(r))
-        return Bounded((p @ a.near + r).tocsr(), wider(off.tocsr()))
+        return Rounded(p @ a.near + r, wider(off))
 
     def balls(self, x: list[Any], speeds: Any) -> Any:
         """The slope as a matrix of balls."""
@@ -148,10 +146,9 @@ class Island:
         """
         number = self.number
         start = [number(x) for x in given]
-        for inverse in (_Floats, _Balls):
+        for inverse in (FloatInverse, BallInverse):
             try:
-                x = self._newton(start, inverse)
-                found = None if x is None else self._krawczyk(x, inverse)
+                found = self._krawczyk(*self._newton(start, inverse))
             except ZeroDivisionError:
                 found = None
             if found is not None:
@@ -165,8 +162,8 @@ class Island:
             raise Sticks(slow)
         raise NoZero(self.floats(start, speeds).near)
 
-    def _newton(self, x: list[Any], kind: Any) -> list[Any] | None:
-        """Middles near a zero."""
+    def _newton(self, x: list[Any], kind: Any) -> tuple[list[Any], Any]:
+        """Middles near a zero, and the inverse of the slope there."""
         inverse, moved, last = None, math.inf, math.inf
         small = 2.0 ** (-0.75 * self.flint.ctx.prec)
         for step in range(30):
@@ -183,22 +180,20 @@ class Island:
             x = [(p - q).mid() for p, q in zip(x, move, strict=True)]
             size, last, moved = largest(x), moved, largest(move)
             if not math.isfinite(moved):
-                return None
+                raise ZeroDivisionError
             if step > 1 and (moved <= small * size or (step > 9 and moved > 0.1 * last)):
                 break
         _, speeds = self.value(x)
         still = [part for (_, part), (_, s) in zip(self.sliding, speeds, strict=True) if not s > 0]
         if still:
             raise Sticks(still)
-        return x
+        return x, inverse
 
-    def _krawczyk(self, x: list[Any], kind: Any) -> list[Any] | None:
+    def _krawczyk(self, x: list[Any], inverse: Any) -> list[Any] | None:
         """Balls around x by (2), None where no box is found."""
         number = self.number
         value, speeds = self.value(x)
-        inverse = kind(self, x, speeds)
-        size = largest(x)
-        wide = np.full(len(x), 2.0 ** (-0.6 * self.flint.ctx.prec) * size + 2.0**-900)
+        wide = np.full(len(x), 2.0 ** (-0.6 * self.flint.ctx.prec) * largest(x) + 2.0**-900)
         for _ in range(EXTENT):
             box = [p + number(0.0, q) for p, q in zip(x, wide.tolist(), strict=True)]
             _, speeds = self.value(box) if self.sliding else (None, [])
@@ -214,7 +209,7 @@ class Island:
         return None
 
 
-class _Balls:
+class BallInverse:
     """Y in balls: the inverse of the slope's middle."""
 
     def __init__(self, island: Island, x: list[Any], speeds: Any) -> None:
@@ -223,6 +218,7 @@ class _Balls:
         self.inverse = island.balls(x, speeds).mid().inv().mid()
 
     def times(self, value: list[Any]) -> list[Any]:
+        """Y F, middles."""
         return (self.inverse * self.matrix(len(value), 1, value)).mid().entries()
 
     def reach(self, box: list[Any], speeds: Any, value: list[Any], wide: FloatArray) -> FloatArray:
@@ -235,45 +231,42 @@ class _Balls:
         return np.array([upper_end(q) for q in away.entries()])
 
 
-class _Floats:
+class FloatInverse:
     """Y in float64, of the slope scaled to entries of about 1 by powers of two."""
 
     def __init__(self, island: Island, x: list[Any], speeds: Any) -> None:
         self.island = island
         near = island.floats(x, speeds).near
         with np.errstate(all="ignore"):
-            size = abs(near)
-            self.column = _power(np.sqrt(size.max(axis=0).toarray().ravel()))
-            self.row = _power((size @ sp.diags_array(self.column)).max(axis=1).toarray().ravel())
-            self.near = self._scaled(near)
-            if not np.isfinite(self.near.data).all():
-                raise ZeroDivisionError
+            self.column = _power(np.sqrt(_largest(near, 0)))
+            self.row = _power(_largest(_scaled(near, np.ones(len(x)), self.column), 1))
+            near = _scaled(near, self.row, self.column)
+            self.whole: Any = None
+            self.factor: Any = None
             try:
-                if len(x) <= DENSE:
-                    self.whole = np.linalg.inv(self.near.toarray())
-                    self.factor = None
-                else:
+                if isinstance(near, np.ndarray):
+                    self.whole = np.linalg.inv(near)
+                elif np.isfinite(near.data).all():
                     options = {"SymmetricMode": True}
                     self.factor = sparse_lu(
-                        self.near, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options
+                        near, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.01, options=options
                     )
+                else:
+                    raise ZeroDivisionError
             except (np.linalg.LinAlgError, RuntimeError):
                 raise ZeroDivisionError from None
 
-    def _scaled(self, a: Any) -> Any:
-        return (sp.diags_array(self.row) @ a @ sp.diags_array(self.column)).tocsr()
-
     def times(self, value: list[Any]) -> list[Any]:
+        """Y F, middles."""
         right = self.row * np.array([float(q) for q in value])
-        move = self.column * (self.whole @ right if self.factor is None else self.factor.solve(right))
+        move = self.column * (self.factor.solve(right) if self.whole is None else self.whole @ right)
         return [self.island.number(q) for q in move.tolist()]
 
-    def _rows(self) -> Iterator[tuple[int, FloatArray]]:
+    def _rows(self, n: int) -> Iterator[tuple[int, FloatArray]]:
         """Rows of Y as columns, in portions."""
-        if self.factor is None:
+        if self.whole is not None:
             yield 0, self.whole.T
             return
-        n = self.near.shape[0]
         step = max(1, PORTION // n)
         for first in range(0, n, step):
             last = min(first + step, n)
@@ -284,17 +277,18 @@ class _Floats:
     def reach(self, box: list[Any], speeds: Any, value: list[Any], wide: FloatArray) -> FloatArray:
         """|Y F| + |I - Y F'(X)| (X - x), rounded up; inf where numbers are beyond float64."""
         slope, n = self.island.floats(box, speeds), len(box)
-        near, off = self._scaled(slope.near), wider(self._scaled(slope.off))
-        live = abs(np.concatenate([self.row, self.column, near.data[near.data != 0.0]]))
+        near, off = (_scaled(a, self.row, self.column) for a in slope)
+        before, after = (a.ravel() if isinstance(a, np.ndarray) else a.data for a in (slope.near, near))
+        live = abs(np.concatenate([self.row, self.column, after[before != 0.0]]))
         out = np.full(n, math.inf)
         if not ((live > TINY) & (live < 1.0 / TINY)).all():
-            return out  # what underflows below is not counted
-        turned = near.T.tocsr()
-        k = 2.0 * (int(np.diff(turned.indptr).max()) + 3) * UNIT  # (3)
+            return out  # numbers whose products float64 does not hold
+        turned = near.T if isinstance(near, np.ndarray) else near.T.tocsr()
+        k = 2.0 * (_most(turned) + 3) * UNIT  # (3)
         r = wider(wide / self.column)
         f = wider(self.row * np.array([upper_end(q) for q in value]))
-        t = f + (k * abs(near) + off) @ r + TINY * r.sum()
-        for first, y in self._rows():
+        t = f + (k * abs(near) + wider(off)) @ r + TINY * r.sum()
+        for first, y in self._rows(n):
             p = turned @ y
             p[np.arange(first, first + y.shape[1]), np.arange(y.shape[1])] -= 1.0
             out[first : first + y.shape[1]] = abs(p).T @ r + abs(y).T @ t
@@ -307,9 +301,31 @@ def _power(size: FloatArray) -> FloatArray:
     return np.exp2(-np.round(np.log2(np.where(size > 0.0, size, 1.0))))
 
 
+def _scaled(a: Any, row: FloatArray, column: FloatArray) -> Any:
+    if isinstance(a, np.ndarray):
+        return row[:, None] * a * column
+    data = a.data * np.repeat(row, np.diff(a.indptr)) * column[a.indices]
+    return sp.csr_array((data, a.indices, a.indptr), shape=a.shape)
+
+
+def _largest(a: Any, axis: int) -> FloatArray:
+    size = abs(a).max(axis=axis)
+    return np.asarray(size if isinstance(a, np.ndarray) else size.toarray().ravel())
+
+
+def _most(a: Any) -> int:
+    """Numbers in the fullest row."""
+    count = np.count_nonzero(a, axis=1) if isinstance(a, np.ndarray) else np.diff(a.indptr)
+    return int(count.max())
+
+
 def _bounded(entries: dict[Any, Any], n: int) -> tuple[Any, Any]:
-    """Sparse matrices of float64 numbers of balls and of how far they are off."""
-    at = np.array(list(entries), np.int64).reshape(-1, 2).T
+    """Matrices of float64 numbers of balls, and of how far they are off."""
+    at = tuple(np.array(list(entries), np.int64).reshape(-1, 2).T)
     near = [float(v.mid()) for v in entries.values()]
     off = [upper_end(v - x) for v, x in zip(entries.values(), near, strict=True)]
-    return tuple(sp.csr_array((np.array(v), (at[0], at[1])), shape=(n, n)) for v in (near, off))
+    if n > DENSE:
+        return tuple(sp.csr_array((np.array(v), at), shape=(n, n)) for v in (near, off))
+    out = np.zeros((2, n, n))
+    out[0][at], out[1][at] = near, off
+    return out[0], out[1]

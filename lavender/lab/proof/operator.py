@@ -14,17 +14,19 @@ from lavender.base.later import sparse as sp
 from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
 
-__all__ = ["LARGEST", "Bounded", "Operator", "Part", "wider"]
+__all__ = ["DENSE", "LARGEST", "Rounded", "Operator", "Part", "wider"]
 
 LARGEST = 2000  # coupled unknowns of J and M, whose M^-1 is dense, in balls: a minute, 0.3 GB
 
 SMALL = 64  # rows up to which A is dense balls
 
+DENSE = 300  # rows up to which float64 numbers are dense
+
 RANGE = 2.0**300  # of numbers whose products of three float64 holds
 
 
-class Bounded(NamedTuple):
-    """Float64 numbers and how far they may be off, sparse."""
+class Rounded(NamedTuple):
+    """Float64 numbers and how far they may be off: arrays up to DENSE rows, sparse above."""
 
     near: Any
     off: Any
@@ -88,22 +90,27 @@ class Part:
         return [p + t * q if t else p for p, t, q in zip(y, self._soft, x, strict=True)]
 
     @cached_property
-    def bounded(self) -> Bounded:
+    def bounded(self) -> Rounded:
         """A as float64 numbers, and how far they may be off."""
         if self._operator.transposed is None:
             a = self._operator.rows[self.which][:, self.which]
-            return Bounded(a, abs(a) * 0.0)
+            return self._bounded(a, abs(a) * 0.0)
         if self.dense:
             n, entries = len(self.which), self._exact.entries()
             near = [float(x.mid()) for x in entries]
             off = [upper_end(x - y) for x, y in zip(entries, near, strict=True)]
-            return Bounded(*(sp.csr_array(np.array(v).reshape(n, n)) for v in (near, off)))
+            both = (np.array(v).reshape(n, n) for v in (near, off))
+            return Rounded(*(v if n <= DENSE else sp.csr_array(v) for v in both))
         _, inner, j = self._matrices
         soft, inner_size, size = sp.diags_array(self._theta), abs(inner), abs(j)
         half, half_size = j @ inner, size @ inner_size
         k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2  # sums of sums of so many products
         off = 2.0 * k * UNIT * (half_size @ size.T + soft)
-        return Bounded((half @ j.T + soft).tocsr(), wider(off.tocsr()))
+        return self._bounded(half @ j.T + soft, wider(off))
+
+    def _bounded(self, near: Any, off: Any) -> Rounded:
+        dense = len(self.which) <= DENSE
+        return Rounded(*(a.toarray() if dense else sp.csr_array(a) for a in (near, off)))
 
 
 def _numbers(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
