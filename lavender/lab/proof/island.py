@@ -21,7 +21,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.lab.proof.numbers import UNIT, largest, upper_end
-from lavender.lab.proof.operator import DENSE, Rounded, Part, wider
+from lavender.lab.proof.operator import DENSE, Part, Rounded, wider
 
 __all__ = ["EXTENT", "PRECISE", "BallInverse", "FloatInverse", "Island", "NoZero", "Sticks"]
 

@@ -14,7 +14,7 @@ from lavender.base.later import sparse as sp
 from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
 
-__all__ = ["DENSE", "LARGEST", "Rounded", "Operator", "Part", "wider"]
+__all__ = ["DENSE", "LARGEST", "Operator", "Part", "Rounded", "wider"]
 
 LARGEST = 2000  # coupled unknowns of J and M, whose M^-1 is dense, in balls: a minute, 0.3 GB
 
