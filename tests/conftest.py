@@ -31,8 +31,16 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption("--one-of-each", action="store_true", help="of each test function only its first case")
+
+
+def pytest_collection_modifyitems(config, items):
     """The longest test begins first: at the end all cores but one would wait for it."""
+    if config.getoption("one_of_each"):
+        first = {(item.path, getattr(item, "originalname", item.name)): item for item in reversed(items)}
+        config.hook.pytest_deselected(items=[item for item in items if item not in first.values()])
+        items[:] = reversed(first.values())
     items.sort(key=lambda item: "parity" not in item.path.parts)
 
 
