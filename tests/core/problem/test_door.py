@@ -198,9 +198,7 @@ def test_a_row_of_dust_is_an_empty_row(form):
     if form == "A":
         problem = lv.Problem([1.0, 0.0], lv.Cones.free(2), np.diag([1.0, dust]))
     else:
-        problem = lv.Problem.from_jacobian(
-            np.diag([1.0, dust]), np.eye(2), [0.0, 0.0], cones=free, target=[1.0, 0.0]
-        )
+        problem = of_two(jac=(1.0, dust), v_free=(0.0, 0.0), target=[1.0, 0.0])
     assert problem.metric.empty.tolist() == [1] and problem.d.tolist() == [1.0, 1.0]
     assert lv.solve(problem, "auto").success
     asked = problem.updated(b=[1.0, 1.0])
