@@ -153,7 +153,9 @@ def of_two(jac=(1.0, 1.0), mass=(1.0, 1.0), v_free=(1.0, 1.0), **given):
 
 def worlds(jac):
     one = np.ones((3, 1))
-    return lv.Batch(np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * one, target=one, cones=lv.Cones.free(1))
+    return lv.Batch(
+        np.full((3, 1, 1), jac), np.ones((3, 1, 1)), 0.0 * one, target=one, cones=lv.Cones.free(1)
+    )
 
 
 OUTSIDE = {
