@@ -95,10 +95,8 @@ class Batch(Sequence[Problem]):
     ) -> None:
         if friction not in FRICTION:
             raise InputError(f"friction is {friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
-        packed = isinstance(M, tuple)
-        jac, mass, free = (
-            _numbers(name, x) for name, x in (("J", J), ("M", M[0] if packed else M), ("v_free", v_free))
-        )
+        values, *pattern = M if isinstance(M, tuple) else (M,)
+        jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
             rows = _pointers("row_ptr", row_ptr)
             if jac.ndim == 2 and velocity_ptr is None:
@@ -133,8 +131,8 @@ class Batch(Sequence[Problem]):
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
         self._place_cones(cones)
-        self._pattern = _triangle(*M[1:], nvs, mass) if packed else None
-        if room is not None and mass.ndim == 2 and not packed:
+        self._pattern = _triangle(pattern, nvs, mass) if pattern else None
+        if room is not None and mass.ndim == 2 and not pattern:
             mass = np.broadcast_to(mass, (n, *mass.shape))
         square = (None, None) if room is None else ((room, nv), (nv, nv))
         jac, at[:, PLACE["jac"]], self._jac_row = _matrices("J", jac, n, square[0], sizes * nvs)
@@ -398,16 +396,22 @@ def _pointers(name: str, given: Any) -> np.ndarray:
     return ptr
 
 
-def _triangle(indices: Any, indptr: Any, nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(indptr, indices) of lower triangles that worlds of nvs velocities share."""
-    ptr, col = (
-        as_array(f"M's {name}", x, (None,), dtype=np.int32)
-        for name, x in (("indptr", indptr), ("indices", indices))
+def _triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
+    if len(given) != 2:
+        raise InputError(f"M is a tuple of {1 + len(given)}; (values, indices, indptr) is needed")
+    col, ptr = (
+        as_array(name, x, (None,), dtype=np.int32)
+        for name, x in zip(("indices of M", "indptr of M"), given, strict=True)
     )
     nv = len(ptr) - 1
     row = np.repeat(np.arange(nv), np.maximum(np.diff(ptr), 0))
     sound = nv >= 0 and ptr[:1] == 0 and (np.diff(ptr) > 0).all() and len(row) == len(col)
-    if not sound or (col[ptr[1:] - 1] != np.arange(nv)).any() or not (np.diff(col)[np.diff(row) == 0] > 0).all():
+    if (
+        not sound
+        or (col[ptr[1:] - 1] != np.arange(nv)).any()
+        or not (np.diff(col)[np.diff(row) == 0] > 0).all()
+    ):
         raise InputError("M's rows must ascend to a last entry on the diagonal; lower triangles are needed")
     if (nvs != nv).any() or values.ndim != 2 or values.shape[1] != len(col):
         raise InputError(

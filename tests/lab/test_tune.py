@@ -74,7 +74,9 @@ def test_a_line_means_in_a_model_what_was_measured(options):
 
 
 def measured(time, error, **options):
-    return Measured(Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time))
+    return Measured(
+        Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time)
+    )
 
 
 def chosen(*some, held=(), threshold=1e-6):

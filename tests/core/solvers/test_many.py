@@ -104,7 +104,7 @@ def test_layouts_hold_the_same_worlds():
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_triangles_of_m_are_read_as_m_is(dtype):
-    """Every other entry off the diagonal is 0 in one world of two: no pattern but that of its numbers is a world's own."""
+    """In one world of two every other entry off the diagonal is 0, which its factor passes over."""
     jac, mass, free = worlds(4, dtype=dtype)
     i, j = np.tril_indices(18)
     mass[::2, i[1::2], j[1::2]] *= i[1::2] == j[1::2]
@@ -332,6 +332,7 @@ def test_worlds_whose_turn_comes_too_late_keep_their_start():
         ({"J": np.zeros((3, 12))}, "stacked it is"),
         ({"M": np.zeros((4, 3, 3))}, "M has shape"),
         ({"M": (np.ones((4, 3)), [0, 0, 1], [0, 1, 3])}, "entries of 2 velocities"),
+        ({"M": (np.ones((4, 3)), [0, 0, 1])}, "M is a tuple of 2"),
         ({"M": (np.ones((4, 17)), np.arange(18), np.arange(19))}, r"M has values of shape \(4, 17\)"),
         ({"M": (np.ones((4, 18)), np.arange(18)[::-1], np.arange(19))}, "ascend to a last entry on the diagonal"),
         ({"M": (np.ones((4, 18)), np.arange(18), np.arange(18))}, "ascend to a last entry on the diagonal"),
