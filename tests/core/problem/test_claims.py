@@ -241,7 +241,7 @@ def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
                 impulse[:] = told
                 return says(status)
 
-            liar = plug_in(run, operators={"matrix"}, rolling=True, boxes={"coulomb", "cone"})
+            liar = plug_in(run, operators={"matrix"}, parts=True, boxes={"coulomb", "cone"})
             solution = lv.solve(problem, liar)
             assert solution.contradicted, (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}
