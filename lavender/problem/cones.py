@@ -501,13 +501,13 @@ class Cones:
         ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
         rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)
         return Cones(
-            ptr,
-            self.kind[blocks],
-            self.lower[rows],
-            self.upper[rows],
-            self.mu[blocks],
-            self.patch_radius[blocks],
-            self.rolling[blocks],
+            ptr=ptr,
+            kind=self.kind[blocks],
+            lower=self.lower[rows],
+            upper=self.upper[rows],
+            mu=self.mu[blocks],
+            patch_radius=self.patch_radius[blocks],
+            rolling=self.rolling[blocks],
         )
 
     def __add__(self, other: object) -> Cones:
