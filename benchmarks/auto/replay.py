@@ -93,6 +93,7 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
         known = ((0, curve.setup, 1.0), *curve.points)
         now = time if n >= end else float(np.interp(n, [k for k, _, _ in known], [t for _, t, _ in known]))
         total += now - spent + LINE
+        tree.spent += stage.cost
         if n >= end:
             return total
         at[stage.solver] = n, now
@@ -171,7 +172,7 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
     def model(q: Any) -> Any:
         start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))
         steps = (
-            (costs.STEPS * count[n] if n in count else n)
+            (c.steps * count[n] if n in count else n)
             * (each * c.rows + entry * c.entries + work[c.form] * c.work)
             for c, _, n in newton
         )

@@ -1,13 +1,12 @@
 """Chooses and combines other solvers: this tree, by two counted costs (`costs.py`).
 
     the start is a solution     nothing is done
-    a small problem             at most 64 rows, or small islands under friction, or cheap velocities: one compiled call
-                                (`small.py`); if that does not solve it, as any other
-    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for twice the factorisations
-                                that `newton` is counted for
-    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it; not
-                                where 100 sweeps cost more
-    a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
+    a small problem             at most 64 rows, or small islands under friction, or velocities that cost less than 100
+                                sweeps: one compiled call (`small.py`); if that does not solve it, as any other
+    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
+                                factorisations that `newton` is counted for
+    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it
+    a loose pile of bodies      that do not roll: sweeps of the convex relaxation, then a few iterations of `nncg`
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
     all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`; all together LAST times
@@ -24,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -47,7 +46,7 @@ from lavender_ext.factor import graph
 
 SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
-ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
+ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
@@ -75,6 +74,7 @@ class Tree:
     """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
 
     begun = 0.0  # ns, of sweeps before Newton's method
+    spent = 0.0  # ns, as counted, of all lines that ran
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
@@ -163,9 +163,11 @@ class Tree:
 
     @property
     def is_loose(self) -> bool:
-        """Bodies under Coulomb's law, nearly each contact between another pair: sweeps then decide what sticks."""
+        """Bodies under Coulomb's law that do not roll, nearly each contact between another pair: sweeps then decide
+        what sticks.
+        """
         rows = self.problem.rows
-        if rows is None or not rows.n_bodies or self.law != "coulomb":
+        if rows is None or not rows.n_bodies or self.law != "coulomb" or self.problem.cones.has_rolling:
             return False
         return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
 
@@ -178,7 +180,7 @@ class Tree:
         if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
             yield Stage(
-                "direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations"
+                "direct", n, self.least, f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations"
             )
         yield from self.sweeps_first(self.least)
         if self.is_loose:
@@ -189,14 +191,13 @@ class Tree:
         yield from self.factorisations(MOST)
         # What follows where these fail has its line here.
         self.add_rows()
-        unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
-        spent = self.begun + MOST * unit
+        most = LAST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         for k in range(TURNS):
             for stage in self.in_turn(2.0**k):
-                spent += stage.cost
-                if spent > LAST * unit:
+                if self.spent >= most:
                     return
-                yield stage
+                share = min(1.0, (most - self.spent) / stage.cost)
+                yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
 
     def factorisations(self, times: float) -> Iterator[Stage]:
         """Newton's method for so many times its counted cost."""
@@ -209,7 +210,7 @@ class Tree:
         cost, short = SHARE * newton - self.begun, self.is_short(newton)
         if short and not self.begun:
             cost = max(cost, 0.5 * self.deadline.nanoseconds())
-        pays = short or self.is_loose or costs.SWEEPS * self.sweep <= newton
+        pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)
@@ -309,8 +310,10 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         return
     steps: dict[str, Step] = {}
     idle = 0  # lines in a row that had nothing to do
-    for stage in tree:
-        if log.done() or idle > len(METHODS):
+    lines = iter(tree)
+    while not log.done() and idle <= len(METHODS):  # before the next line counts what it needs
+        stage = next(lines, None)
+        if stage is None:
             break
         step = steps.get(stage.solver)
         if step is None:
@@ -325,6 +328,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         idle = idle + 1 if step.over else 0
         if not step.over:
             step.least, step.cost = stage.least, stage.cost
+            tree.spent += stage.cost
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)

@@ -20,7 +20,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import judged, reference
 from lavender.judge.solution import Claim, Status, Turn, counted
 from lavender.problem import Problem
-from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
+from lavender.solvers.costs import RATES, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import SMALL_ROWS
@@ -43,10 +43,12 @@ SPLIT = 200.0  # ns for each row of what tells islands apart
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
-def limits(most: float) -> Limits:
-    """Limits of the compiled calls over generalised velocities: rates, room, and the most counted cost [ns]."""
-    count = (STEPS * factorisations(law) for law in ("lcp", "coulomb", "cone"))
-    return Limits(np.array([RATES["entry"], RATES["work"]["velocities"], *count, general.ROOM, most]))
+def limits(sweeps: float, most: float = MOST) -> Limits:
+    """Limits of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`."""
+    count = (factorisations(law) for law in ("lcp", "coulomb", "cone"))
+    sweep = RATES["start"], RATES["sweep row"], RATES["sweep cone"], sweeps
+    step = RATES["entry"], RATES["work"]["velocities"]
+    return Limits(np.array([*step, *count, STEPS, *sweep, general.ROOM, most]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:
@@ -102,9 +104,10 @@ def who(problem: Problem) -> str:
     """Who solves a problem in the compiled call of `auto`, in words; "" where that is not made."""
     if problem.generalized is not None:
         kernel = general.prepare(problem)
-        limits = AUTO.limits
-        cost = np.inf if kernel is None or limits is None else limits.cost(problem.metric, kernel.work)[0]
-        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= MOST else ""
+        if kernel is None or AUTO.limits is None:
+            return ""
+        cost, most = AUTO.limits.cost(problem.metric, kernel.work)
+        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= most else ""
     small = prepared(problem)
     if small is None:
         return ""
@@ -134,14 +137,15 @@ class SmallCall:
             return None
         if kept.vain is not None:
             at = (problem._start if impulse is None else impulse).tobytes()
-            if kept.vain == (self.name, tol, at):
+            if kept.vain[:3] == (self.name, tol, at):
                 return None
+        done: tuple[int, ...] = ()
         if problem.generalized is not None:
             if self.limits is None:
                 return None
-            if most < inf:
-                return solve_first(kept.view, impulse, tol, self.limits, most)
-            found = solve_first(kept.view, impulse, tol, self.limits)
+            found = solve_first(kept.view, impulse, tol, self.limits, most)
+            if found[0] is None:
+                found, done = None, found[1]
         else:
             small = kept.small
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
@@ -151,8 +155,8 @@ class SmallCall:
             if most < inf:
                 return small.run(impulse, tol, self.hands_over, WARM, most)
             found = small.run(impulse, tol, self.hands_over, WARM)
-        if found is None:  # the same steps need not be done again before the full solver
-            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
+        if found is None and most == inf:  # the same steps need not be done again before the full solver
+            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes(), done)
         return found
 
     def claim(
@@ -252,6 +256,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(MOST), True, True)
+AUTO = SmallCall("auto", limits(SWEEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", limits(MOST), False)
+NEWTON = SmallCall("newton", limits(inf), False)
