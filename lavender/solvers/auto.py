@@ -75,6 +75,7 @@ class Tree:
 
     begun = 0.0  # ns, of sweeps before Newton's method
     spent = 0.0  # ns, as counted, of all lines that ran
+    tried = False  # velocities of J and M, in the compiled call
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
@@ -105,13 +106,18 @@ class Tree:
                 found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
             except BREAKDOWN:
                 continue
-        return dict(sorted(found.items(), key=lambda pair: pair[1].cost))
+        return dict(sorted(found.items(), key=self._order))
+
+    def _order(self, named: tuple[str, NewtonState]) -> tuple[bool, float]:
+        # The cheaper first; last what has failed.
+        return self.tried and named[1].general is not None, named[1].cost
 
     def _rows_may_pay(self, over: NewtonState | None) -> bool:
-        """Whether rows of an A that is formed of J and M are counted to cost less than velocities, at least."""
+        """Whether rows of an A that is formed of J and M are counted to cost less than what velocities still have."""
         if over is None or over.general is None or self.problem.cones.has_round:
             return False
-        return costs.newton_cost(costs.formed(self.problem), self.law) < over.cost
+        left = MOST if self.tried else 1.0
+        return costs.newton_cost(costs.formed(self.problem), self.law) < left * over.cost
 
     def _forms_late(self) -> bool:
         """Rows of an A of J and M are not there in time, with what of SciPy reads them."""
@@ -180,7 +186,10 @@ class Tree:
         if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
             yield Stage(
-                "direct", n, self.least, f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations"
+                "direct",
+                n,
+                self.least,
+                f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations",
             )
         yield from self.sweeps_first(self.least)
         if self.is_loose:
@@ -258,18 +267,20 @@ class Auto:
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem, state.log = state.problem, None
-        deadline = Deadline(time_limit)
+        deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
         if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
-            made = AUTO.solve(problem, impulse, tol, share * deadline.nanoseconds())
-            if made is not None and made[0].relative <= tol:
-                claim = AUTO.claim(problem, made[1], impulse, made[0].relative)
+            found, counts = AUTO.attempt(problem, impulse, tol, share * deadline.nanoseconds())
+            if found is not None and found.relative <= tol:
+                claim = AUTO.claim(problem, counts, impulse, found.relative)
                 if claim.iterations <= max_iter:
-                    impulse[:] = made[0].impulse
+                    impulse[:] = found.impulse
                     return claim
+            failed = AUTO.failed(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         tree, sweeps = Tree(problem, deadline), None
+        tree.tried = bool(failed) and problem.generalized is not None
         if deadline.is_set and not problem.cones.has_round:
             if deadline.passed(sweeping(problem)):
                 return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
@@ -283,6 +294,8 @@ class Auto:
         state.log = log
         try:
             if max_iter > 0 and log.best > tol and not log.done():
+                for name, claim in failed:
+                    log.note(name, claim, log.best)
                 solve(log, tree, sweeps)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same

@@ -71,8 +71,8 @@ class NewtonState:
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            rigid = problem.law in ("coulomb", "cone") and not self.general.soft
-            return Count("velocities", self.general.work, read, 0.0, steps=STEPS if rigid else 1.0)
+            steps = 1.0 if problem.law == "lcp" or self.general.soft else STEPS
+            return Count("velocities", self.general.work, read, 0.0, steps=steps)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
