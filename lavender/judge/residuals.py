@@ -275,6 +275,11 @@ def setup_time(problem: Problem) -> float:
     return 0.0 if _is_set_up(problem) else _read(problem)[1]
 
 
+def reading_time(problem: Problem) -> float:
+    """What he sets up and one pass take [s], counted, without a result made of it."""
+    return setup_time(problem) + judging_time(problem) - RESULT
+
+
 def _is_set_up(problem: Problem) -> bool:
     view = problem.derived.view
     return "metric" in problem.__dict__ or (view is not None and view.ready)
