@@ -85,6 +85,7 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
     for stage in islice(rule(tree), 60):
         curve, (before, spent) = curves.get(stage.solver), at.get(stage.solver, (0.0, 0.0))
         if curve is None or not curve.points or before >= curve.points[-1][0]:
+            tree.left += stage.cost
             continue
         time, end = curve.to(level)
         n = before + max(1.0, stage.iterations)
@@ -93,7 +94,6 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
         known = ((0, curve.setup, 1.0), *curve.points)
         now = time if n >= end else float(np.interp(n, [k for k, _, _ in known], [t for _, t, _ in known]))
         total += now - spent + LINE
-        tree.spent += stage.cost
         if n >= end:
             return total
         at[stage.solver] = n, now

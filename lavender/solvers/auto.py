@@ -74,7 +74,7 @@ class Tree:
     """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
 
     begun = 0.0  # ns, of sweeps before Newton's method
-    spent = 0.0  # ns, as counted, of all lines that ran
+    left = 0.0  # ns, for turns; who takes the lines gives back what did not run
     tried = False  # velocities of J and M, in the compiled call
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -200,12 +200,14 @@ class Tree:
         yield from self.factorisations(MOST)
         # What follows where these fail has its line here.
         self.add_rows()
-        most = LAST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
+        unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
+        self.left = (LAST - MOST) * unit - self.begun
         for k in range(TURNS):
             for stage in self.in_turn(2.0**k):
-                if self.spent >= most:
+                if self.left <= 0.0:
                     return
-                share = min(1.0, (most - self.spent) / stage.cost)
+                share = min(1.0, self.left / stage.cost)
+                self.left -= share * stage.cost
                 yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
 
     def factorisations(self, times: float) -> Iterator[Stage]:
@@ -339,9 +341,10 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
                 set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
                 step.over = log.ends_late(set_up + SURE * once(stage))
         idle = idle + 1 if step.over else 0
-        if not step.over:
+        if step.over:
+            tree.left += stage.cost
+        else:
             step.least, step.cost = stage.least, stage.cost
-            tree.spent += stage.cost
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
