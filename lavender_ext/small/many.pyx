@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
@@ -25,9 +25,9 @@ from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
 from lavender_ext.generalized.sparse cimport per_column
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
+from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
-from lavender_ext.judge.score cimport norms_of_rhs, relative, score_t
+from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
 
 cdef extern from *:
     """
@@ -79,6 +79,7 @@ cdef struct job_t:
     int32_t counts[4]           # steps, factorisations, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
+    const double* push          # (n) M^-1 J^T lam of the judge, in room that the next world takes
     score_t score
     double relative, floor
 
@@ -162,10 +163,13 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
 
 
 cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
-    """The judge's pass over lam; x (n + m) is scratch."""
+    """The judge's pass over lam, `general_judge` with what it pushes kept; x (2 n + m) is scratch."""
     cdef int32_t m = j.p.n_rows
     j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, x, True, &j.score)
+    general_slack(&j.p, &j.g, j.lam, x, j.both)
+    score_rows(&j.p, j.lam, j.both, j.both + m, &j.score)
+    general_floor(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
+    j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
 
@@ -204,7 +208,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if code != DONE and not j.spent:
         return
-    if not has_room(room, 0, <ssize_t>j.g.n + m):
+    if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
         return
     judge_job(j, room.real)
     j.solved = j.relative <= tol
@@ -332,6 +336,8 @@ cdef class Worlds:
         J, M, v*, target, compliance, mu (or None), flat float64 or float32.
     strides : (int, int)
         Numbers from one row to the next of J and of M, 0: as many as velocities.
+    pattern : (indptr, indices) int32, or None
+        Of M, where it holds lower triangles in compressed rows of one pattern.
     impulse, velocity : float64
         Of the results; of arrays the impulse holds the starts, unless `cold`.
     """
@@ -366,15 +372,20 @@ cdef class Worlds:
         self.v = &velocity[0] if velocity.shape[0] else NULL
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
-    def of_arrays(self, arrays, strides, Blocks blocks, int law, double asymmetry):
+    def of_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Of arrays, which have passed every check but that of their numbers."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
+        cdef const int32_t[::1] ptr, col
         cdef int32_t i
+        self.w.mass_ptr = NULL
+        if pattern is not None:
+            ptr, col = pattern
+            self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
         self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
-        self.keep += [blocks, *arrays]
+        self.keep += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
@@ -445,10 +456,8 @@ cdef class Worlds:
             self.count[4 * i + k] = j.counts[k]
         if self.jobs == NULL:
             v = self.v + at[VELOCITY]
-            jac_push(&j.g, j.lam, v)
-            tree_solve(&j.g, v)
             for k in range(j.g.n):
-                v[k] = desk.free[k] + v[k]
+                v[k] = desk.free[k] + j.push[k]
 
     cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
         """A world without rows, which nothing moves."""
@@ -489,7 +498,7 @@ cdef class Worlds:
         known = j.made.marks != NULL
         code = LEFT
         if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
-                and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
+                and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
             code, x = READY, room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
@@ -498,9 +507,10 @@ cdef class Worlds:
             for k in range(4):
                 j.counts[k] = 0
             if narrow:
+                x += j.g.n                              # behind what is pushed
                 squares32(&j.p, &j.g, &desk.mass, desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
-                    x[k] += x[m + k] + x[2 * m + k]
+                    x[k] = x[k] + x[m + k] + x[2 * m + k]
                 j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
             self.keep_result(i, &j, desk)
         forget(&j, known)
