@@ -41,7 +41,7 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     assert same.motion.max() == 0.0 and same.worst < 1e-9
 
 
-def test_what_interrupts_a_step_in_one_round_is_not_its_time(model, monkeypatch):  # noqa: F811
+def test_what_interrupts_a_step_in_one_round_is_not_its_time(model, monkeypatch):
     runs = Runs(str(model()), 1, 40)
     handle, made = runs.load()
     stage = Stage.of(handle, made, runs, [0], 10)
