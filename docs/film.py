@@ -18,10 +18,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # benchmarks
 
 from benchmarks.page import opened
 
-MOST = 1_000_000  # bytes
-FRAMES = 12  # a second
-COLORS = 64
-WIDTH = 900  # pixels
+MOST = 150_000  # bytes
+FRAMES = 10  # a second
+COLORS = 32
+WIDTH = 720  # pixels
 OUT = Path(__file__).resolve().parent / "static" / "web.gif"
 
 

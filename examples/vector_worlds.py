@@ -1,8 +1,9 @@
 """A verdict for every world of a vector environment, at every step of the training loop.
 
-Needs MuJoCo: pip install mujoco. With gymnasium its HalfCheetah-v5; without, hoppers in plain MuJoCo behind the same two
-calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and MuJoCo's answers to
-`residual_many`: worlds that are further off than a trainer would accept are counted, and their samples could be left out.
+Needs MuJoCo: pip install mujoco. With gymnasium its HalfCheetah-v5; without, hoppers in plain MuJoCo behind the same
+two calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and MuJoCo's
+answers to `residual_many`: worlds that are further off than a trainer would accept are counted, and their samples
+could be left out.
 
     python examples/vector_worlds.py [WORLDS [STEPS [ITERATIONS]]]
 

@@ -31,8 +31,16 @@ hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 PROBLEMS = os.environ.get("LAVENDER_PROBLEMS", "")
 
 
-def pytest_collection_modifyitems(items):
+def pytest_addoption(parser):
+    parser.addoption("--one-of-each", action="store_true", help="of each test function only its first case")
+
+
+def pytest_collection_modifyitems(config, items):
     """The longest test begins first: at the end all cores but one would wait for it."""
+    if config.getoption("one_of_each"):
+        first = {(item.path, getattr(item, "originalname", item.name)): item for item in reversed(items)}
+        config.hook.pytest_deselected(items=[item for item in items if item not in first.values()])
+        items[:] = reversed(first.values())
     items.sort(key=lambda item: "parity" not in item.path.parts)
 
 
@@ -56,6 +64,19 @@ def problem_dir() -> Path:
     if not any(folder.glob("*.npz")) and not any(folder.glob("*.hdf5")):
         pytest.fail(f"LAVENDER_PROBLEMS={PROBLEMS} holds no .npz or .hdf5 file")
     return folder
+
+
+@pytest.fixture
+def boxes(tmp_path):
+    """Writes the model `calls.BOXES` with these options of MuJoCo; its path."""
+    from calls import BOXES
+
+    def make(options=""):
+        path = tmp_path / "boxes.xml"
+        path.write_text(BOXES.format(options=options))
+        return path
+
+    return make
 
 
 @pytest.fixture
@@ -109,3 +130,24 @@ def interrupted_newton(monkeypatch) -> list[float]:
     for system in (MatrixSystem, VelocitySystem):
         monkeypatch.setattr(system, "took", interrupt)
     return looks
+
+
+def shipped(name):
+    """A module of WebAssembly of these sources, as bytes; built once for each state of the sources."""
+    from lavender.base.errors import LavenderError
+    from lavender.sim.web import pages
+
+    try:
+        return pages.module(name=name)
+    except LavenderError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def module():
+    return shipped("lavender")
+
+
+@pytest.fixture(scope="session")
+def newton_module():
+    return shipped("newton")

@@ -93,7 +93,7 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
             call=daqp.call, dense=True, warm=True, stoppable=True),
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
-            call=highs.call, max_iter=100_000, stoppable=True),
+            call=highs.call, max_iter=100_000, stoppable=True, noisy=True),
     Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
             "O'Donoghue 2021, SCS 3", settings=_scs, max_iter=100_000, warm=True, stoppable=True),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",

@@ -242,10 +242,9 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
         s = scale[0]
         jac *= s[:, None]
         goal, soft, lam = goal * s, soft * s * s, lam / s
-    whole = whole_mass(model, mass)
     batch = Batch(
         jac,
-        whole,
+        (mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))),
         before + dt * smooth,
         target=goal,
         cones=cones,

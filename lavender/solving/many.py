@@ -17,7 +17,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, number, places, whole_number
 from lavender.base.deadline import NEVER, Deadline
 from lavender.base.errors import InputError, LavenderError
-from lavender.judge.residuals import AT_REST, ENOUGH, Residual, judged, residual, verdict_of
+from lavender.judge.residuals import AT_REST, ENOUGH, Residual, judged, reading_time, residual, verdict_of
 from lavender.judge.solution import Solution, Status, uninterrupted
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender.problem.batch import Batch, check_errors
@@ -31,7 +31,10 @@ from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds
 __all__ = ["Residuals", "Solutions", "residual_many", "solve_many"]
 
 DONE_ALL = -1  # of `Hand`: there are no more worlds
-LATE = 1e-5  # s, that the judge is given for a world whose turn comes too late
+LATE, ENTRY = (
+    4e-6,
+    5e-9,
+)  # s, of the judge on a world of J and M whose turn comes too late, and for each multiply-add
 UNREAD = 4e-5  # s, of one that he reads later
 NO_TURN = "the time limit was over before its turn: the start, unjudged"
 STATUS = np.array(list(Status), object)
@@ -103,6 +106,14 @@ class _Many:
 
     def _read(self) -> None:
         """Judge what is not yet."""
+
+    def _late(self) -> float:
+        """What the results take [s] where nobody has his turn."""
+        if isinstance(self.problems, Batch):
+            rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
+            return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * columns + 4.0)))
+        both = zip(self.problems, self._data, strict=True)
+        return sum(LATE + reading_time(p) if data else UNREAD for p, data in both)
 
     def _rows(self, i: int) -> slice:
         return slice(int(self._first[i]), int(self._first[i] + self._sizes[i]))
@@ -436,11 +447,7 @@ def solve_many(
     made._unusable = unusable
     # What the results of those to come take is kept free.
     if deadline.is_set:
-        deadline.keep(
-            LATE * len(given)
-            if isinstance(given, Batch)
-            else sum(LATE if data else UNREAD for data in made._data)
-        )
+        deadline.keep(made._late())
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
     together = spec.own and spec.small is not None and not options and max_iter is None

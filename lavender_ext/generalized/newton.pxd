@@ -18,7 +18,8 @@ that lacks symmetry, as long as |G| falls; where it does not, normals are lowere
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
-N and its factor serve the next step where no block has changed its V.
+N and its factor serve the next step where no block has changed its V, and the first after the centre has moved: lambda
+leaps there, along the law that it has settled on, and so does V.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
@@ -243,7 +244,7 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double le
     """Newton steps under a law from y, s still to be formed; `best` has that error, or none has."""
     cdef descent_t* x = &f.descent
     f.p.law = law
-    x.idle = x.n = x.known = 0
+    x.idle = x.n = x.known = x.moved = 0
     x.fresh = x.stale = 1
     x.share = f.share
     x.least = least
@@ -298,6 +299,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         if rigid and (size <= 0.1 * energy or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
             follow(f, island)
+            x.moved = 1
             if x.last_center >= 0.0 and energy > 0.3 * x.last_center and x.share > 1e-9:
                 x.share = 0.1 * x.share
                 soften(f, island, x.share)
@@ -307,11 +309,11 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if x.stale or not is_held(f, island):
+        if x.stale or not (x.moved or is_held(f, island)):
             form(f, island, square)
             if not factor(f, island, square):
                 return FAILED
-        x.stale = 0
+        x.stale = x.moved = 0
         newton_step(f, island, square)
         if square:
             bound = size

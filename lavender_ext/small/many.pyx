@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
-from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
@@ -25,9 +25,9 @@ from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all
 from lavender_ext.generalized.sparse cimport per_column
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
+from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
-from lavender_ext.judge.score cimport norms_of_rhs, relative, score_t
+from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
 
 cdef extern from *:
     """
@@ -45,6 +45,11 @@ cdef enum:
     STEPS = 128                 # of newton for each island, and in all as many as `newton` has by default
     MOST = 1500
     AT_A_TIME = 256             # problems between two checks for Ctrl-C
+    # Counted in readings of all entries, fitted to 500 drawn problems; within 1.4 times what nine of ten take.
+    READ = 10                   # what is worked out and judged
+    FORMED = 3                  # N, beside half of its counted factor
+    LINE = 11                   # each row of an evaluation along a line
+    LOOKS = 3                   # evaluations of a step
 
 
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
@@ -69,6 +74,7 @@ cdef struct job_t:
     int32_t counts[4]           # steps, factorisations, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
+    const double* push          # (n) M^-1 J^T lam of the judge, in room that the next world takes
     score_t score
     double relative, floor
 
@@ -93,12 +99,28 @@ cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limi
     return count * step_cost(p, g, l, work)
 
 
-cdef inline bint is_cheap(job_t* j, const limits_t* l, double work, int32_t* steps) noexcept nogil:
-    """Is it? No more steps then than `most` of the job is for, counted as if each were of all islands."""
-    cdef double fit = j.most / step_cost(&j.p, &j.g, l, work)
-    if fit < steps[0]:
-        j.spent, steps[0] = True, <int32_t>max(fit, 0.0)
-    return cost_of(&j.p, &j.g, l, work) <= l.most
+cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
+    """What so many factorisations and evaluations along lines are counted to have cost, with what is read before and after [ns]."""
+    cdef double once = step_cost(&j.p, &j.g, l, 0.0)
+    return (READ + FORMED * factored) * once + 0.5 * factored * l.work * work + LINE * l.entry * j.p.n_rows * lines
+
+
+cdef inline int32_t descend_within(job_t* j, flow_t* f, const limits_t* l, double work) noexcept nogil:
+    """`descend_all` for as long as what it did is counted to cost less than `most` of the job: `spent` where it is not over then.
+
+    Steps that factor nothing are cheap, so it is asked again for as many as what is left is for if each did.
+    """
+    cdef int32_t code = SPENT, left = f.steps
+    cdef double each = spent_by(j, l, work, 1, LOOKS) - spent_by(j, l, work, 0, 0.0), fit = 1.0
+    while code == SPENT and left > 0 and fit >= 1.0:
+        fit = (j.most - spent_by(j, l, work, f.factorisations, f.evaluations)) / each
+        f.steps = <int32_t>max(fit, 0.0) if fit < left else left
+        left -= f.steps
+        code = descend_all(f, j.lam)
+        left += f.steps
+    f.steps = left
+    j.spent = code == SPENT and left > 0
+    return code
 
 
 cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
@@ -127,10 +149,13 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
 
 
 cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
-    """The judge's pass over lam; x (n + m) is scratch."""
+    """The judge's pass over lam, `general_judge` with what it pushes kept; x (2 n + m) is scratch."""
     cdef int32_t m = j.p.n_rows
     j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, x, True, &j.score)
+    general_slack(&j.p, &j.g, j.lam, x, j.both)
+    score_rows(&j.p, j.lam, j.both, j.both + m, &j.score)
+    general_floor(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
+    j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
 
@@ -148,8 +173,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     settle(&f, &j.p, &j.g, per, room.index, &need)
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
-    if need.crowded or need.values > limits.values or not is_cheap(j, limits, need.work, &steps):
-        j.spent = False
+    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > limits.most:
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -157,15 +181,13 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if j.cold:
         do_nothing(&j.p, j.lam, j.both)
     if j.made.n_empty and not settle_empty_rows(j, tol):
-        j.spent = False
         return
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    code = descend_all(&f, j.lam)
-    j.spent = j.spent and code == SPENT
+    code = descend_within(j, &f, limits, need.work)
     if code != DONE and not j.spent:
         return
     j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
-    if not has_room(room, 0, <ssize_t>j.g.n + m):
+    if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
         return
     judge_job(j, room.real)
     j.solved = j.relative <= tol
@@ -298,6 +320,8 @@ cdef class Worlds:
         J, M, v*, target, compliance, mu (or None), flat float64 or float32.
     strides : (int, int)
         Numbers from one row to the next of J and of M, 0: as many as velocities.
+    pattern : (indptr, indices) int32, or None
+        Of M, where it holds lower triangles in compressed rows of one pattern.
     impulse, velocity : float64
         Of the results; of arrays the impulse holds the starts, unless `cold`.
     """
@@ -332,15 +356,20 @@ cdef class Worlds:
         self.v = &velocity[0] if velocity.shape[0] else NULL
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
-    def of_arrays(self, arrays, strides, Blocks blocks, int law, double asymmetry):
+    def of_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Of arrays, which have passed every check but that of their numbers."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
+        cdef const int32_t[::1] ptr, col
         cdef int32_t i
+        self.w.mass_ptr = NULL
+        if pattern is not None:
+            ptr, col = pattern
+            self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
         self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
-        self.keep += [blocks, *arrays]
+        self.keep += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
@@ -411,10 +440,8 @@ cdef class Worlds:
             self.count[4 * i + k] = j.counts[k]
         if self.jobs == NULL:
             v = self.v + at[VELOCITY]
-            jac_push(&j.g, j.lam, v)
-            tree_solve(&j.g, v)
             for k in range(j.g.n):
-                v[k] = desk.free[k] + v[k]
+                v[k] = desk.free[k] + j.push[k]
 
     cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
         """A world without rows, which nothing moves."""
@@ -453,7 +480,7 @@ cdef class Worlds:
         known = j.made.marks != NULL
         code = LEFT
         if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
-                and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
+                and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
             code, x = READY, room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
@@ -462,9 +489,10 @@ cdef class Worlds:
             for k in range(4):
                 j.counts[k] = 0
             if narrow:
+                x += j.g.n                              # behind what is pushed
                 squares32(&j.p, &j.g, &desk.mass, desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
-                    x[k] += x[m + k] + x[2 * m + k]
+                    x[k] = x[k] + x[m + k] + x[2 * m + k]
                 j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
             self.keep_result(i, &j, desk)
         forget(&j, known)

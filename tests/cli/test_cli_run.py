@@ -1,9 +1,6 @@
 """`lavender run` and `web`: what steps an engine from the command line."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,6 @@ from click.testing import CliRunner
 from lavender.base.errors import LavenderError
 from lavender.cli import cli
 from lavender.sim.engine import Film
-from lavender.sim.web import compile as wasm
 from lavender.sim.web import pages
 
 
@@ -22,20 +18,8 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
     from lavender.io import load
 
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
-    words = [
-        "run",
-        "stack",
-        "--iterations",
-        "8",
-        "--no-warm-start",
-        "--steps",
-        "12",
-        "--set",
-        "n=2",
-        "--order",
-        "top_down",
-        "--residual",
-    ]
+    words = ["run", "stack", "--iterations", "8", "--no-warm-start", "--steps", "12", "--set", "n=2"]
+    words += ["--order", "top_down", "--residual"]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
     with pytest.raises(SystemExit) as code:
         main([*words, *map(str, files)])
@@ -66,33 +50,6 @@ def test_the_last_line_says_solver_and_order(words, last, capsys):
         main(["run", "stack", "--set", "n=2", "--steps", "3", *words])
     assert not code.value.code
     assert f" s, {last}" in capsys.readouterr().out.splitlines()[-1]
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["run", "stac"],
-        ["run", "stack", "--set", "n"],
-        ["run", "stack", "--set", "mu=1"],
-        ["run", "stack", "--iterations", "3"],
-        ["run", "stack", "--solver", "newtn"],
-        ["run", "stack", "--order", "up"],
-        ["run", "stack", "--solver", "newton", "--order", "bottom_up"],
-        ["run", "stack", "--order", "given", "--set", "order=reverse"],
-        ["run", "stack", "--stepper", "xpbd", "--solver", "newton"],
-    ],
-)
-def test_lavender_run_refuses_what_it_cannot_do(words, capsys):
-    from lavender.cli import main
-
-    with pytest.raises(SystemExit) as code:
-        main(words)
-    assert code.value.code == 2
-    assert "Traceback" not in capsys.readouterr().err
-
-
-def run(sim, steps):
-    return [sim.step()[0] for _ in range(steps)]
 
 
 def test_lavender_run_writes_films_and_pictures(tmp_path, capsys):
@@ -131,15 +88,6 @@ ROOT = HERE.parents[1]
 CHECK = ROOT / "tests" / "sim" / "web" / "check_wasm_exports.mjs"
 
 
-@pytest.fixture(scope="session")
-def module():
-    """The module of these sources, as bytes; built once for each state of the sources."""
-    try:
-        return pages.module()
-    except LavenderError as error:
-        pytest.skip(str(error))
-
-
 def test_lavender_web_check_says_what_it_needs_and_ends_as_its_script_does(tmp_path, monkeypatch):
     monkeypatch.setattr(pages, "module", lambda say, name: name.encode())
     monkeypatch.setattr(pages, "ROOT", tmp_path)
@@ -165,25 +113,8 @@ process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === 
         assert CliRunner().invoke(cli, ["web", "check"]).exit_code == code
 
 
-def node(*arguments):
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    return subprocess.run(["node", *map(str, arguments)], capture_output=True, text=True, check=False)
-
-
-needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
-
-
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
-        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
-    )  # fmt: skip
-
-
-def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
-    done = command("page", tmp_path / "site")
-    assert done.returncode == 0, done.stderr
+def test_command_writes_a_page_without_outside_addresses(lavender, module, tmp_path):
+    assert lavender("web", "page", tmp_path / "site")[0] == 0
     files = {
         path.relative_to(tmp_path / "site").as_posix()
         for path in (tmp_path / "site").rglob("*")
@@ -196,10 +127,3 @@ def test_command_writes_a_page_without_outside_addresses(module, tmp_path):
         if name.endswith((".html", ".js", ".css")) and not name.startswith("vendor/"):
             text = (tmp_path / "site" / name).read_text(encoding="utf-8")
             assert "http:" not in text.replace("http://www.w3.org/", "") and "https:" not in text, name
-
-
-@needs_compiler
-def test_command_says_why_it_cannot_build(tmp_path):
-    done = command("build", tmp_path / "none" / "a.wasm")
-    assert done.returncode == 2
-    assert "is not there; make it first" in done.stderr

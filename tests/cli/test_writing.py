@@ -195,25 +195,6 @@ def test_the_path_of_an_open_descriptor_is_no_name(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("run", "stack", "--steps", "2", "--film"),
-        ("run", "stack", "--steps", "2", "--trace"),
-        ("run", "stack", "--steps", "2", "--plot"),
-        ("solve", "stack(n=2)", "--output"),
-    ],
-)
-def test_a_command_that_is_to_write_a_device_ends_with_2(words, tmp_path, capsys):
-    path = tmp_path / "device.npz"
-    before = special("device", path)
-    with pytest.raises(SystemExit) as end:
-        lv.cli.main([*words, str(path)])
-    assert end.value.code == 2
-    assert "cannot write" in capsys.readouterr().err
-    assert os.lstat(path).st_rdev == before.st_rdev
-
-
 def test_threads_that_write_one_path_do_not_share_their_parts(tmp_path):
     from threading import Barrier, Thread
 

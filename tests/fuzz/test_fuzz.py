@@ -20,6 +20,7 @@ sys.path.insert(0, str(FUZZ))
 import checks
 import crowds
 import doors
+import fuzz
 import problems
 from judge_twin import Problem, spec_of
 from strategies import plain
@@ -109,15 +110,15 @@ sys.exit(fuzz.main())
 def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypatch, how):
     script = tmp_path / "broken.py"
     script.write_text(BROKEN.format(paths=[str(FUZZ), str(FUZZ.parent), str(FUZZ.parent.parent)], how=how))
-    monkeypatch.setenv("LAVENDER_FUZZ_FOUND", str(tmp_path / "found"))
+    monkeypatch.setenv("LAVENDER_FUZZ_FOUND", str(tmp_path / "found.jsonl"))
     monkeypatch.setenv("LAVENDER_FUZZ_SCRIPT", str(script))
     limit = "1" if how == "hang" else "60"
     asked = ["--seed", "1", "--kinds", "promise", "--most", "3", "--limit", limit]
     done = python(script, "30", *asked, status=1)
-    assert (tmp_path / "found").exists(), done.stdout + done.stderr
-    found = list((tmp_path / "found").iterdir())
-    assert {path.name.split("-")[1] for path in found} == {how}
-    assert all(json.loads(path.read_text())["spec"]["tol"] != 1e-6 for path in found)
+    assert (tmp_path / "found.jsonl").exists(), done.stdout + done.stderr
+    found = [json.loads(line) for line in (tmp_path / "found.jsonl").read_text().splitlines()]
+    assert {finding["name"].split("-")[1] for finding in found} == {how}
+    assert all(finding["spec"]["tol"] != 1e-6 for finding in found)
 
 
 # -- what the fuzzer draws for hours, for some seconds --------------------------------------------------------------
@@ -156,6 +157,6 @@ def test_no_lie_of_a_plug_in_changes_a_problem_or_a_verdict(lie):
 # -- what was found ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", sorted((FUZZ / "found").glob("*.json")), ids=lambda path: path.stem)
-def test_what_was_found_stays_mended(path):
-    assert checks.run(json.loads(path.read_text(encoding="utf-8"))["spec"]) == []
+@pytest.mark.parametrize(("name", "line"), fuzz.kept().items(), ids=fuzz.kept())
+def test_what_was_found_stays_mended(name, line):
+    assert checks.run(json.loads(line)["spec"]) == [], name

@@ -1,5 +1,8 @@
 """The problem set: made again by its names with the same numbers, and what its manifest says is so."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,6 +28,16 @@ def test_problems_are_made_again_with_the_same_numbers(start):
     wrong = replace(chosen[0], sha="0" * 16)
     (line,) = collection.changed([wrong])
     assert wrong.name in line and wrong.sha in line
+
+
+@pytest.mark.parametrize("core", ["Haswell", "Nehalem", "SkylakeX"])
+def test_no_problem_hangs_on_the_kernels_of_blas(core):
+    """Where the processor has not all that a core asks for, OpenBLAS chooses by itself."""
+    command = [sys.executable, "-m", "lavender", "problems", "--check"]
+    done = subprocess.run(
+        command, env=os.environ | {"OPENBLAS_CORETYPE": core}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout
 
 
 @pytest.mark.parametrize("entry", [e for e in ENTRIES if e.rows <= 40][::6], ids=lambda e: e.name)

@@ -115,13 +115,16 @@ def test_no_number_stands_unclaimed_and_no_claim_without_its_number(section):
 
 
 def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
-    shown = re.findall(r"generated/figures/(\w+)/(\w+)\.svg", PAGE)
-    assert len(shown) > 12
-    # no file of one example is overwritten by another's
-    assert len({panel for _, panel in shown}) == len(shown)
-    for name, panel in shown:
-        assert panel in example(name).PANELS
-        assert f"`python examples/{name}.py {panel}.png`" in PAGE
+    """Its picture is there without a build, and none is there that the page does not show."""
+    pictures = ROOT / "docs" / "static" / "chapter"
+    shown = re.findall(
+        r"\(static/chapter/(\w+)\.png\)\n\n\*[^`]*\*\s`python examples/(\w+)\.py (\w+)\.png`", PAGE
+    )
+    assert sorted(f"{file}.png" for file, *_ in shown) == sorted(path.name for path in pictures.iterdir())
+    assert len(shown) > 12 and PAGE.count("(static/chapter/") == len(shown)
+    for file, name, panel in shown:
+        assert file == panel and panel in example(name).PANELS
+        assert (pictures / f"{file}.png").stat().st_size <= 150_000
     for name, panel in re.findall(r"`python examples/(\w+)\.py (\w+)\.png`", PAGE):
         assert panel in example(name).PANELS
     named = {re.match(r"python examples/(\w+)\.py", command) for command in CLAIMS}

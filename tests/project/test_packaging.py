@@ -26,9 +26,7 @@ import pytest
 
 import lavender
 import lavender_ext
-from lavender.base.errors import LavenderError
 from lavender.io.stored import write_atomically
-from lavender.sim.web import pages
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 KERNELS = Path(lavender_ext.__file__).parent
@@ -394,24 +392,6 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
 HERE = Path(__file__).resolve().parent
 
 
-@pytest.fixture(scope="session")
-def module():
-    """The module of these sources, as bytes; built once for each state of the sources."""
-    try:
-        return pages.module()
-    except LavenderError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="session")
-def newton_module():
-    """The module of Newton's method, likewise."""
-    try:
-        return pages.module(name="newton")
-    except LavenderError as error:
-        pytest.skip(str(error))
-
-
 def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):
     # As `pip wheel --no-build-isolation` runs it: built, or taken from the checkout where it is of these sources.
     shipped = tmp_path / "lavender" / "sim" / "web"
@@ -419,10 +399,3 @@ def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_modul
     subprocess.run(command, check=True, cwd=ROOT)
     assert (shipped / "lavender.wasm").read_bytes() == module
     assert (shipped / "newton.wasm").read_bytes() == newton_module
-
-
-def command(*arguments):
-    return subprocess.run(
-        [sys.executable, "-m", "lavender.cli", "web", *map(str, arguments)],
-        capture_output=True, text=True, check=False, cwd=ROOT, env={**os.environ, "COLUMNS": "100"},
-    )  # fmt: skip

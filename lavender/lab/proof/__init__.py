@@ -13,9 +13,9 @@ box X around x~,
 
     K(X) = x~ - Y F(x~) + (I - Y F'(X)) (X - x~)  inside X   =>   F has one zero in X                      (2)
 
-(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), in ball arithmetic on the problem's float64 numbers as exact ones; where
-each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target included,
-keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
+(Krawczyk 1969; Neumaier 1990, theorem 5.1.8), F in ball arithmetic on the problem's float64 numbers as exact ones;
+where each inequality holds over the box of the zero, it is a solution. Rows that depend on others exactly, target
+included, keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
 Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
 exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
 else it is named as on the border of two cases.
@@ -58,7 +58,7 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     SolverUnavailable
         python-flint is not installed.
     CapabilityError
-        More than LARGEST unknowns that are coupled with each other.
+        More than LARGEST unknowns of J and M that are coupled with each other.
 
     Notes
     -----

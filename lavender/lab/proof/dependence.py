@@ -9,6 +9,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.later import lapack
 from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 
 __all__ = ["PRIMES", "Tangled", "dependencies", "pivots"]
 
@@ -17,13 +18,25 @@ class Tangled(Exception):
     """Rows that depend on each other to rounding, by no simple quotients."""
 
 
-def pivots(j: FloatArray) -> tuple[Any, int]:
+def pivots(j: Any) -> tuple[Any, int]:
     """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
-    size = np.maximum(np.sqrt((j * j).sum(axis=1)), np.finfo(float).tiny)
-    unit = j / size[:, None]
-    _, order, rank, _ = lapack.dpstrf(unit @ unit.T, tol=1e-10)
+    size = np.maximum(np.sqrt(j.multiply(j).sum(axis=1)), np.finfo(float).tiny)
+    unit = sp.csr_array(sp.diags_array(1.0 / size) @ j)
+    gram = sp.csc_array(unit @ unit.T)
+    m = gram.shape[0]
+    if m > SPARSE:
+        try:
+            options = {"SymmetricMode": True}
+            factor = sparse_lu(gram, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+            if abs(factor.U.diagonal()).min() > 1e-10:
+                return np.arange(m), m
+        except RuntimeError:
+            pass
+    _, order, rank, _ = lapack.dpstrf(gram.toarray(), tol=1e-10)
     return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
 
+
+SPARSE = 200  # rows above which a sparse factor is tried first: most depend on none
 
 PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
 
@@ -55,8 +68,9 @@ def dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
 
 def _dependent(flint: Any, j: Any, target: FloatArray, prime: int) -> tuple[list[int], list[int]] | None:
     m, n = j.shape
-    dense = [[_residue(x, prime) if x else 0 for x in row] for row in j.T.toarray().tolist()]
-    entries = [x for row in dense for x in row]
+    entries, by_row = [0] * (n * m), j.tocoo()
+    for i, k, x in zip(by_row.row.tolist(), by_row.col.tolist(), by_row.data.tolist(), strict=True):
+        entries[k * m + i] = _residue(x, prime)
     if prime < 2**64:
         reduced, rank = flint.nmod_mat(n, m, entries, prime).rref()
     else:

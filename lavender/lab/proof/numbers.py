@@ -86,9 +86,9 @@ def upper_end(x: Any) -> float:
     return 0.0 if up == 0 else float(up) * (1.0 + 2.0**-50) + 2.0**-1070
 
 
-def largest(x: Any) -> float:
-    """The size of a matrix's largest entry."""
-    return max((abs(float(q)) for q in x.entries()), default=0.0)
+def largest(x: list[Any]) -> float:
+    """The size of the largest of some numbers."""
+    return max((abs(float(q)) for q in x), default=0.0)
 
 
 def squared(x: Any) -> Any:

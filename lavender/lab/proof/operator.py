@@ -2,16 +2,122 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
-from lavender.lab.proof.numbers import UNIT, matrix, times
+from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
 
-__all__ = ["Operator"]
+__all__ = ["DENSE", "LARGEST", "Operator", "Part", "Rounded", "wider"]
+
+LARGEST = 2000  # coupled unknowns of J and M, whose M^-1 is dense, in balls: a minute, 0.3 GB
+
+SMALL = 64  # rows up to which A is dense balls
+
+DENSE = 300  # rows up to which float64 numbers are dense
+
+RANGE = 2.0**300  # of numbers whose products of three float64 holds
+
+
+class Rounded(NamedTuple):
+    """Float64 numbers and how far they may be off: arrays up to DENSE rows, sparse above."""
+
+    near: Any
+    off: Any
+
+
+def _in_range(a: Any) -> bool:
+    live = abs(a.data[a.data != 0.0])
+    return bool(((live > 1.0 / RANGE) & (live < RANGE)).all())
+
+
+def wider(x: Any) -> Any:
+    """More than these, which are rounded sums of nothing negative."""
+    return x * (1.0 + 1e-9)
+
+
+class Part:
+    """A of some rows and columns: exactly, times balls, and as float64 numbers with a bound."""
+
+    def __init__(self, operator: Operator, kind: Balls, which: Any) -> None:
+        self.which, self._operator, self._kind = which, operator, kind
+        self.dense = len(which) <= SMALL or operator.problem.generalized is not None
+        if not self.dense:
+            self._matrices = self._factors()
+            self.dense = not all(map(_in_range, self._matrices)) and operator.transposed is not None
+        if self.dense:
+            if len(which) > LARGEST:
+                raise CapabilityError(
+                    f"{len(which)} unknowns of J and M are coupled with each other; up to {LARGEST} are proven"
+                )
+            return
+        self._numbers = [_numbers(kind, f) for f in self._matrices]
+        theta = operator.problem.compliance
+        self._theta = np.zeros(len(which)) if theta is None else theta[which]
+        self._soft = [kind.number(t) for t in self._theta.tolist()]
+
+    def _factors(self) -> list[Any]:
+        """Matrices whose product, with the compliance, is A: the last one first."""
+        operator = self._operator
+        rows = operator.rows[self.which]
+        if operator.transposed is None:
+            return [rows[:, self.which]]
+        used = np.unique(rows.indices)
+        j = rows[:, used]
+        return [j.T.tocsr(), operator.inverse[used][:, used], j]
+
+    @cached_property
+    def _exact(self) -> Any:
+        return self._operator.block(self._kind, self.which)
+
+    def exact(self) -> Any:
+        """A as a dense matrix of balls."""
+        return self._exact
+
+    def times(self, x: list[Any]) -> list[Any]:
+        """A x."""
+        if self.dense:
+            return list((self._exact * self._kind.matrix(len(x), 1, x)).entries())
+        y = x
+        for factor in self._numbers:
+            y = [sum((p * y[k] for p, k in row), self._kind.number(0.0)) for row in factor]
+        return [p + t * q if t else p for p, t, q in zip(y, self._soft, x, strict=True)]
+
+    @cached_property
+    def bounded(self) -> Rounded:
+        """A as float64 numbers, and how far they may be off."""
+        if self._operator.transposed is None:
+            a = self._operator.rows[self.which][:, self.which]
+            return self._bounded(a, abs(a) * 0.0)
+        if self.dense:
+            n, entries = len(self.which), self._exact.entries()
+            near = [float(x.mid()) for x in entries]
+            off = [upper_end(x - y) for x, y in zip(entries, near, strict=True)]
+            both = (np.array(v).reshape(n, n) for v in (near, off))
+            return Rounded(*(v if n <= DENSE else sp.csr_array(v) for v in both))
+        _, inner, j = self._matrices
+        soft, inner_size, size = sp.diags_array(self._theta), abs(inner), abs(j)
+        half, half_size = j @ inner, size @ inner_size
+        k = int(np.diff(j.indptr).max() + np.diff(half.indptr).max()) + 2  # sums of sums of so many products
+        off = 2.0 * k * UNIT * (half_size @ size.T + soft)
+        return self._bounded(half @ j.T + soft, wider(off))
+
+    def _bounded(self, near: Any, off: Any) -> Rounded:
+        dense = len(self.which) <= DENSE
+        return Rounded(*(a.toarray() if dense else sp.csr_array(a) for a in (near, off)))
+
+
+def _numbers(kind: Any, a: Any) -> list[list[tuple[Any, int]]]:
+    """The entries of each row of a sparse matrix, in numbers of a kind."""
+    entries = list(zip([kind.number(x) for x in a.data.tolist()], a.indices.tolist(), strict=True))
+    ptr = a.indptr.tolist()
+    return [entries[s:e] for s, e in pairwise(ptr)]
 
 
 class Operator:

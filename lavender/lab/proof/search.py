@@ -9,30 +9,24 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, read_only
-from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.lab.motion import uniqueness
 from lavender.lab.proof.dependence import Tangled, dependencies, pivots
-from lavender.lab.proof.numbers import UNIT, Balls, Rationals, largest, sign_of, squared, upper_end
-from lavender.lab.proof.operator import Operator
+from lavender.lab.proof.island import Island, NoZero, Sticks
+from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, squared, upper_end
+from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 from lavender.problem.cones import ROW
 
-__all__ = ["EXTENT", "LARGEST", "PRECISE", "RATIONAL", "ROUNDS", "SLOW", "SMALL", "Enclosure", "Search"]
+__all__ = ["NAMED", "RATIONAL", "ROUNDS", "SMALL", "Enclosure", "Search"]
 
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 
-LARGEST = 2000  # unknowns that are coupled, in dense balls of 128 bits: a minute, 0.3 GB
-
-PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
-
-SLOW = 1e-9  # of the largest b: a speed that an answer may have where the solution sticks
+NAMED = 2000  # unknowns up to which a singular direction is looked for
 
 SMALL = 32  # unknowns that are not parted into islands
 
 ROUNDS = 30  # changes of cases, as in an active-set method
-
-EXTENT = 10  # enlargements of X
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +210,7 @@ class Search:
                 ):
                     lam[r] = x
             else:
-                self._island(kind, which, lam, base)
+                self._island(which, lam, base)
         return lam, self.operator.slack(kind, lam)
 
     def _islands(self, free: Any) -> list[Any]:
@@ -250,7 +244,7 @@ class Search:
         rows, self.still = np.array(sorted(still), np.int64), touching[:0]
         if not len(rows):
             return unknown
-        first, numerical = pivots(j[rows].toarray())
+        first, numerical = pivots(j[rows])
         if numerical == len(rows) and not len(touching):
             return unknown
         own = rows[first]
@@ -297,146 +291,35 @@ class Search:
         words += "; which carry load hangs on these (a compliance on them decides it)"
         return _Undecided(f"{_listed(names)}: {words}", names)
 
-    def _island(self, kind: Any, which: Any, lam: list[Any], base: list[Any]) -> None:
+    def _island(self, which: Any, lam: list[Any], base: list[Any]) -> None:
         """Enclose the impulses of `which`, by (2), into `lam`."""
-        n = len(which)
-        if n > LARGEST:
-            raise CapabilityError(f"{n} unknowns are coupled with each other; up to {LARGEST} are proven")
-        a = self.operator.block(kind, which)
-        place = {r: k for k, r in enumerate(which.tolist())}
-        parts = [
+        own = set(which.tolist())
+        sliding = [
             (block.first, part)
             for block in self.blocks
             if block.parts
             and block.loaded
-            and (block.first in place or any(r in place for p in block.parts for r in p.rows))
+            and (block.first in own or any(r in own for p in block.parts for r in p.rows))
             for part in block.parts
             if part.slides
         ]
-        matrix, number = kind.matrix, kind.number
-        b0 = matrix(n, 1, [base[r] for r in which.tolist()])  # w of what is fixed
+        part = Part(self.operator, Balls(self.flint), which)
+        island = Island(self.flint, part, sliding, self.cone, lam, base)
+        try:
+            found = island.enclose(self.given[which].tolist(), float(abs(self.problem.b).max()))
+        except Sticks as slow:
+            for one in slow.parts:
+                one.slides = False
+            raise _Recase from None
+        except NoZero as error:
+            raise self._singular(which, error.slope) from None
+        for r, x in zip(which.tolist(), found, strict=True):
+            lam[r] = x
 
-        def f(x: Any) -> tuple[Any, Any]:
-            """F and, of the sliding parts, their w and s."""
-            w = a * x + b0
-            out, speeds = [w[k, 0] for k in range(n)], []
-            for first, part in parts:
-                z = [number(c) * w[place[r], 0] for r, c in zip(part.rows, part.reach, strict=True)]
-                s = sum((q * q for q in z), number(0.0)).sqrt() if len(z) > 1 else abs(z[0])
-                speeds.append((w, s))
-                normal = x[place[first], 0] if first in place else lam[first]
-                for r, c in zip(part.rows, part.reach, strict=True):
-                    c2 = number(c) * number(c)
-                    out[place[r]] = x[place[r], 0] * s + c2 * w[place[r], 0] * normal
-                if self.cone and first in place:
-                    out[place[first]] -= s
-            return matrix(n, 1, out), speeds
-
-        def slope(x: Any, speeds: Any, left: Any, right: Any, other: Any) -> Any:
-            """F' = left A + right over a box, into two matrices of 1 and 0."""
-            for (first, part), (w, s) in zip(parts, speeds, strict=True):
-                at = [(place[r], number(c) * number(c)) for r, c in zip(part.rows, part.reach, strict=True)]
-                share = [c2 * w[k, 0] / s for k, c2 in at]  # ds = share . dw
-                normal = x[place[first], 0] if first in place else lam[first]
-                for k, c2 in at:
-                    for (q, _), ds in zip(at, share, strict=True):
-                        left[k, q] = other(x[k, 0] * ds + (c2 * normal if q == k else 0))
-                    right[k, k] = other(s)
-                    if first in place:
-                        right[k, place[first]] = other(c2 * w[k, 0])
-                if self.cone and first in place:
-                    for (q, _), ds in zip(at, share, strict=True):
-                        left[place[first], q] = other(-ds)
-
-        def near(x: Any, speeds: Any) -> FloatArray:
-            left, right = np.eye(n), np.zeros((n, n))
-            slope(x, speeds, left, right, float)
-            return left @ floats + right
-
-        def over(x: Any, speeds: Any) -> Any:
-            if not parts:
-                return a
-            left, right = matrix(unit), matrix(n, n)
-            slope(x, speeds, left, right, number)
-            return left * a + right
-
-        floats = np.asarray(self.problem.csr[which][:, which].toarray())
-        unit = matrix(n, n, np.eye(n).ravel().tolist())
-        x = matrix(n, 1, [number(float(self.given[r])) for r in which.tolist()])
-        start, inverse, precise = x, None, False
-        moved = last = math.inf
-        for step in range(30):
-            value, speeds = f(x)
-            if any(not (s > 0) for _, s in speeds):
-                break  # its case is wrong, or on the border
-            precise = precise or (step > 6 and moved > 0.1 * last)
-            if inverse is None or moved > (1e-3 if parts else 0.1) * last or (parts and step < 3):
-                inverse = None if precise else self._inverse(near(x, speeds))
-            if inverse is None:
-                try:
-                    if n > PRECISE:
-                        raise ZeroDivisionError
-                    inverse, precise = over(x, speeds).mid().inv().mid(), True
-                except ZeroDivisionError:
-                    raise self._singular(which, near(x, speeds)) from None
-            move = (inverse * value).mid()
-            x = (x - move).mid()
-            size, last, moved = largest(x), moved, largest(move)
-            enough = moved <= 2.0 ** (-0.75 * self.flint.ctx.prec) * size
-            if step > 1 and (enough or (precise and step > 9 and moved > 0.1 * last)):
-                break
-        value, speeds = f(x)
-        still = [part for (_, part), (_, s) in zip(parts, speeds, strict=True) if not s > 0]
-        for part in still:
-            part.slides = False
-        if still:
-            raise _Recase
-        newton = inverse * value
-        radius = [2.0 * upper_end(q) for q in newton.entries()]
-        least = max(radius, default=0.0) + 2.0 ** (-self.flint.ctx.prec + 16) * largest(x) + 2.0**-900
-        wide = [max(q, 1e-6 * least) for q in radius]
-        for _ in range(EXTENT):
-            ball = matrix(n, 1, [number(0.0, q) for q in wide])
-            box = x + ball
-            value, speeds = f(box)
-            if all(s > 0 for _, s in speeds):
-                away = (unit - inverse * over(box, speeds)) * ball - newton
-                reach = [upper_end(q) for q in away.entries()]
-                if all(q < p for q, p in zip(reach, wide, strict=True)):
-                    for r in which.tolist():
-                        lam[r] = x[place[r], 0] + number(0.0, reach[place[r]])
-                    return
-                wide = [4.0 * max(p, q) for p, q in zip(wide, reach, strict=True)]
-            else:
-                wide = [0.25 * p for p in wide]
-            if not all(math.isfinite(q) for q in wide):
-                break
-        # What hardly slides at the answer may stick.
-        _, speeds_given = f(start)
-        hardly = SLOW * float(abs(self.problem.b).max())
-        slow = [part for (_, part), (_, s) in zip(parts, speeds_given, strict=True) if not s > hardly]
-        for part in slow:
-            part.slides = False
-        if slow:
-            raise _Recase
-        raise self._singular(which, near(start, speeds_given))
-
-    def _inverse(self, middle: FloatArray) -> Any:
-        n = len(middle)
-        with np.errstate(all="ignore"):
-            scale = np.sqrt(np.maximum(abs(middle).max(axis=0), np.finfo(float).tiny))
-            row = np.maximum(abs(middle / scale).max(axis=1), np.finfo(float).tiny)
-            try:
-                inverse = np.linalg.inv(middle / scale / row[:, None]) / scale[:, None] / row
-            except np.linalg.LinAlgError:
-                return None
-            good = np.isfinite(inverse).all() and abs(np.eye(n) - inverse @ middle).max() < 1e-3
-        return self.flint.arb_mat(n, n, inverse.ravel().tolist()) if good else None
-
-    def _singular(self, which: Any, slope: FloatArray) -> _Undecided:
+    def _singular(self, which: Any, slope: Any) -> _Undecided:
         """Names the blocks whose impulses the equations do not fix, if they are singular."""
         rows = which[:0]
-        if np.isfinite(slope).all():
+        if len(which) <= NAMED and np.isfinite(slope := _array(slope)).all():
             _, size, direction = np.linalg.svd(
                 slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
             )
@@ -553,6 +436,10 @@ class Search:
 
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
+
+
+def _array(a: Any) -> FloatArray:
+    return a if isinstance(a, np.ndarray) else a.toarray()
 
 
 def _listed(names: tuple[str, ...]) -> str:

@@ -7,6 +7,8 @@ judge alone speaks. `SET` is what `lavender report hard` runs.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from lavender.base.errors import InputError
@@ -22,7 +24,16 @@ from lavender.lab.suite.build import (
 )
 from lavender.lab.suite.case import Draft, Reference, family
 from lavender.lab.suite.exact import solve_linear
-from lavender.lab.suite.families import BOX, MU, SPHERE, at_least, ball_joints, positive, rest_reference
+from lavender.lab.suite.families import (
+    BOX,
+    MU,
+    SPHERE,
+    at_least,
+    ball_joints,
+    positive,
+    product,
+    rest_reference,
+)
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
@@ -126,14 +137,13 @@ def four_bar(tilt: float = 0.3) -> Draft:
     20 rows on 18 degrees of freedom that still move in one: rank 17. An engine that trusts its pivots drifts.
     """
     anchor = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 1.0], [1.4, 0.0, 1.3], [1.5, 0.0, 0.0]])
-    c, s = np.cos(tilt), np.sin(tilt)
-    turn = np.array([[1.0, 0, 0], [0, c, -s], [0, s, c]]) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-    anchor, axis = anchor @ turn.T, turn @ np.array([0.0, 1.0, 0.0])
+    c, s = math.cos(tilt), math.sin(tilt)
+    turn = np.array([[c, -s, 0.0], [c * s, c * c, -s], [s * s, s * c, c]])  # about z, then about x
+    anchor = product(anchor, turn.T)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), [1.0, 2.0, 1.0], 0.1)
     body = np.array([[-1, 0], [0, 1], [1, 2], [2, -1]])
     ball = ball_joints(bodies.position, body, anchor).reshape(4, 3, 12)
-    # Two axes across the hinge: omega_b - omega_a has no part there.
-    across = np.linalg.svd(axis[None])[2][1:]
+    across = turn.T[[0, 2]]  # of the hinge, which is y: omega_b - omega_a has no part there
     turning = np.zeros((4, 2, 12))
     for joint, (a, b) in enumerate(body):
         for row in range(2):

@@ -8,7 +8,7 @@ import numpy as np
 
 from lavender.base.errors import UnknownName
 from lavender.lab.suite.case import Draft, family
-from lavender.lab.suite.families import at_least, positive
+from lavender.lab.suite.families import at_least, positive, product
 from lavender.problem import Problem
 
 __all__ = ["engine_step", "walking"]
@@ -49,13 +49,13 @@ def walking(n: int = 16, dt: float = 0.1, height: float = 0.8, foot: float = 0.1
     free, by_jerk = np.empty(n), np.zeros((n, n))
     ways = np.zeros((3, n))  # of the state by each jerk
     for k in range(n):
-        state, ways = move @ state, move @ ways
+        state, ways = product(move, state), product(move, ways)
         ways[:, k] = push
-        free[k], by_jerk[k] = pressure @ state, pressure @ ways
+        free[k], by_jerk[k] = product(pressure, state), product(pressure, ways)
     middle = 0.2 * ((np.arange(n) + rng.integers(8)) // 8) + rng.normal(scale=0.01, size=n)
     problem = Problem.from_qp(
-        by_jerk.T @ by_jerk + 1e-4 * np.eye(n),
-        by_jerk.T @ (free - middle),
+        product(by_jerk.T, by_jerk) + 1e-4 * np.eye(n),
+        product(by_jerk.T, free - middle),
         G=np.vstack([by_jerk, -by_jerk]),
         h=np.concatenate([middle + 0.5 * foot - free, free - middle + 0.5 * foot]),
     )

@@ -49,6 +49,14 @@ def test_an_absent_backend_says_what_to_install():
         assert f"pip install {backend.install}" in reasons[backend.name]
 
 
+@pytest.mark.parametrize("name", BACKENDS)
+def test_nothing_is_printed(name, capfd):
+    """HiGHS greets where it is made, whatever it is told; on standard output that is no JSON."""
+    a, b = spd(4)
+    lv.solve(lv.Problem.lcp(a, b), name)
+    assert capfd.readouterr() == ("", "")
+
+
 # -- what a problem may be ----------------------------------------------------------------------------
 
 

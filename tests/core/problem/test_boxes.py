@@ -200,9 +200,3 @@ def test_no_impulse_meets_every_row():
         assert solution.status is lv.Status.INFEASIBLE, (law, name, solution)
         assert check_certificate(problem, solution.certificate) is None
         assert not solution.contradicted
-
-
-# -- the engine --------------------------------------------------------------------------------------------------------
-
-
-# -- files -------------------------------------------------------------------------------------------------------------

@@ -204,6 +204,3 @@ def test_an_empty_row_of_bodies_may_be_dust_as_well():
             target[0] = dust
             problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
             assert lv.solve(problem).status.name == status
-
-
-# -- who fights ------------------------------------------------------------------------------------------

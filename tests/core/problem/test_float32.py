@@ -115,9 +115,6 @@ def test_another_precision_is_told(word):
         lv.Problem.lcp(np.eye(1), [1.0], precision=word)
 
 
-# -- early stops, planted -----------------------------------------------------------------------------
-
-
 # -- data in float32 ----------------------------------------------------------------------------------
 
 

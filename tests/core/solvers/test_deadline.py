@@ -15,6 +15,7 @@ from lavender.base import deadline
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Auto
+from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
 
@@ -49,6 +50,22 @@ def test_set_up_is_inside(clock, monkeypatch):
     assert prepared.solve(dense(100, "lcp", 1), time_limit=1.0).success
     inside = [left < 0.4 for left in given]
     assert inside == [True, False, True]
+
+
+@pytest.mark.parametrize("name", ["newton", "pgs", "anderson"])
+def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monkeypatch):
+    """A first iteration was: of 5,000 rows 1.2 ms more under a limit of 1 ms."""
+    problem, solver = dense(100, "lcp"), registry.get(name).load()
+    prepare = solver.prepare
+
+    def slow(self, *of):
+        clock.now += 2.0
+        return prepare(self, *of)
+
+    monkeypatch.setattr(solver, "prepare", slow)
+    monkeypatch.setattr(solver, "run", None)
+    late = lv.solve(problem, name, time_limit=1.0)
+    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and "set up" in late.message
 
 
 def test_a_set_up_that_was_late_is_done_by_the_next_call():
@@ -119,6 +136,21 @@ def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeyp
     assert any(ended) and not all(ended)
 
 
+def test_steps_that_factor_nothing_are_cheap():
+    """Each was counted as one that does: bounded rows over J and M were ended at a third of their limit."""
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        low = rng.uniform(-2.0, 0.0, 48)
+        cones = lv.Cones.bounded(low, low + rng.uniform(0.0, 3.0, 48))
+        jac, free = rng.normal(size=(48, 30)), rng.normal(size=30)
+        problem = lv.Problem.from_jacobian(jac, np.diag(rng.uniform(0.1, 10.0, 30)), free, cones=cones)
+        steps, factored, _, _ = AUTO.solve(problem, None, 1e-6)[1]
+        of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work)[1]
+        most = 1.25 * factored * of_step
+        assert most < 0.8 * steps * of_step
+        assert AUTO.solve(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
+
+
 @pytest.mark.parametrize("small", [AUTO, DIRECT, NEWTON], ids=lambda small: small.name)
 def test_more_counted_cost_of_a_small_call_ends_more_problems(small):
     ends = []
@@ -155,6 +187,21 @@ def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, cl
     within = lv.solve_many([fresh(p) for p in small], time_limit=0.3, threads=threads)
     assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
     assert [a.status for a in within] == [b.status for b in without]
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_what_late_worlds_take_is_counted_by_their_size(stacked, clock):
+    """Judging 150 rows over 60 velocities takes 65 us, for which 10 were kept: 10 ms took 20."""
+    worlds = [over_velocities(150, 60, seed) for seed in range(10)]
+    if stacked:
+        of = [(p.generalized.jac, p.generalized.mass, p.generalized.v_free) for p in worlds]
+        jac, mass, free = (
+            np.array([x if x.ndim == 1 else x.toarray() for x in xs]) for xs in zip(*of, strict=True)
+        )
+        worlds = lv.Batch(jac, mass, free, cones=worlds[0].cones)
+    within, without = (lv.solve_many(worlds, time_limit=limit) for limit in (5e-4, 10.0))
+    assert not within.iterations.any() and all(status is lv.Status.TIME_LIMIT for status in within.status)
+    assert without.success.all()
 
 
 def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):

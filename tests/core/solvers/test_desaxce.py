@@ -96,6 +96,3 @@ def test_augmented_system_is_the_same_newton_system(law, seed):
     x = solve.solve("natural", r)
     # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
     np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
-
-
-# -- scenes at rest: many redundant points, few of which slip -------------------------------------------

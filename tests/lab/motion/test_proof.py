@@ -9,7 +9,7 @@ import scipy.sparse as sp
 
 import lavender as lv
 from lavender import suite
-from lavender.lab.proof import search
+from lavender.lab.proof import island, operator, search
 from lavender.lab.proof.numbers import Balls
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
@@ -178,18 +178,47 @@ def test_a_twin_in_rational_numbers_finds_nothing_false(first):
     assert sum(near) >= 0.9 * len(near) > 0
 
 
+def test_sparse_numbers_prove_nothing_false_either(monkeypatch):
+    """Small problems by the way of large ones: sparse float64 numbers with bounds, rows of the inverse in portions."""
+    for where, name in ((operator, "SMALL"), (operator, "DENSE"), (island, "DENSE"), (island, "PORTION")):
+        monkeypatch.setattr(where, name, 1)
+    tried = [proof_twin.attack(seed) for seed in range(200, 260)]
+    assert not [wrong for _, _, wrong in tried if wrong]
+    near = [held for label, held, _ in tried if label in ("strict exact", "strict near", "strict noise")]
+    assert sum(near) >= 0.9 * len(near) > 0
+
+
+@pytest.mark.parametrize("name", ["granular(n=9)", "chain(n=1000)"])
+def test_thousands_of_coupled_rows_are_proven(name):
+    problem = suite.case(name).problem
+    found = lv.prove(problem, lv.solve(problem, tol=1e-12))
+    assert found.proven and found.unique and found.velocity_radius < 1e-9, found
+
+
+def test_both_inverses_enclose_the_same_zero(monkeypatch):
+    """Float64 with bounds, and balls throughout: each other's centre lies inside."""
+    problem = suite.case("granularF(n=2, sliding=0.5)").problem
+    solution = lv.solve(problem, tol=1e-12)
+    one = lv.prove(problem, solution)
+    monkeypatch.setattr(island, "FloatInverse", island.BallInverse)
+    two = lv.prove(problem, solution)
+    assert one.proven and two.proven
+    assert abs(one.impulse - two.impulse).max() <= 2.0**-50 * abs(two.impulse).max()
+    assert one.impulse_radius == pytest.approx(two.impulse_radius, rel=1e-9)
+
+
 def hair(h):
     """Row 0 is pushed by h: a hair that balls of 256 bits cannot tell from nothing beside 1."""
     a = [[2.0, -h, 1.0], [-h, 1.0, 0.0], [1.0, 0.0, 1.0]]
-    return lv.Problem(np.ones(3), lv.Cones.bounded([0.0], [np.inf]) + lv.Cones.free(2), np.array(a))
+    return lv.Problem(np.ones(3), lv.Cones.bounded([0.0, 1.0, 1.0], [np.inf, 1.0, 1.0]), np.array(a))
 
 
 def told_of_hairs():
-    """What is proven of row 0, which carries h / (1 - h^2) where that is positive, else nothing."""
+    """What is proven of row 0, which carries h / 2 where that is positive, else nothing."""
     pushed, pulled = (lv.prove(hair(h), [0.0, 1.0, 1.0]) for h in (2.0**-300, -(2.0**-300)))
     return (
         pushed.proven
-        and pushed.impulse_radius >= 2.0**-300
+        and pushed.impulse_radius >= 2.0**-301
         and pulled.proven
         and pulled.impulse_radius == 0.0
     )
@@ -223,8 +252,8 @@ def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
 
 def test_a_ball_about_zero_counts():
     """w of a row that another moves by at most 1: [-1, 1] holds it."""
-    operator = Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
-    w = operator.slack(Balls(flint), [flint.arb(0, 1), flint.arb(0)])
+    a = Operator(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [0.0, 0.0]))
+    w = a.slack(Balls(flint), [flint.arb(0, 1), flint.arb(0)])
     assert w[1].contains(0.75) and w[0].contains(-1.5)
 
 

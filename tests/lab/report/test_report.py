@@ -407,12 +407,6 @@ def test_a_report_of_nothing_says_so(tmp_path):
     assert "takes laws linear" in text
 
 
-def test_an_unwritable_folder_is_an_input_error(real, tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(lv.InputError, match="cannot write"):
-        report.write(real[0], tmp_path / "file")
-
-
 def test_a_frame_has_the_rows(real):
     pandas = pytest.importorskip("pandas", reason="a frame needs pandas (extra: frame)")
     frame = real[0].frame()
@@ -508,25 +502,6 @@ def test_changes_beyond_noise_are_named(tmp_path):
     assert tables.changes(old, moved) == []
     text = report.write(Report(moved, old), tmp_path, figures=False).read_text()
     assert "no case has the same numbers in both" in text
-
-
-def test_a_full_disk_leaves_the_page_of_the_last_time(tmp_path, monkeypatch):
-    found = records_of(record("a", "pgs", 1.0, 1e-7))
-    index = report.write(found, tmp_path, figures=False)
-    before = index.read_text()
-    true = type(index).write_bytes
-
-    def full(path, data):
-        if "index" not in path.name:
-            return true(path, data)
-        true(path, data[: len(data) // 2])
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr(type(index), "write_bytes", full)
-    with pytest.raises(lv.InputError, match=r"No space left.*make room"):
-        report.write(records_of(record("b", "pgs", 2.0, 1e-7)), tmp_path, figures=False)
-    assert index.read_text() == before
-    assert not list(tmp_path.glob(".*"))  # nor is a half of a page left
 
 
 @pytest.mark.parametrize(

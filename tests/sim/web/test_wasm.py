@@ -27,24 +27,6 @@ needs_compiler = pytest.mark.skipif(bool(wasm.why_not()), reason=wasm.why_not())
 
 
 @pytest.fixture(scope="session")
-def module():
-    """The module of these sources, as bytes; built once for each state of the sources."""
-    try:
-        return pages.module()
-    except LavenderError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="session")
-def newton_module():
-    """The module of Newton's method, likewise."""
-    try:
-        return pages.module(name="newton")
-    except LavenderError as error:
-        pytest.skip(str(error))
-
-
-@pytest.fixture(scope="session")
 def recording(tmp_path_factory):
     """Folder of what the native kernels did."""
     folder = tmp_path_factory.mktemp("recording")

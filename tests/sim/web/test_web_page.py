@@ -1,103 +1,19 @@
 """The page in a real browser without a window: what it shows is what the native kernels compute."""
 
-import os
-import shutil
-import threading
-
 import numpy as np
 import pytest
 from newton_steps import NewtonSteps
 
 import lavender as lv
-from lavender.base.errors import LavenderError
 from lavender.sim.engine import SOLVER_FIELDS
 from lavender.sim.scene import SCENES as SCENES_OF_GALLERY
 from lavender.sim.scene.parts import rotation
-from lavender.sim.web import pages
 from lavender.sim.web.scenes import EXPERIMENTS, PRESETS
 
 pytestmark = pytest.mark.slow  # the module is the same whatever checks the native kernels are built with
 
 SCENES = ("stack", "pyramid", "chain", "spinner")  # of the page's, which are those of the gallery
-PATIENCE = 600_000  # ms, for what hangs: on a loaded machine a page takes its time
 WHOLE = ("iterations", "warm_start", "contacts", "cache_matches")
-
-
-@pytest.fixture(scope="module")
-def address(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    try:
-        pages.write_page(folder)
-    except LavenderError as error:
-        pytest.skip(str(error))
-    server = pages.server(folder)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_address[1]}/"
-    server.shutdown()
-    server.server_close()
-    thread.join()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-    if found is None:
-        pytest.skip(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
-    with playwright.sync_playwright() as p:
-        # Containers and root have no user namespaces to build the sandbox from.
-        browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=PATIENCE)
-        yield browser
-        browser.close()
-
-
-def new_context(browser, **options):
-    context = browser.new_context(**options)
-    context.set_default_timeout(PATIENCE)
-    return context
-
-
-class Visit:
-    """A page with what it complained of and what it asked for."""
-
-    def __init__(self, browser, address, **options):
-        self.context = new_context(browser, **{"viewport": {"width": 1280, "height": 900}, **options})
-        self.page = self.context.new_page()
-        self.complaints, self.requests = [], []
-        self.page.on("console", lambda m: m.type in ("error", "warning") and self.complaints.append(m.text))
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
-        self.page.on("requestfailed", lambda request: self.complaints.append(request.url))
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(address)
-        self.page.wait_for_selector("html[data-ready=true]")
-
-    def side(self, i):
-        return self.page.locator(f".side[data-side='{i}']")
-
-    def values(self, i):
-        """The eight values of a side: exactly, and as they are shown."""
-        cells = [self.side(i).locator(f"td[data-field='{field}']") for field in SOLVER_FIELDS]
-        return [float(c.get_attribute("data-value")) for c in cells], [c.text_content() for c in cells]
-
-    def js(self, expression):
-        return self.page.evaluate(expression)
-
-
-@pytest.fixture
-def visit(browser, address):
-    visits = []
-
-    def start(path="#stack", **options):
-        visits.append(Visit(browser, address + path, **options))
-        return visits[-1]
-
-    yield start
-    for v in visits:
-        assert v.complaints == []
-        assert {url.rsplit("/", 1)[0] for url in v.requests if "/vendor/" not in url} == {address[:-1]}
-        v.context.close()
 
 
 def native(scene, steps, **parameters):
@@ -316,14 +232,12 @@ def test_phone_without_network(visit, scene):
     assert all(colors_in(v, i) > 10 for i in (0, 1))  # background, faces, edges, marks: something is drawn
 
 
-def test_a_page_that_cannot_start_says_so(browser, address):
-    context = new_context(browser)
-    page = context.new_page()
+def test_a_page_that_cannot_start_says_so(new_page, address):
+    page = new_page()
     page.route("**/scenes.json", lambda route: route.fulfill(body="{", content_type="application/json"))
     page.goto(address)
     page.wait_for_selector("#failure:not([hidden])")
     assert page.locator("#failure").text_content().startswith("The page could not start")
-    context.close()
 
 
 def test_a_lost_state_is_named(visit):
@@ -525,16 +439,14 @@ def test_the_module_of_newton_is_fetched_when_it_is_asked_for(visit):
     assert v.values(1)[0] == native("bridge", 2)
 
 
-def test_without_the_module_of_newton_both_sides_sweep(browser, address):
-    context = new_context(browser)
-    page = context.new_page()
+def test_without_the_module_of_newton_both_sides_sweep(new_page, address):
+    page = new_page()
     page.route("**/newton.wasm", lambda route: route.fulfill(status=404))
     page.goto(address + "#newton-against-sweeps")
     page.wait_for_selector("#failure:not([hidden])")
     assert "could not be loaded" in page.locator("#failure").text_content()
     assert page.locator(".solver").first.input_value() == "sweeps"
     page.wait_for_function("lavender.steps > 3")
-    context.close()
 
 
 def test_the_address_holds_every_setting_and_is_followed(visit):
@@ -616,10 +528,10 @@ def test_panels_with_nothing_to_show_give_way(visit):
     assert v.page.locator("figure .legend").first.text_content() == "AB"
 
 
-def test_a_run_is_shown_live_and_again(browser):
+def test_a_run_is_shown_live_and_again(visit):
     simulation = lv.Simulation("bridge")
     with simulation.view(browser=False) as viewer:
-        v = Visit(browser, viewer.address, viewport={"width": 1200, "height": 800})
+        v = visit("", viewer.address, viewport={"width": 1200, "height": 800})
         for _ in range(60):
             simulation.step()
         v.page.wait_for_function("lavender.frames.length === 61")
@@ -642,8 +554,6 @@ def test_a_run_is_shown_live_and_again(browser):
             v.page.set_viewport_size({"width": width, "height": 800})
             assert v.js("document.documentElement.scrollWidth") <= width
         _open_files(v, viewer.film.to_bytes())
-        assert v.complaints == []
-        v.context.close()
 
 
 def _open_files(v, film):
