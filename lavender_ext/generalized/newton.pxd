@@ -24,9 +24,9 @@ leaps there, along the law that it has settled on, and so does V.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
+from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, blocks_t, n_apart, n_tangents
 from lavender_ext.core.contact_map cimport length
-from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
@@ -175,8 +175,23 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
         theta[k] = big
 
 
+cdef inline double enough(int32_t kind) noexcept nogil:
+    """Compliance over d with which a block needs no proximal term."""
+    return 1e-6 if kind == ROW else 1e-3
+
+
+cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
+    """Needs no block one?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not g.compliance[k] >= enough(p.kind[i]) * p.d[k]:
+                return False
+    return True
+
+
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own, 1e-3 d in contacts.
+    """theta' of (2): rho is `share` d on rows with less than `enough` of their own.
 
     A disk's tangents get the largest.
     """
@@ -192,7 +207,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = 1e-6 if f.p.kind[i] == ROW else 1e-3
+            low = enough(f.p.kind[i])
             if share < low:
                 low = share
             for k in range(j, end):
@@ -420,7 +435,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
                 restart(f, island, impulse)
             begin_descent(f, island, CONE if x.at == RELAXED else COULOMB, 1.0 / 0.0)
         f.p.law = CONE if x.at == RELAXED else COULOMB
-        n = descend(f, island, 1e-2 * least if x.at == RELAXED and least > 1e2 else 1.0)
+        n = descend(f, island, 0.1 * least if x.at == RELAXED and least > 1e2 else 1.0)
         if x.at == RELAXED:
             if n == LOST or n == FAILED:
                 return n

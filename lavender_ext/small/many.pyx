@@ -23,7 +23,7 @@ from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, 
                                        ROW as AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all
+from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
 from lavender_ext.generalized.sparse cimport per_column
 from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
@@ -55,9 +55,14 @@ cdef enum:
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double entry                # each multiply-add of a sweep, and
     double work                 # of a factor,
-    double bounded              # factorisations by law
+    double bounded              # factorisations by law,
     double coulomb
     double cone
+    double rigid                # times as many with friction and a rigid row
+    double start                # what a solve beside this call takes at least,
+    double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
+    double sweep_cone
+    double sweeps               # and how many of them
     double values               # of one island's N
     double most                 # what all may cost to be asked at all
 
@@ -96,7 +101,16 @@ cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limi
     cdef double count = l.bounded
     if has_friction(p):
         count = l.coulomb if p.law == COULOMB else l.cone
+        if not is_soft(p, g):
+            count *= l.rigid
     return count * step_cost(p, g, l, work)
+
+
+cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
+    """What it may cost [ns]: as much as sweeps, which may do with less."""
+    cdef double each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.entry
+    cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
+    return min(l.most, l.start + l.sweeps * sweep)
 
 
 cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
@@ -164,16 +178,23 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
+    j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
         return
-    if not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
+    if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
         return
     if j.begin[0] < 0.0:
         begin(j, room.real)
-    settle(&f, &j.p, &j.g, per, room.index, &need)
+    while True:
+        if not has_room(room, marks_of(&j.p, &j.g, per), 0):
+            return
+        settle(&f, &j.p, &j.g, per, room.index, &need)
+        if not need.crowded or <double>per * j.g.n > limits.values:
+            break
+        per *= 2                                        # L has more entries than that in a row
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
-    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > limits.most:
+    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > allowed(&j.p, &j.g, limits):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -184,9 +205,9 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
         return
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
     code = descend_within(j, &f, limits, need.work)
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if code != DONE and not j.spent:
         return
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
         return
     judge_job(j, room.real)
@@ -221,9 +242,9 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
 
 
 cdef result(job_t* j, Data p, impulse, both):
-    """(What the judge found, counts as of `Newton.run`); doing nothing is kept with the data."""
-    return judged_from(p, impulse, both, &j.score, j.relative, j.floor), (
-        j.counts[0], j.counts[1], j.counts[2], j.counts[3])
+    """(What the judge found, None where nobody asked him, counts as of `Newton.run`)."""
+    found = judged_from(p, impulse, both, &j.score, j.relative, j.floor) if j.solved or j.spent else None
+    return found, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
 cdef void remember(job_t* j, Data p):
@@ -233,28 +254,23 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (7,)."""
+    """Of the numbers of a `limits_t` (12,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
 
     def cost(self, Data p, double work):
-        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and of a step."""
-        return cost_of(&p.blocks, &p.general, &self.at, work), step_cost(&p.blocks, &p.general, &self.at, work)
-
-    @property
-    def most(self):
-        """What it may cost to be asked at all [ns]."""
-        return self.at.most
+        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and may cost."""
+        return cost_of(&p.blocks, &p.general, &self.at, work), allowed(&p.blocks, &p.general, &self.at)
 
 
 def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
 
-    What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, an empty row cannot be
-    met or it costs more than the limits (`limits_t`) let in; most: counted cost [ns] where what was found by then is the
-    result. d, Y and the error of doing nothing stay with the data.
+    What the judge finds, None where it does not end below tol, an empty row cannot be met or it costs more than the limits
+    (`limits_t`) let in, and the counts, zeros where nothing was done; most: counted cost [ns] where what was found by then
+    is the result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL)
@@ -272,7 +288,7 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     if not known and j.made.numbers != NULL:
         p.adopt(&j.made)
     remember(&j, p)
-    return result(&j, p, impulse, results) if j.solved or j.spent else None
+    return result(&j, p, impulse, results)
 
 
 cdef enum:                      # what is known of a world when it is done, rows of `Worlds.numbers`
@@ -462,6 +478,8 @@ cdef class Worlds:
         solve_job(&j, room, limits, tol)
         if j.solved:
             self.keep_result(i, &j, desk)
+        else:
+            memcpy(&self.count[4 * i], j.counts, sizeof(j.counts))
         forget(&j, known)
         if self.jobs != NULL:
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
