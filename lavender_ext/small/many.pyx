@@ -58,7 +58,8 @@ cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double bounded              # factorisations by law,
     double coulomb
     double cone
-    double rigid                # times as many, but of bounded rows, with a rigid row
+    double rigid                # times as many, but of bounded rows, with a rigid row,
+    double soft                 # and where none is, but of free ones
     double start                # what a solve beside this call takes at least,
     double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
     double sweep_cone
@@ -109,12 +110,14 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
 cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
     """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
     cdef double count = l.bounded
-    cdef bint linear = is_linear(p), rubs = has_friction(p)
+    cdef bint linear = is_linear(p), rubs = has_friction(p), soft = is_soft(p, g)
     if linear:
         count = 1.0
     elif rubs:
         count = l.coulomb if p.law == COULOMB else l.cone
-    if (linear or rubs) and not is_soft(p, g):
+    if soft and not linear:
+        count *= l.soft
+    elif not soft and (linear or rubs):
         count *= l.rigid
     return count * step_cost(p, g, l, work)
 
@@ -267,7 +270,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (12,)."""
+    """Of the numbers of a `limits_t` (13,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
