@@ -23,7 +23,7 @@ from lavender.base.arrays import FloatArray, as_array, number, precision_of, who
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io import mujoco as single
 from lavender.problem.batch import Batch, check_errors
-from lavender.problem.cones import CONTACT, ROUND, ROW, Cones
+from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]
@@ -186,7 +186,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     found: list[Any] = [None] * n
     held: list[Any] = [np.zeros(0, np.int32)] * n  # what names are made of
     free, smooth = np.full((n, model.nv), np.nan), np.zeros((n, model.nv))
-    mass = np.zeros((n, len(mj.MjData(model).M)))
+    mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
     none = [np.zeros(0) for _ in OF_ROWS]
     todo = iter(range(n))
@@ -280,7 +280,7 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
 def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple[Cones, FloatArray | None]:
     """Blocks of all rows that count, one world after the other, and the factor of each row (n, m), None: 1."""
     n, m = of.shape
-    begins, kind, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
+    begins, tangents, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
     scale = None
     elliptic = (of == ELLIPTIC) & counted
     if elliptic.any() and contacts is None:
@@ -296,7 +296,7 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
             raise InputError(
                 f"efc_type has {rows} rows of elliptic contacts, contacts name {np.sum(dim)} of them"
             )
-        kind[world, address], mu[world, address] = np.where(dim > 3, ROUND, CONTACT), rub[:, 0]
+        tangents[world, address], mu[world, address] = dim - 1, rub[:, 0]
         factor = np.ones((n, m))
         for j in range(1, int(np.max(dim, initial=1))):
             at = dim > j
@@ -311,7 +311,8 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
     first = begins[counted]
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
-    kinds = np.where(kind[counted][first] == 0, ROW, kind[counted][first]).astype(np.int32)
+    tangents = tangents[counted][first]
+    kinds = kinds_of(tangents > 0, tangents=tangents)
     return Cones(
         ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[counted][first], patch_radius=none
     ), scale

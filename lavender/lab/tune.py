@@ -46,6 +46,7 @@ __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
 WORST = 0.99  # quantile of the error by which settings are compared
 EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
 SLOW = 2.0  # times the time now, above which a setting is timed no more
+TRIAL = 2  # rounds after which settings near the front are varied
 NEAR = 1.5  # times the time now, up to which settings of the front are varied
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
@@ -215,7 +216,8 @@ class Stage:
         models = [m.setting.on(self.mj, self.model) for m in some]
         for turn in range(rounds):
             for m, model in zip(some, models, strict=True):
-                if turn == 0 or m.time <= SLOW * some[0].time:
+                # Medians: one step that was interrupted in the first round says nothing of a setting.
+                if turn == 0 or np.median(m.times) <= SLOW * np.median(some[0].times):
                     m.times = np.minimum(m.times, self.run(model)[0])
                     tell("timed")
 
@@ -468,7 +470,7 @@ def tune(
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds fly apart with the model's own setting")
         measured += judge(stage, grid(mj, made)[1:])
-        stage.time(measured, 1, tell)
+        stage.time(measured, min(TRIAL, rounds), tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [Setting(), *near] for x in around(mj, made, s) if x not in known)

@@ -78,7 +78,7 @@ def prepared(problem: Problem) -> Any:
 def _make(problem: Problem) -> Small | None:
     law, cones, count, label = problem.law, problem.cones, 1, None
     bounded = law in ("linear", "lcp")
-    if cones.has_round or cones.has_rolling:
+    if cones.has_round or cones.has_more_parts:
         return None
     if problem.m > SMALL_ROWS:
         if bounded:

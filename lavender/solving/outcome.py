@@ -14,7 +14,6 @@ from lavender.judge.certificates import prove, rounded_down
 from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
 from lavender.judge.solution import Claim, History, Solution, SolverRun, Status
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender.solvers.registry import SolverSpec, in_one_call
 from lavender_ext.judge.measure import Judged, all_finite
 
@@ -145,9 +144,8 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
 def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
     cones, worst, empty = problem.cones, -1, problem.metric.empty
-    block = np.searchsorted(cones.ptr, empty, side="right") - 1
-    # Tangents, spin and rolling are bounded by mu lambda_n.
-    asks = empty[(problem.b[empty] != 0.0) & ((cones.kind[block] == ROW) | (empty == cones.ptr[block]))]
+    # What is behind a normal is bounded by its impulse.
+    asks = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if not len(asks):
         return None
     for i in np.setdiff1d(asks, problem.vanished_rows).tolist():

@@ -41,11 +41,11 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     assert same.motion.max() == 0.0 and same.worst < 1e-9
 
 
-def test_what_interrupts_a_step_in_one_round_is_not_its_time(model, monkeypatch):  # noqa: F811
-    runs = Runs(str(model()), 1, 40)
+def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
+    runs = Runs(str(boxes()), 1, 40)
     handle, made = runs.load()
     stage = Stage.of(handle, made, runs, [0], 10)
-    found = stage.measured(Setting())
+    found = [stage.measured(s) for s in (Setting(), Setting((("iterations", 5),)))]
     rng, now = np.random.default_rng(1), 0.0
 
     def busy():
@@ -54,8 +54,9 @@ def test_what_interrupts_a_step_in_one_round_is_not_its_time(model, monkeypatch)
         return now
 
     monkeypatch.setattr(module, "perf_counter", busy)
-    stage.time([found], 6, lambda _: None)
-    assert found.time == pytest.approx(1e-6, abs=1e-9)  # the clock itself rounds to 1e-14 of its 30 s
+    stage.time(found, 6, lambda _: None)
+    for m in found:
+        assert m.time == pytest.approx(1e-6, abs=1e-9)  # the clock itself rounds to 1e-14 of its 30 s
 
 
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
