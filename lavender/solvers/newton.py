@@ -36,7 +36,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status, counted
 from lavender.problem import OPERATORS, Problem
-from lavender.solvers.costs import STEPS, Count, factorisations, newton_cost
+from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.registry import SolverSpec
@@ -72,7 +72,8 @@ class NewtonState:
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            steps = 1.0 if problem.law == "lcp" or self.general.soft else STEPS
+            soft, law = self.general.soft, problem.law
+            steps = SOFT if soft and law != "linear" else 1.0 if soft or law == "lcp" else STEPS
             return Count("velocities", self.general.work, read, 0.0, steps=steps)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
