@@ -20,6 +20,16 @@ from lavender_ext.sweep import serial
 SHORT = ("auto", "direct", "newton")
 
 
+# A model of MuJoCo: two boxes on each other, and a driven arm at the end of its range.
+BOXES = """<mujoco><option timestep="0.004" {options}/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+  <body name="low" pos="0 0 0.099"><freejoint/><geom name="low" type="box" size=".1 .1 .1" density="300"/></body>
+  <body name="high" pos="0.02 0 0.32"><freejoint/><geom name="high" type="box" size=".1 .1 .1"/></body>
+  <body pos="0.5 0 0.3"><joint name="arm" axis="0 1 0" range="-20 20" limited="true"/>
+    <geom name="arm" type="capsule" size=".04" fromto="0 0 0 -.35 0 0"/></body>
+</worldbody><actuator><motor joint="arm" gear="6"/></actuator></mujoco>"""
+EARLY_BOXES = 'solver="CG" iterations="3"'  # plainly too few
+
+
 TIMES = ("setup_time", "solve_time", "_rest")
 
 

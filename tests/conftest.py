@@ -67,6 +67,19 @@ def problem_dir() -> Path:
 
 
 @pytest.fixture
+def boxes(tmp_path):
+    """Writes the model `calls.BOXES` with these options of MuJoCo; its path."""
+    from calls import BOXES
+
+    def make(options=""):
+        path = tmp_path / "boxes.xml"
+        path.write_text(BOXES.format(options=options))
+        return path
+
+    return make
+
+
+@pytest.fixture
 def register(monkeypatch):
     """As `lavender.register`, for one test, and in the place of a solver of the same name."""
     from lavender import registry

@@ -221,8 +221,8 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
         "`lavender problems` makes them from their names, `lavender problems --check` compares every number with "
         "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page. "
         "Robots need the extra `robots`: models of gymnasium (MIT) and dm_control (Apache-2.0). Recorded are files of "
-        "other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two of ContactBench "
-        "(BSD-2-Clause); `lavender problems FOLDER --certify FILE` says of yours what this page says of them."
+        "other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two of "
+        "ContactBench (BSD-2-Clause); `lavender problems FOLDER --certify FILE` says the same of yours."
     )
     columns = (
         "Rows from the least to the most; sweeps of PGS to a thousandth of the error of doing nothing, in the median "

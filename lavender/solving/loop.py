@@ -65,7 +65,8 @@ class Loop:
                 return claim if tell is None else tell(self.state, self.impulse, claim)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        if not all_finite(self.impulse) or (self.broken and self._is_worse_than(start_point)):
+        # It was in the middle of whatever it does.
+        if not all_finite(self.impulse) or self._is_worse_than(start_point):
             self.impulse[:] = start_point
         return claim
 

@@ -305,7 +305,7 @@ class Prepared:
             claim = Claim(INFEASIBLE, 0, {}, proof[0], certificate=proof[1])
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
-        elif self._late:
+        elif self._late or (loop.deadline.passed() and not spec.external):
             claim = Claim(TIME_LIMIT, 0, {}, "what has to be set up first takes longer than the time limit")
             loop.not_worse(loop.impulse)
         else:

@@ -5,7 +5,7 @@
 Blocks that meet at a body are found from the blocks of each body; entries that are exactly zero are left out.
 A_rc is formed once, from r <= c, so that A is symmetric to the bit.
 """
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport INT32_MAX, int32_t, int64_t
 
 import numpy as np
 
@@ -394,6 +394,67 @@ cdef public int32_t lav_gram(int32_t m, const int32_t* indptr, const int32_t* in
     return to
 
 
+cdef enum:
+    TILE = 4                    # rows and columns of A whose sums are in registers
+
+
+cdef bint is_full(int32_t m, const int32_t* indptr, const int32_t* indices) noexcept nogil:
+    """Has every row entries in the same columns, in ascending order?"""
+    cdef int32_t i, q, n = indptr[1]
+    for i in range(m):
+        if indptr[i + 1] != (i + 1) * n:
+            return False
+        for q in range(n):
+            if indices[i * n + q] != indices[q] or (q > 0 and indices[q] <= indices[q - 1]):
+                return False
+    return True
+
+
+cdef void full_gram(int32_t m, int64_t n, const double* y, const double* across, double* a) noexcept nogil:
+    """a (m, m) = Y Y^T of Y (m, n), in `across` by columns; each entry a sum in their order, as of `lav_gram`."""
+    cdef int32_t tiles = (m + TILE - 1) // TILE, down, right, i, j, r, c, high, wide
+    cdef int64_t k
+    cdef double x
+    cdef double s[TILE * TILE]
+    for right in range(tiles):
+        for down in range(right, tiles):
+            i, j = TILE * down, TILE * right
+            high, wide = min(TILE, m - i), min(TILE, m - j)
+            for r in range(TILE * TILE):
+                s[r] = 0.0
+            if wide == TILE and high == TILE:
+                for k in range(n):
+                    for r in range(TILE):
+                        x = y[(i + r) * n + k]
+                        for c in range(TILE):
+                            s[TILE * r + c] += x * across[k * m + j + c]
+            else:
+                for k in range(n):
+                    for r in range(high):
+                        for c in range(wide):
+                            s[TILE * r + c] += y[(i + r) * n + k] * across[k * m + j + c]
+            for r in range(high):
+                for c in range(wide):
+                    a[<int64_t>(i + r) * m + j + c] = a[<int64_t>(j + c) * m + i + r] = s[TILE * r + c]
+
+
+cdef int32_t full_rows(int32_t m, const double* diagonal, int32_t* count, int32_t* out, double* entry) noexcept nogil:
+    """D is added to A (m, m), and entries that are zero are left out."""
+    cdef int32_t i, j, to = 0
+    cdef double x
+    for i in range(m):
+        count[i] = to
+        for j in range(m):
+            x = entry[<int64_t>i * m + j]
+            if i == j:
+                x += diagonal[i]
+            if x != 0.0:
+                out[to], entry[to] = j, x
+                to += 1
+    count[m] = to
+    return to
+
+
 def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] indptr, int n, const double[::1] diagonal):
     """(indptr, indices, data) of Y Y^T + D, columns sorted, of Y (m, n) in compressed rows; D = diag(diagonal)."""
     cdef int32_t m = <int32_t>indptr.shape[0] - 1, nnz = <int32_t>indices.shape[0], total
@@ -401,6 +462,7 @@ def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] 
     cdef double[::1] value = np.empty(nnz + m + 1), entry
     cdef const int32_t* columns = &indices[0] if nnz else NULL
     cdef const double* numbers = &data[0] if nnz else NULL
+    cdef bint full
     cdef int32_t* ptr = &whole[0]
     cdef int32_t* row = ptr + n + 2
     cdef int32_t* scratch = row + nnz
@@ -410,10 +472,18 @@ def gram(const double[::1] data, const int32_t[::1] indices, const int32_t[::1] 
     count = count_array
     with nogil:
         by_columns(m, n, &indptr[0], columns, numbers, ptr, row, &value[0])
-        lav_gram_pattern(m, &indptr[0], columns, ptr, row, scratch, &count[0])
+        full = nnz > 0 and <int64_t>m * m < INT32_MAX and is_full(m, &indptr[0], columns)
+        if full:
+            count[m] = m * m
+        else:
+            lav_gram_pattern(m, &indptr[0], columns, ptr, row, scratch, &count[0])
     out_array, entry_array = np.empty(count[m], np.int32), np.empty(count[m])
     out, entry = out_array, entry_array
     with nogil:
-        total = lav_gram(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz], &count[0],
-                         &out[0], &entry[0])
+        if full:
+            full_gram(m, nnz // m, numbers, &value[0], &entry[0])
+            total = full_rows(m, &diagonal[0], &count[0], &out[0], &entry[0])
+        else:
+            total = lav_gram(m, &indptr[0], columns, numbers, ptr, row, &value[0], &diagonal[0], scratch, &value[nnz],
+                             &count[0], &out[0], &entry[0])
     return count_array, out_array[:total], entry_array[:total]

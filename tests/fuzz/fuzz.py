@@ -1,14 +1,13 @@
 """Hostile inputs for MINUTES: what tests/fuzz/test_fuzz.py draws for some seconds, each kind in a watched process.
 
-    python tests/fuzz/fuzz.py MINUTES [--seed N] [--kinds solve,file,...] [--limit SECONDS] [--most N] [--guided]
+    python tests/fuzz/fuzz.py MINUTES [--seed N] [--kinds solve,file,...] [--limit SECONDS] [--most N]
     python tests/fuzz/fuzz.py --replay [NAME ...]
 
 Hypothesis draws the inputs and makes one that fails smaller. A worker writes each into a file before it starts on
 it, and gives itself `limit` seconds of processor time: one that it does not end is a hang, one on which it ends by
 another signal a crash, and the next worker goes on with another seed. For each place that fails, its smallest input
-becomes a line of tests/fuzz/found.jsonl; --replay runs those that are there. --guided lets libFuzzer look for inputs
-that reach new lines (needs the package atheris, which no extra installs: there is one for Linux alone). The exit
-status is 1 where anything failed.
+becomes a line of tests/fuzz/found.jsonl; --replay runs those that are there. The exit status is 1 where anything
+failed.
 """
 
 import argparse
@@ -16,7 +15,6 @@ import faulthandler
 import hashlib
 import json
 import os
-import random
 import re
 import resource
 import signal
@@ -25,7 +23,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import hypothesis
@@ -38,13 +35,6 @@ LIMIT = 20  # s of processor time on one input
 ROOM = 3 * 2**30  # bytes of memory of a worker, beyond what it starts with
 CHUNK = 200  # inputs, after which Hypothesis starts again with another seed
 FAULTS = ("crash", "hang", "raw", "false claim", "wrong number", "overrun", "changed", "warning")
-#: What --guided is to cover; the rest of the package runs at full speed.
-COVERED = {
-    "file": ["lavender.io", "lavender.problem"],
-    "snapshot": ["lavender.sim.engine"],
-    "steps": ["lavender.sim.engine", "lavender.sim.scene"],
-    "solve": ["lavender.solving.solve", "lavender.solvers", "lavender.problem", "lavender.judge.residuals"],
-}
 
 
 # -- the worker ------------------------------------------------------------------------------------------------
@@ -99,47 +89,20 @@ class Worker:
             seed += 1
         self.tell()
 
-    def draw_guided(self, seed, until, most):
-        """The same, with the choices of Hypothesis made by libFuzzer."""
-        import atheris
 
-        corpus = self.folder / "corpus"
-        corpus.mkdir()
-        rng = random.Random(seed)
-        for i in range(64):  # choices to begin with
-            (corpus / str(i)).write_bytes(rng.randbytes(rng.randint(16, 4000)))
-        check = self.property(seed, 1).hypothesis.fuzz_one_input
-
-        def one(data):
-            with suppress(AssertionError):  # kept already
-                check(data)
-
-        atheris.Setup(
-            [sys.argv[0], f"-max_total_time={max(1, int(until - time.time()))}", f"-runs={most}", f"-seed={seed}",
-             f"-artifact_prefix={self.folder}/ended-", "-max_len=8000", "-rss_limit_mb=6000", str(corpus)],
-            one,
-        )  # fmt: skip
-        atheris.Fuzz()
-
-
-def work(kind, folder, seed, until, most, limit, guided):
+def work(kind, folder, seed, until, most, limit):
     """What a process of its own does."""
     global checks
-    covered = nullcontext()
-    if guided:
-        import atheris
-
-        covered = atheris.instrument_imports(include=COVERED[kind])
     sys.path[:0] = [str(HERE), str(HERE.parent), str(HERE.parent.parent)]
-    with covered:
-        import checks
+    import checks
+
     faulthandler.enable()
     faulthandler.register(signal.SIGXCPU, all_threads=True, chain=True)
     if "libasan" not in os.environ.get("LD_PRELOAD", "") and kind != "folder":  # which starts processes
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (used + ROOM,) * 2)
     worker = Worker(kind, folder, limit)
-    (worker.draw_guided if guided else worker.draw)(seed, until, most)
+    worker.draw(seed, until, most)
 
 
 def write(path, data):
@@ -175,7 +138,7 @@ class Campaign:
 
     def run_worker(self, kind, given, folder, seed, until):
         """Until it ends, by itself or not."""
-        options = [kind, folder, seed, until, given.most - self.inputs[kind], given.limit, int(given.guided)]
+        options = [kind, folder, seed, until, given.most - self.inputs[kind], given.limit]
         script = os.environ.get("LAVENDER_FUZZ_SCRIPT", str(HERE / "fuzz.py"))
         command = [sys.executable, script, "--work", *(str(option) for option in options)]
         done = subprocess.run(command, stdout=sys.stderr, stderr=subprocess.PIPE, check=False)
@@ -255,24 +218,21 @@ def replay(names):
 def main():
     """Command line."""
     if sys.argv[1:2] == ["--work"]:
-        kind, folder, seed, until, most, limit, guided = sys.argv[2:]
-        work(kind, folder, int(seed), float(until), int(most), float(limit), guided == "1")
+        kind, folder, seed, until, most, limit = sys.argv[2:]
+        work(kind, folder, int(seed), float(until), int(most), float(limit))
         return 0
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("minutes", nargs="?", type=float, default=2.0)
     parser.add_argument("--seed", type=int, help="default: drawn, and printed")
-    parser.add_argument(
-        "--kinds", default=None, help=f"default: {','.join(SHARE)}; guided: {','.join(COVERED)}"
-    )
+    parser.add_argument("--kinds", help=f"default: {','.join(SHARE)}")
     parser.add_argument("--limit", type=float, default=LIMIT, help="s of processor time on one input")
     parser.add_argument("--most", type=int, default=10**9, help="inputs of each kind")
-    parser.add_argument("--guided", action="store_true", help="led by coverage")
     parser.add_argument("--replay", nargs="*", metavar="NAME")
     given = parser.parse_args()
     if given.replay is not None:
         return 1 if replay(given.replay) else 0
     seed = given.seed if given.seed is not None else int.from_bytes(os.urandom(6), "little")
-    kinds = given.kinds.split(",") if given.kinds else list(COVERED if given.guided else SHARE)
+    kinds = given.kinds.split(",") if given.kinds else list(SHARE)
     print(f"seed {seed}", flush=True)
     campaign = Campaign()
     total = sum(SHARE[kind] for kind in kinds)

@@ -1,37 +1,16 @@
 """Every step of many worlds judged: MuJoCo's own answers, what ended early, and the way back to the worst."""
 
-import json
-
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from calls import EARLY_BOXES as EARLY
 
 import lavender as lv
-from lavender.cli.audit import audit as command
 from lavender.io.efc import from_efc
 from lavender.lab import audit as module
 from lavender.lab.audit import VERDICTS, audit
 from lavender.lab.worlds import Frame, Runs
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
-
-MODEL = """<mujoco><option timestep="0.004" {options}/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
-  <body name="low" pos="0 0 0.099"><freejoint/><geom name="low" type="box" size=".1 .1 .1" density="300"/></body>
-  <body name="high" pos="0.02 0 0.32"><freejoint/><geom name="high" type="box" size=".1 .1 .1"/></body>
-  <body pos="0.5 0 0.3"><joint name="arm" axis="0 1 0" range="-20 20" limited="true"/>
-    <geom name="arm" type="capsule" size=".04" fromto="0 0 0 -.35 0 0"/></body>
-</worldbody><actuator><motor joint="arm" gear="6"/></actuator></mujoco>"""
-EARLY = 'solver="CG" iterations="3"'  # plainly too few
-
-
-@pytest.fixture
-def model(tmp_path):
-    def make(options=""):
-        path = tmp_path / "boxes.xml"
-        path.write_text(MODEL.format(options=options))
-        return path
-
-    return make
 
 
 def own_errors(path, world, steps, seed=0, spread=0.1):
@@ -50,8 +29,8 @@ def own_errors(path, world, steps, seed=0, spread=0.1):
 
 
 @pytest.mark.parametrize("options", [EARLY, f'{EARLY} cone="elliptic"', EARLY + ' jacobian="sparse"'])
-def test_numbers_are_those_of_the_run_itself(model, options):
-    path = model(options)
+def test_numbers_are_those_of_the_run_itself(boxes, options):
+    path = boxes(options)
     found = audit(path, worlds=2, steps=30, workers=1)
     for world in range(2):
         want = own_errors(path, world, 30)
@@ -62,17 +41,17 @@ def test_numbers_are_those_of_the_run_itself(model, options):
     assert found.early.any()
 
 
-def test_workers_change_no_bit(model, monkeypatch):
+def test_workers_change_no_bit(boxes, monkeypatch):
     monkeypatch.setattr(module, "TASK", 20)
-    path = model(EARLY)
+    path = boxes(EARLY)
     one, two = (audit(path, worlds=4, steps=20, workers=n) for n in (1, 2))
     assert one.numbers.tobytes() == two.numbers.tobytes()
     assert one.where == two.where
     assert [(w.world, w.step) for w in one.worst] == [(w.world, w.step) for w in two.worst]
 
 
-def test_the_worst_can_be_gone_back_to(model, tmp_path):
-    path = model(EARLY)
+def test_the_worst_can_be_gone_back_to(boxes, tmp_path):
+    path = boxes(EARLY)
     found = audit(path, worlds=3, steps=25, workers=1)
     found.write(tmp_path / "out")
     made = mj.MjModel.from_xml_path(str(path))
@@ -117,58 +96,33 @@ def frames_in_float32(planted):
     return frames
 
 
-def test_the_floor_of_float32_is_told_from_an_early_stop(model, monkeypatch):
+def test_the_floor_of_float32_is_told_from_an_early_stop(boxes, monkeypatch):
     planted = {3, 9, 12}
     monkeypatch.setattr(module, "frames", frames_in_float32(planted))
-    found = audit(model('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
+    found = audit(boxes('jacobian="dense"'), worlds=1, steps=16, engine="mjx", threshold=0.0)
     assert set(np.flatnonzero(found.early[0])) == planted
     assert (found.numbers[0, 0] > 1e-9).sum() > len(planted)  # rounding leaves errors that float64 would not
 
 
-def test_ctrl_c_keeps_what_there_is(model, tmp_path, monkeypatch):
+def test_ctrl_c_keeps_what_there_is(boxes, tmp_path, monkeypatch):
     monkeypatch.setattr(module, "TASK", 20)
 
     def watch(event):
         raise KeyboardInterrupt
 
-    found = audit(model(EARLY), worlds=3, steps=20, workers=1, watch=watch)
+    found = audit(boxes(EARLY), worlds=3, steps=20, workers=1, watch=watch)
     assert found.stopped and found.done == 20
     assert np.isnan(found.numbers[:, 1:]).all()
     found.write(tmp_path / "out")
     assert found.sheet.write(tmp_path / "out").is_file()
 
 
-def test_the_command_accepts_or_does_not(model, tmp_path):
-    words = [
-        "--worlds",
-        "2",
-        "--steps",
-        "20",
-        "--workers",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-        "--accept",
-        "1e-3",
-    ]
-    bad = CliRunner().invoke(command, [str(model(EARLY)), *words])
-    assert bad.exit_code == 1 and "ended early" in bad.output
-    assert len(bad.output.splitlines()) <= 25
-    page = (tmp_path / "out" / "index.html").read_text()
-    assert "worst_1.npz" in page and "<svg" in page
-    told = json.loads((tmp_path / "out" / "numbers.json").read_text())
-    assert told["early"] > 0 and told["largest"] > 1e-3
-    good = CliRunner().invoke(command, [str(model()), *words])
-    assert good.exit_code == 0 and "none of 40 steps of 2 worlds ended early" in good.output
-    assert not list((tmp_path / "out" / "worst").glob("*.npz"))  # those of another run are gone
-
-
-def test_what_is_close_enough_may_still_not_be_accepted(model):
-    found = audit(model(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
+def test_what_is_close_enough_may_still_not_be_accepted(boxes):
+    found = audit(boxes(EARLY), worlds=1, steps=10, workers=1, threshold=1e3)
     assert not found.early.any() and found.largest == found.numbers[0].max() > 1e-3
 
 
-def test_a_world_that_is_not_finite_is_accepted_by_nobody(model, monkeypatch):
+def test_a_world_that_is_not_finite_is_accepted_by_nobody(boxes, monkeypatch):
     states_of = module.states_of
 
     def spoiled(*given):
@@ -177,27 +131,27 @@ def test_a_world_that_is_not_finite_is_accepted_by_nobody(model, monkeypatch):
         return states
 
     monkeypatch.setattr(module, "states_of", spoiled)
-    found = audit(model(), worlds=1, steps=10, workers=1)
+    found = audit(boxes(), worlds=1, steps=10, workers=1)
     assert VERDICTS[found.verdict[0, 5]] == "not finite" and found.largest == np.inf
 
 
-def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(model, monkeypatch):
+def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(boxes, monkeypatch):
     step = mj.mj_step
 
-    def dies(model, data):
+    def dies(boxes, data):
         if data.time > 0.03:
             raise mj.FatalError("out of memory")
-        step(model, data)
+        step(boxes, data)
 
     monkeypatch.setattr(mj, "mj_step", dies)
-    found = audit(model(), worlds=1, steps=12, workers=1)
+    found = audit(boxes(), worlds=1, steps=12, workers=1)
     assert [VERDICTS[i] == "not finite" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_world_that_mujoco_begins_anew_ends_there(model, monkeypatch, tmp_path):
+def test_a_world_that_mujoco_begins_anew_ends_there(boxes, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
-    found = audit(model(), worlds=2, steps=10, workers=1, spread=1e12)
+    found = audit(boxes(), worlds=2, steps=10, workers=1, spread=1e12)
     assert (found.verdict[1, 1:] == VERDICTS.index("not finite")).all()
     assert (found.verdict[0] < VERDICTS.index("not finite")).all() and found.largest == np.inf
 
@@ -214,9 +168,9 @@ def test_a_world_that_mujoco_begins_anew_ends_there(model, monkeypatch, tmp_path
         ("", {"backend": "carrier pigeon"}, "backend"),
     ],
 )
-def test_bad_words_are_told(model, options, given, words):
+def test_bad_words_are_told(boxes, options, given, words):
     with pytest.raises(lv.LavenderError, match=words):
-        audit(model(options), **{"worlds": 1, "steps": 2, "workers": 1} | given)
+        audit(boxes(options), **{"worlds": 1, "steps": 2, "workers": 1} | given)
 
 
 def test_a_file_that_is_no_model_is_told(tmp_path):
@@ -226,21 +180,21 @@ def test_a_file_that_is_no_model_is_told(tmp_path):
 
 
 @pytest.mark.parametrize(("engine", "package"), [("mjx", "mujoco.mjx"), ("mujoco_warp", "mujoco_warp")])
-def test_an_engine_that_is_not_installed_says_how(model, engine, package, monkeypatch):
+def test_an_engine_that_is_not_installed_says_how(boxes, engine, package, monkeypatch):
     import sys
 
     for name in (package, "jax", "warp"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(lv.InputError, match="pip install mujoco-"):
-        audit(model(), worlds=1, steps=2, engine=engine)
+        audit(boxes(), worlds=1, steps=2, engine=engine)
 
 
 @pytest.mark.parametrize("options", ['solver="Newton"', 'solver="Newton" cone="elliptic"'])
 @pytest.mark.parametrize(("engine", "package"), [("mjx", "jax"), ("mujoco_warp", "mujoco_warp")])
 @pytest.mark.filterwarnings("ignore")
-def test_other_engines_pose_the_problem_that_mujoco_poses(model, engine, package, options):
+def test_other_engines_pose_the_problem_that_mujoco_poses(boxes, engine, package, options):
     pytest.importorskip(package, reason="needs the engine")
-    path = str(model(options + ' iterations="100" ls_iterations="50"'))
+    path = str(boxes(options + ' iterations="100" ls_iterations="50"'))
     (frame,) = list(module.frames(engine, Runs(path, 2, 1)))
     made = mj.MjModel.from_xml_path(path)
     for world in range(2):

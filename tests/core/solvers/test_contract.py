@@ -227,6 +227,20 @@ def test_tol_zero_is_an_exact_budget(name):
 
 
 @pytest.mark.parametrize("name", OURS)
+def test_a_budget_is_kept_and_never_leaves_more_than_the_start(name):
+    """Of none the start comes back; few iterations are no more than that, whatever one of them is."""
+    for problem in examples(registry.get(name)):
+        none = lv.solve(problem, name, tol=1e-12, max_iter=0)
+        assert (none.status, none.iterations) == (lv.Status.MAX_ITERATIONS, 0)
+        assert none.impulse.tobytes() == problem.start().tobytes()
+        for n in (1, 3, 8):
+            few = lv.solve(problem, name, tol=1e-12, max_iter=n)
+            assert few.iterations <= n and not few.contradicted
+            # Jacobi, mixing and proximal steps may leave the best of their sweeps for a while.
+            assert few.residual.relative <= 1.0 or registry.get(name).resumable
+
+
+@pytest.mark.parametrize("name", OURS)
 def test_update_equals_a_fresh_solve_to_the_bit(name):
     spec = registry.get(name)
     kwargs = {"tol": 1e-9, "max_iter": 50 if spec.resumable else None}
@@ -494,9 +508,9 @@ def test_units_scale_the_result(name):
 BROKEN = [MemoryError("8 GB"), TooLarge("A would have 1e10 entries"), FloatingPointError("1e400")]
 
 
-@pytest.mark.parametrize("error", BROKEN, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("error", [*BROKEN, KeyboardInterrupt()], ids=lambda error: type(error).__name__)
 @pytest.mark.parametrize("name", [name for name in OURS if name != "auto"])
-def test_what_breaks_down_after_the_start_is_a_result(name, error, monkeypatch):
+def test_what_breaks_down_or_is_stopped_after_the_start_is_a_result(name, error, monkeypatch):
     """With the best impulse so far, and never one that is worse than the start."""
     spec = registry.get(name)
     *_, problem = examples(spec)
@@ -517,8 +531,11 @@ def test_what_breaks_down_after_the_start_is_a_result(name, error, monkeypatch):
         monkeypatch.setattr(factory, "run", run)
         found = lv.solve(problem, name, impulse=start, tol=1e-12, max_iter=500)
         if not (before and found.success):  # the first of its iterations may do
-            assert found.status is lv.Status.NUMERICAL_ERROR
-            assert found.message.endswith(str(error))
+            stopped = isinstance(error, KeyboardInterrupt)
+            assert found.status is (lv.Status.INTERRUPTED if stopped else lv.Status.NUMERICAL_ERROR)
+            assert stopped or found.message.endswith(str(error))
+            with pytest.raises(lv.SolveFailed):
+                found.raise_for_status()
         assert found.residual.relative <= lv.residual(problem, start).relative
         monkeypatch.undo()
 

@@ -52,6 +52,22 @@ def test_set_up_is_inside(clock, monkeypatch):
     assert inside == [True, False, True]
 
 
+@pytest.mark.parametrize("name", ["newton", "pgs", "anderson"])
+def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monkeypatch):
+    """A first iteration was: of 5,000 rows 1.2 ms more under a limit of 1 ms."""
+    problem, solver = dense(100, "lcp"), registry.get(name).load()
+    prepare = solver.prepare
+
+    def slow(self, *of):
+        clock.now += 2.0
+        return prepare(self, *of)
+
+    monkeypatch.setattr(solver, "prepare", slow)
+    monkeypatch.setattr(solver, "run", None)
+    late = lv.solve(problem, name, time_limit=1.0)
+    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and "set up" in late.message
+
+
 def test_a_set_up_that_was_late_is_done_by_the_next_call():
     problem, other = dense(200, "lcp"), dense(200, "lcp", 1)
     lv.residual(problem, problem.start())

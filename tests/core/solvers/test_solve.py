@@ -13,7 +13,6 @@ from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from lavender import registry
-from lavender.judge.solution import Claim, Status
 from lavender.solving import many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
@@ -58,38 +57,6 @@ def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds()
     assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
     assert at_start(problem) == [2.0, 3.0]
     assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
-
-
-class Interrupted:
-    """Ctrl-C in the middle of the second call."""
-
-    def __init__(self):
-        self.calls = 0
-
-    def prepare(self, problem):
-        return problem
-
-    def update(self, state, problem):
-        return problem
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        self.calls += 1
-        impulse += 1.0
-        if self.calls > 1:
-            raise KeyboardInterrupt
-        return Claim(Status.MAX_ITERATIONS, n)
-
-
-def test_ctrl_c_is_a_result(register):
-    spec = dataclasses.replace(registry.get("pgs"), name="interrupted", factory=Interrupted, options={})
-    register(spec)
-    problem = lv.Problem.lcp(np.eye(2), [50.0, 50.0])
-    solution = lv.solve(problem, "interrupted", tol=1e-9, max_iter=10**6)
-    assert solution.status is Status.INTERRUPTED
-    np.testing.assert_array_equal(solution.impulse, 2.0)  # what it had come to
-    assert not solution.success
-    with pytest.raises(lv.SolveFailed):
-        solution.raise_for_status()
 
 
 def test_what_was_done_is_printed_in_words():

@@ -3,12 +3,10 @@
 import dataclasses
 import json
 
-import numpy as np
 import pytest
 from calls import robot
 
 import lavender as lv
-from benchmarks.float32 import CUT, FLOOR, exchange, newton, planted, table
 from lavender.lab.bench import resolve
 from lavender.lab.bench.cases import describe
 from lavender.lab.bench.record import from_json, to_json
@@ -47,24 +45,3 @@ def test_a_recording_of_a_float32_engine_counts_its_early_answers(tmp_path):
     assert str(early) in row
     with pytest.raises(lv.InputError, match="precision is 'half'"):
         lv.io.record(model, mujoco.MjData(model), tmp_path / "other", 1, precision="half")
-
-
-def test_early_stops_are_found_and_no_answer_at_its_floor_is_called_early():
-    rng = np.random.default_rng(0)
-    stops = [stop for seed in range(60) for stop in planted(robot(seed), rng)]
-    for method in ("velocities", "impulses"):
-        ended = [s for s in stops if s.kind == f"{method}: {FLOOR}"]
-        cut = [s for s in stops if s.kind == f"{method}: {CUT}"]
-        assert len(ended) == 60
-        assert len(cut) > 50
-        assert all(s.verdict == "at its floor" for s in ended)
-        assert sum(s.verdict != "at its floor" for s in cut) >= 0.95 * len(cut)
-    assert table(stops).count("\n") == 1 + len({s.kind for s in stops})
-
-
-def test_the_newtons_of_the_benchmark_solve_in_float64_what_lavender_solves():
-    p = robot(11)
-    want = lv.solve(p, tol=1e-11).impulse
-    np.testing.assert_allclose(newton(p, np.float64)[-1][1], want, rtol=0, atol=1e-8 * abs(want).max())
-    np.testing.assert_allclose(exchange(p)[-1], want, rtol=0, atol=1e-4 * abs(want).max())
-    assert newton(p, np.float32)[-1][1].dtype == np.float32

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from worked import after
+from worked import after, energy
 
 import lavender as lv
-from benchmarks import gallery
 from lavender.sim.engine.layout import HEAD
+from lavender.sim.scene import SCENES
 from lavender.sim.scene.parts import rotation
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
 
@@ -125,18 +125,6 @@ def test_boxes_stand_for_ten_seconds(name):
     np.testing.assert_allclose(seen["positions"][1:, 2], np.arange(scene.n_bodies - 1) + 0.5, atol=0.01)
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if STEPPERS[n].restitution])
-def test_a_ball_bounces_as_high_as_restitution_says(name):
-    scene = lv.Scene(stepper=name, dt=1 / 480, restitution=0.5)
-    scene.add_plane()
-    scene.add_sphere(0.1, position=(0, 0, 1.1))
-    sim, height = lv.Simulation(scene), []
-    for _ in range(480):
-        height.append(sim.step()[0]["positions"][1][2] - 0.1)
-    first = int(np.flatnonzero(np.diff(height) > 0)[0])
-    assert max(height[first:]) == pytest.approx(0.25, rel=0.05)
-
-
 @pytest.mark.parametrize("name", ["impulses", "soft_step", "xpbd"])
 def test_bodies_that_meet_keep_their_momentum(name):
     scene = lv.Scene(stepper=name, dt=1 / 240, gravity=0.0)
@@ -188,12 +176,31 @@ def test_thrown_bodies_gain_no_energy_and_fall_through_nothing(name, seed):
             turned = rng.normal(size=4)
             scene.add_box(rng.uniform(0.2, 0.8, 3), quaternion=turned / np.linalg.norm(turned), **more)
     sim = lv.Simulation(scene)
-    start = gallery.energy(scene, sim.reset()[0])
+    start = energy(scene, sim.reset()[0])
     for _ in range(600):
         seen, _, lost, _, _ = sim.step()
         assert not lost
-        assert gallery.energy(scene, seen) < 1.001 * start
+        assert energy(scene, seen) < 1.001 * start
     assert seen["positions"][1:, 2].min() > 0.05
+
+
+SMALL = {"pyramid": {"base": 4}, "pile": {"n": 20}, "chain": {"n": 8}, "bridge": {"n": 6}}
+GAINS = {
+    "xpbd": 1e-2
+}  # of the energy at the start, as docs/engine.md says; others: what rounding and projection lift
+
+
+@pytest.mark.parametrize("of", sorted(SCENES))
+@pytest.mark.parametrize("name", NAMES)
+def test_no_scene_that_nothing_drives_ends_above_its_energy(name, of):
+    scene = lv.Scene(of, **SMALL.get(of, {})).with_parameters(stepper=name)
+    try:
+        sim = lv.Simulation(scene)
+    except lv.InputError as refused:  # spin friction, restitution
+        pytest.skip(str(refused))
+    start = energy(scene, sim.reset()[0])
+    gained = max(energy(scene, sim.step()[0]) - start for _ in range(180))
+    assert gained <= GAINS.get(name, 1e-5) * abs(start)
 
 
 # -- twins ----------------------------------------------------------------------------------------
