@@ -49,6 +49,7 @@ __all__ = [
 MANIFEST = Path(__file__).with_name("manifest.json")
 RECORDED = MANIFEST.with_name("recorded.json")  # of files of other projects, which are not part of this one
 SEARCHED = 60  # rows under Coulomb's law up to which other motions are looked for
+NEAR = 1e-9  # m/s
 SWEEPS = 10_000  # of PGS, at most
 SECONDS = 30.0  # of `auto`, to the answer that a proof begins from
 
@@ -210,11 +211,11 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     """
     found = [*found, *recorded]
     count = Counter(e.known for e in found)
-    radius = max((e.radius for e in found if e.radius is not None), default=0.0)
+    near = sum(e.radius is not None and e.radius <= NEAR for e in found)
     unique = sum(e.unique for e in found)
     first = (
-        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
-        f"within {radius:.0e} m/s of a known answer; for {unique} no other motion exists; {count['infeasible']} have "
+        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to stand "
+        f"beside a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; {count['infeasible']} have "
         "no solution, with a certificate."
     )
     how = (
@@ -243,7 +244,11 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     ]
     for group in dict.fromkeys(e.group for e in found):
         own = [e for e in found if e.group == group]
-        cells = [f"`@{group}`", len(own), f"{min(e.rows for e in own)} to {max(e.rows for e in own)}"]
+        cells = [
+            f"`@{group}`" if group in suite.SETS else group,
+            len(own),
+            f"{min(e.rows for e in own)} to {max(e.rows for e in own)}",
+        ]
         cells.append(f"{np.median([SWEEPS if e.sweeps is None else e.sweeps for e in own]):.0f}")
         conditions = [e.condition for e in own if e.condition is not None]
         cells += [f"{np.median(conditions):.0e}" if conditions else "", sum(e.degenerate > 0.0 for e in own)]

@@ -45,8 +45,9 @@ def robot(package: str = "gymnasium", model: str = "ant", cone: str = "pyramidal
 
 def package_of(name: str) -> str:
     """The package that the model of a case's name is in; empty where the name alone makes it."""
-    family_name, values = parse(name)
-    return str(values.get("package", "gymnasium")) if family_name == "robot" else ""
+    if name.partition("(")[0] != "robot":
+        return ""
+    return str(parse(name)[1].get("package", "gymnasium"))
 
 
 def missing(package: str) -> str:
