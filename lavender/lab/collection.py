@@ -215,8 +215,8 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
     unique = sum(e.unique for e in found)
     first = (
         f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to stand "
-        f"beside a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; {count['infeasible']} have "
-        "no solution, with a certificate."
+        f"beside a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; "
+        f"{count['infeasible']} have no solution, with a certificate."
     )
     how = (
         "`lavender problems` makes them from their names, `lavender problems --check` compares every number with "

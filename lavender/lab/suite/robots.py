@@ -52,7 +52,7 @@ def package_of(name: str) -> str:
 
 def missing(package: str) -> str:
     """What has to be installed for the models of a package; empty where all is there."""
-    absent = [name for name in ("mujoco", package) if find_spec(name) is None]
+    absent = [name for name in ("mujoco", package) if package and find_spec(name) is None]
     return (
         f"robots of {package} need {' and '.join(absent)}: pip install 'lavender-contact[robots]'"
         if absent
