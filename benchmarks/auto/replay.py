@@ -51,11 +51,12 @@ def two_lines(tree: Tree) -> Iterator[Stage]:
         yield Stage("anderson", MOST * 2**k * tree.newton / tree.sweep, 0.0, "")
 
 
-def sweeps_first(tree: Tree) -> Iterator[Stage]:
-    """Sweeps first even where 100 of them cost more than Newton's method."""
-    if tree.newton < costs.SWEEPS * tree.sweep and tree.law != "linear":
-        yield tree.sweeps(SHARE * tree.newton, "", tree.newton)
-    yield from tree
+def sweeps_if_cheap(tree: Tree) -> Iterator[Stage]:
+    """Sweeps first only where 100 of them cost no more than Newton's method."""
+    for stage in tree:
+        first = stage.solver == "anderson" and stage.least < math.inf
+        if not first or costs.SWEEPS * tree.sweep <= tree.newton:
+            yield stage
 
 
 def with_admm(tree: Tree) -> Iterator[Stage]:
@@ -72,7 +73,7 @@ RULES: dict[str, Rule] = {
     "without `direct` on bounded rows": without("direct"),
     "without rows of A over J and M": without("newton over rows"),
     "without the prediction of sweeps": lambda tree: (replace(s, least=math.inf) for s in tree),
-    "sweeps first even if 100 cost more": sweeps_first,
+    "sweeps first only if 100 cost no more": sweeps_if_cheap,
     "without the relaxation": without("relaxation"),
     "without `nncg`": without("nncg"),
     "with `admm` at the end": with_admm,

@@ -197,7 +197,7 @@ class Tree:
             yield Stage("relaxation", self.newton / self.sweep, self.newton, why, self.newton / self.sweep)
             yield Stage("nncg", FEW, FEW * 2.0 * self.sweep, "puts right what slides")
         yield from self.sweeps_first(self.newton)
-        yield from self.factorisations(MOST)
+        yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         # What follows where these fail has its line here.
         self.add_rows()
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
@@ -224,7 +224,8 @@ class Tree:
         pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
-            yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)
+            most = inf if short else newton
+            yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", most)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""

@@ -6,8 +6,8 @@
 m rows; e multiply-adds of a sweep or entries of A, which one step reads; w multiply-adds of one factorisation and its
 solution, as the solver's own analysis tells them (`NewtonState.count`); n factorisations, by law. Over generalised
 velocities all is compiled: no start, nothing for a row, and n is STEPS times as large where a row has no compliance and
-not all are bounded. No clock is read: the same problem has the same counts on every machine. The twelve rates of
-`rates.json` are written by `python -m benchmarks auto --fit`.
+not all are bounded, SOFT times where every row has enough and not all are free. No clock is read: the same problem has
+the same counts on every machine. The twelve rates of `rates.json` are written by `python -m benchmarks auto --fit`.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ __all__ = [
 # By os.path: pathlib would be 4 % of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
+SOFT = 0.5  # over generalised velocities for each factorisation elsewhere, if no row is rigid
 STEPS = 4.0  # over generalised velocities for each factorisation elsewhere, if a row is rigid
 SWEEPS = 100.0  # that a problem is counted to take: Newton's method comes first where its cost is less
 

@@ -11,7 +11,8 @@
 3. If rows are nearly dependent and 1 and 2 fail: both again, with the augmented system of the bodies.
 4. Coulomb friction: a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
    law, whose convex problem changes with every step. Where these stall, a path of smoothed problems (Chen, Mangasarian
-   1996) is followed by its arc length (Keller 1977), through folds where contacts pass from stick to slip.
+   1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds where contacts
+   pass from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity".
@@ -35,7 +36,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status, counted
 from lavender.problem import OPERATORS, Problem
-from lavender.solvers.costs import STEPS, Count, factorisations, newton_cost
+from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
 from lavender.solvers.registry import SolverSpec
@@ -71,7 +72,8 @@ class NewtonState:
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            steps = 1.0 if problem.law == "lcp" or self.general.soft else STEPS
+            soft, law = self.general.soft, problem.law
+            steps = SOFT if soft and law != "linear" else 1.0 if soft or law == "lcp" else STEPS
             return Count("velocities", self.general.work, read, 0.0, steps=steps)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))

@@ -20,7 +20,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import judged, reference
 from lavender.judge.solution import Claim, Status, Turn, counted
 from lavender.problem import Problem
-from lavender.solvers.costs import RATES, STEPS, SWEEPS, factorisations, sweep_cost
+from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import SMALL_ROWS
@@ -49,7 +49,7 @@ def limits(sweeps: float, most: float = MOST) -> Limits:
     count = (factorisations(law) for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"]
-    return Limits(np.array([*step, *count, STEPS, *sweep, general.ROOM, most]))
+    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:

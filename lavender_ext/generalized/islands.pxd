@@ -166,7 +166,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.p = p[0]
     f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
     f.p.law = f.law
-    f.share = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 1e-3)
+    f.share = 1e-4 if not has_friction(p) else (3e-2 if f.law == COULOMB else 3e-3)
     f.g = g
     f.iptr = w + at
     f.cptr = w + at + panels + 1

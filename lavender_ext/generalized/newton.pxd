@@ -10,8 +10,8 @@ Without Coulomb friction G is the gradient of a convex function with kinks in it
 and t is where the derivative along p vanishes (Todorov 2014; Castro et al. 2022): it ends in a few steps. rho (2)
 is nothing where the problem's own theta is no less than 1e-6 d, 1e-3 d on contacts, where kinks are sharp; below, and
 between tangents that differ, it is a proximal term about the centre c, which follows lambda (Rockafellar 1976), and the
-limit is the problem given. It begins the larger the further steps lead astray: 1e-4 d where nothing rubs, 1e-3 d
-under the cone law, 3e-2 d under Coulomb's (docs/auto.md).
+limit is the problem given. It begins the larger the further steps lead astray: 1e-4 d where nothing rubs, 3e-3 d
+under the cone law, 3e-2 d under Coulomb's.
 
 Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
 that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| + mu_r |w_r| (3)

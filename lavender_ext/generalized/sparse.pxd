@@ -104,44 +104,83 @@ cdef inline void take_row(double* x, const double* y, double f, int32_t n) noexc
         x[i] -= f * y[i]
 
 
+cdef inline void take_two(double* x, const double* y, double f, const double* z, double g, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] = (x[i] - f * y[i]) - g * z[i]
+
+
+cdef inline int32_t place_of(const int32_t* theirs, int32_t column) noexcept nogil:
+    """Where a row with these columns has this one, which is among them."""
+    cdef int32_t at = 0
+    while theirs[at] != column:
+        at += 1
+    return at
+
+
 cdef inline int32_t sparse_factor(int32_t n, const int32_t* lptr, const int32_t* lidx, double* val,
                                   double* inv) noexcept nogil:
-    """L in place, inv = 1 / D (n); 0 where a pivot is not positive. lptr may begin anywhere in lidx."""
-    cdef int32_t k, a, b, j, count, at, i, base = lptr[0]
+    """L in place, inv = 1 / D (n); 0 where a pivot is not positive. lptr may begin anywhere in lidx.
+
+    Two rows whose columns are the same but for the upper one's own place are eliminated together: with the bits of one
+    after the other, and half of what is read and written.
+    """
+    cdef int32_t k = n - 1, a, b, j, count, at, i, base = lptr[0]
     cdef double* diag = val + (lptr[n] - base)
     cdef double* row
+    cdef double* up
     cdef double* to
     cdef const int32_t* cols
     cdef const int32_t* theirs
-    cdef double x, f, r
-    for k in range(n - 1, -1, -1):
+    cdef double x, y, f, g, r
+    cdef bint two
+    while k >= 0:
         if not diag[k] > 0.0:
             return 0
         r = 1.0 / diag[k]
         inv[k] = r
         row = val + (lptr[k] - base)
+        up = row
         cols = lidx + lptr[k]
         count = lptr[k + 1] - lptr[k]
+        two = count > 0 and cols[count - 1] == k - 1 and lptr[k] - lptr[k - 1] == count - 1
+        if two:                                             # row k leaves row k - 1 first
+            count -= 1
+            up = val + (lptr[k - 1] - base)
+            x = row[count]
+            f = x * r
+            if x != 0.0:
+                diag[k - 1] -= f * x
+                take_row(up, row, f, count)
+                row[count] = f
+            k -= 1
+            if not diag[k] > 0.0:
+                return 0
+            inv[k] = 1.0 / diag[k]
         for a in range(count - 1, -1, -1):
             x = row[a]
-            if x == 0.0:
+            y = up[a] if two else 0.0
+            if x == 0.0 and y == 0.0:
                 continue
             f = x * r
+            g = y * inv[k]
             j = cols[a]
-            diag[j] -= f * x
+            diag[j] = (diag[j] - f * x) - g * y
             to = val + (lptr[j] - base)
             theirs = lidx + lptr[j]
-            at = 0
-            if a > 0:
-                while theirs[at] != cols[0]:
-                    at += 1
-            if lptr[j + 1] - lptr[j] == at + a:             # the same columns from there on
-                take_row(to + at, row, f, a)
-            else:
+            at = place_of(theirs, cols[0]) if a > 0 else 0
+            if lptr[j + 1] - lptr[j] != at + a:             # not the same columns from there on
                 for b in range(a):
                     i = cols[b]
                     while theirs[at] != i:
                         at += 1
-                    to[at] -= f * row[b]
+                    to[at] = (to[at] - f * row[b]) - g * up[b]
+            elif two:
+                take_two(to + at, row, f, up, g, a)
+            else:
+                take_row(to + at, row, f, a)
             row[a] = f
+            if two:
+                up[a] = g
+        k -= 1
     return 1

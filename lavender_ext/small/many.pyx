@@ -58,7 +58,8 @@ cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double bounded              # factorisations by law,
     double coulomb
     double cone
-    double rigid                # times as many with friction and a rigid row
+    double rigid                # times as many, but of bounded rows, with a rigid row,
+    double soft                 # and where none is, but of free ones
     double start                # what a solve beside this call takes at least,
     double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
     double sweep_cone
@@ -96,21 +97,36 @@ cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const li
     return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
 
 
+cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
+    """Is every row free?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if p.kind[i] != ROW or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
+                return False
+    return True
+
+
 cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
     """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
     cdef double count = l.bounded
-    if has_friction(p):
+    cdef bint linear = is_linear(p), rubs = has_friction(p), soft = is_soft(p, g)
+    if linear:
+        count = 1.0
+    elif rubs:
         count = l.coulomb if p.law == COULOMB else l.cone
-        if not is_soft(p, g):
-            count *= l.rigid
+    if soft and not linear:
+        count *= l.soft
+    elif not soft and (linear or rubs):
+        count *= l.rigid
     return count * step_cost(p, g, l, work)
 
 
 cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
-    """What it may cost [ns]: as much as sweeps, which may do with less."""
+    """What it may cost [ns]: where a row is rigid as much as sweeps, which may do with less."""
     cdef double each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
-    return min(l.most, l.start + l.sweeps * sweep)
+    return l.most if is_soft(p, g) else min(l.most, l.start + l.sweeps * sweep)
 
 
 cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
@@ -254,7 +270,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (12,)."""
+    """Of the numbers of a `limits_t` (13,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
