@@ -70,7 +70,7 @@ def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
     InputError
         A level, budget or limit that means nothing.
     """
-    names = ("levels", "budgets", "motion", "speed_levels", "orders")
+    names = ("levels", "budgets", "motion", "prove", "speed_levels", "orders")
     return kind(**{name: asked[name] for name in names if asked[name] is not None}, **more)
 
 
@@ -90,6 +90,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         A file that was named and does not load; a folder that cannot be written or that another process writes.
     """
     from lavender.lab import bench
+    from lavender.lab.proof import require
     from lavender.lab.report.contenders import time_lines
 
     one_thread()
@@ -102,6 +103,8 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
     limits["time_limit"] = (1.0 if files else 0.25) if asked["time_limit"] is None else asked["time_limit"]
     more: dict[str, Any] = {"repeats": asked["repeats"], "times": asked["time_budgets"], "sweeps": sweeps}
     plan = plan_of(asked, bench.Plan, **limits, **more)
+    if plan.prove:
+        require()
     reused = 0
     with bench.Store(path) as store:
         items = bench.resolve(files, asked["sequence"])
@@ -134,6 +137,8 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
 
     one_thread()
     check_named(bench.resolve(words))
+    if asked["prove"]:
+        raise InputError("--prove is of reports; a campaign has too many problems")
     plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
     more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
     with bench.Store(path) as store, Progress() as watch:

@@ -292,6 +292,8 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                   "help": "Relative residuals to reach."}),
     ("--motion", {"is_flag": True, "help": "Also measure the motion error: how wrong the velocities of the bodies are, "
                   "relative to a reference that is solved once for each case."}),
+    ("--prove", {"is_flag": True, "help": "Measure the motion error from an exact solution that is enclosed with "
+                 "proof, where one is (extra `proof`); implies --motion."}),
     ("--speed-levels", {"type": Numbers(), "default": (), "metavar": "M/S,M/S,...",
                         "help": "Motion errors to reach, in metres per second; implies --motion."}),
     ("--budgets", {"type": Numbers(int), "default": "4,8,16,32,64", "show_default": True,

@@ -12,7 +12,7 @@ __all__ = ["problems"]
 
 
 @click.command()
-@click.argument("groups", nargs=-1, metavar="[@SET]...")
+@click.argument("groups", nargs=-1, metavar="[@SET | FILE | FOLDER]...")
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), help="Write every problem as a file here."
 )
@@ -42,17 +42,20 @@ def problems(
 ) -> None:
     """List, make or check the problem set: names, numbers, and what is proved of each solution.
 
-    Without an option, a line for each problem of the named sets; all sets if none is named.
+    Without an option, a line for each problem of the named sets; all sets if none is named. Files and folders of your
+    own are taken by --certify alone. What needs a package that is not installed is left out, and named.
 
     Exit code 1: a problem has other numbers than the manifest says.
     """
     from lavender.lab import collection, suite
+    from lavender.lab.bench.cases import is_path
     from lavender.lab.bench.record import file_name
 
     one_thread()
     names = [group.removeprefix("@") for group in groups]
     for name in names:
-        suite.cases(f"@{name}")  # an unknown set is refused first
+        if certify is None or not is_path(name):
+            suite.names(f"@{name}")  # an unknown set is refused first
     if certify is not None:
         made = []
         for entry, _ in collection.entries(names):
@@ -64,14 +67,17 @@ def problems(
         chosen = collection.hidden(secret, count)
     else:
         found = [e for e in collection.load() if not names or e.group in names]
-        chosen = [e.name for e in found]
         if page is not None:
-            page.write_text(collection.page(found), encoding="utf-8")
+            page.write_text(collection.page(found, collection.load(collection.RECORDED)), encoding="utf-8")
+        here, missing = collection.makeable(found)
+        chosen = [e.name for e in here]
+        for line in missing if check or out is not None else ():
+            click.echo(f"left out: {line}", err=True)
         if check:
-            wrong = list(collection.changed(found))
+            wrong = list(collection.changed(here))
             for line in wrong:
                 click.echo(line)
-            click.echo(f"{len(found) - len(wrong)} of {len(found)} problems are the same")
+            click.echo(f"{len(here) - len(wrong)} of {len(here)} problems are the same")
             if wrong:
                 raise click.exceptions.Exit(EXIT_UNMET)
             return
@@ -86,7 +92,5 @@ def problems(
     elif page is None:
         to = console()
         for e in found:
-            tell = f"enclosed within {e.radius:.1e} m/s" if e.radius is not None else e.known
-            more = ", one motion" if e.unique else f", at least {e.motions} motions" if e.motions > 1 else ""
-            line = f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {tell}{more}"
+            line = f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}"
             to.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
-
-if TYPE_CHECKING:
-    from lavender.base.arrays import FloatArray
-    from lavender.problem import Problem
 
 __all__ = ["reference"]
 
@@ -32,13 +27,7 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     Exits with 1 when nothing solves a problem or proves a solution, or a file met in a folder cannot be read.
     """
     from lavender.lab import bench, motion
-    from lavender.lab.proof import prove, require
-
-    def enclosed(problem: Problem) -> tuple[FloatArray, str]:
-        found = prove(problem.disk, motion.reference(problem.disk).impulse)
-        if found.impulse is None:
-            raise InputError(f"not proven: {found.reason}")
-        return found.impulse, f"proof: an exact solution within {found.velocity_radius:.1e} m/s"
+    from lavender.lab.proof import enclosed, require
 
     one_thread()
     if proven:
@@ -49,8 +38,9 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
         try:
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is no file; a reference is written beside one")
-            exact = enclosed(item.problem) if proven else ()
-            written = motion.save_reference(item.problem, item.source, *exact)
+            if proven and not (found := enclosed(item.problem)).proven:
+                raise InputError(str(found))
+            written = motion.save_reference(item.problem, item.source)
             told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
             with going_on():
                 out.print(told, highlight=False, markup=False, soft_wrap=True)

@@ -26,7 +26,7 @@ from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.solve import solve
 
-__all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check"]
+__all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check", "distance"]
 
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
@@ -264,14 +264,14 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
         "solution": solution,
     }
     if optimum is not None and np.isfinite(solution.impulse).all():
-        distance, allowed = _distance(problem, solution, optimum)
+        apart, allowed = distance(problem, solution, optimum)
         shared |= {
-            "distance": distance,
+            "distance": apart,
             "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
             "objective": _objective(problem, solution) - _objective(problem, optimum),
         }
         shared["allowed"] = allowed
-        if distance > allowed:
+        if apart > allowed:
             return CrossCheckRow(name, BREACH, note=note, **shared)
     if solution.contradicted:
         return CrossCheckRow(
@@ -288,14 +288,14 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
     return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)
 
 
-def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, float]:
-    """|Delta|_A and the largest value of it that (1) allows, rounding included [sqrt J]."""
+def distance(problem: Problem, one: Any, two: Any) -> tuple[float, float]:
+    """|Delta|_A of two judged answers and the largest value of it that (1) allows, rounding included [sqrt J]."""
     delta = problem.on_disk(one.impulse - two.impulse)
     eps = problem.on_disk(one.residual.error - two.residual.error)
     problem = problem.disk
     d: Any = problem.d
     a_delta, a_eps = _apply(problem, delta), _apply(problem, eps)
-    distance = float(np.sqrt(max(delta @ a_delta, 0.0)))
+    apart = float(np.sqrt(max(delta @ a_delta, 0.0)))
     # The errors e themselves are known to the floor of both residuals, in the norm of D.
     fuzz = float(sum(s.residual.floor * s.residual.energy_start for s in (one, two)))
     root = 1.0 / np.sqrt(d)
@@ -306,7 +306,7 @@ def _distance(problem: Problem, one: Solution, two: Solution) -> tuple[float, fl
     # x^2 <= x eps_a + eps_d delta_d bounds x by the larger root. Rounding of Delta.A Delta itself:
     rounding = 2.0**-50 * stiff * delta_d
     allowed = 0.5 * (eps_a + np.sqrt(eps_a * eps_a + 4.0 * eps_d * delta_d))
-    return distance, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
+    return apart, float(allowed * (1.0 + 1e-9) + np.sqrt(rounding * stiff * delta_d))
 
 
 def _apply(problem: Problem, x: Any, part: Callable[[Any], Any] = lambda a: a) -> Any:

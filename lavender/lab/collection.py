@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import numpy as np
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.solution import Status
 from lavender.lab import suite
-from lavender.lab.bench.cases import fingerprint
+from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
 from lavender.lab.motion import motions
 from lavender.lab.proof import prove
 from lavender.problem import Problem
@@ -32,6 +32,7 @@ from lavender.solving.solve import solve
 
 __all__ = [
     "MANIFEST",
+    "RECORDED",
     "Entry",
     "certified",
     "changed",
@@ -39,13 +40,16 @@ __all__ = [
     "entries",
     "hidden",
     "load",
+    "makeable",
     "page",
     "save",
+    "told",
 ]
 
 MANIFEST = Path(__file__).with_name("manifest.json")
-PROVED = 1000  # rows up to which a proof is tried, seconds to a minute each
+RECORDED = MANIFEST.with_name("recorded.json")  # of files of other projects, which are not part of this one
 SEARCHED = 60  # rows under Coulomb's law up to which other motions are looked for
+NEAR = 1e-9  # m/s
 SWEEPS = 10_000  # of PGS, at most
 SECONDS = 30.0  # of `auto`, to the answer that a proof begins from
 
@@ -60,9 +64,15 @@ class Entry:
     rows: int
     law: str
     form: str  # rows (bodies), matrix, generalized (J and M)
+    licence: str = ""  # of a model that another package installs
+    made: str = ""  # versions that give these numbers, where they hang on other packages
     sweeps: int | None = (
         None  # of PGS to 1e-3 of doing nothing; None: not within 10,000, or it does not take the problem
     )
+    condition: float | None = (
+        None  # of A, scaled to a diagonal of 1, over its range; None above CONDITION rows
+    )
+    degenerate: float = 0.0  # share of blocks that are nearer to another state than the answer's error
     known: str = "open"  # enclosed, infeasible or open
     radius: float | None = None  # m/s, of every row of the enclosed solution
     unique: bool = False  # proved to be the only motion
@@ -73,6 +83,8 @@ class Entry:
 
 def certified(problem: Problem, name: str, group: str) -> Entry:
     """The entry of a problem, with a proof or a certificate where there is one. Needs the extra `proof`."""
+    package = suite.package_of(name)
+    answer = solve(problem, "auto", tol=1e-12, time_limit=SECONDS)
     entry = Entry(
         name=name,
         group=group,
@@ -80,25 +92,26 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
         rows=problem.m,
         law=problem.law,
         form=problem.operator,
+        licence=suite.LICENCES.get(package, ""),
+        made=suite.versions(package),
         sweeps=difficulty(problem),
+        condition=condition(problem),
+        degenerate=round(len(answer.states.borders) / max(len(answer.states), 1), 3),
     )
-    told = asdict(entry)
-    if problem.m > PROVED:
-        return Entry(**told | {"reason": f"more than {PROVED} rows: not tried"})
-    answer = solve(problem, "auto", tol=1e-12, time_limit=SECONDS)
+    base = asdict(entry)
     if answer.status is Status.INFEASIBLE:
-        return Entry(**told | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
+        return Entry(**base | {"known": "infeasible", "reason": answer.message.rpartition("; ")[2]})
     try:
         found = prove(problem, answer)
     except CapabilityError as error:
-        return Entry(**told | {"reason": str(error)})
-    told |= {"reason": found.reason, "unique": found.unique}
+        return Entry(**base | {"reason": str(error)})
+    base |= {"reason": found.reason, "unique": found.unique}
     if found.proven:
-        told |= {"known": "enclosed", "radius": found.velocity_radius}
+        base |= {"known": "enclosed", "radius": found.velocity_radius}
     if problem.law == "coulomb" and not found.unique and problem.m <= SEARCHED:
         several = motions(problem.disk)
-        told |= {"motions": len(several), "apart": several.spread, "unique": bool(several.unique)}
-    return Entry(**told)
+        base |= {"motions": len(several), "apart": several.spread, "unique": bool(several.unique)}
+    return Entry(**base)
 
 
 def difficulty(problem: Problem) -> int | None:
@@ -131,8 +144,13 @@ def hidden(secret: str, count: int) -> list[str]:
 def entries(
     groups: Iterable[str], make: Callable[[Problem, str, str], Entry] = certified
 ) -> Iterator[tuple[Entry, Problem]]:
-    """Every problem of these sets, with its entry by `make`; all sets if none is named."""
+    """Every problem of these sets, files and folders, with its entry by `make`; all sets if none is named."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
+        if is_path(group):
+            for item in resolve(group):
+                yield make(item.problem, item.name, "recorded"), item.problem
+                item.forget()
+            continue
         for case in suite.cases(f"@{group}"):
             yield make(case.problem, case.name, group), case.problem
 
@@ -161,33 +179,57 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
         raise InputError(f"{path} is no manifest of problems: {error}") from None
 
 
+def makeable(found: Iterable[Entry]) -> tuple[list[Entry], list[str]]:
+    """Those of the entries whose models are installed, and a line for each package that is not."""
+    found = list(found)
+    missing = {e.name: suite.missing(package) for e in found if (package := suite.package_of(e.name))}
+    kept = [e for e in found if not missing.get(e.name)]
+    return kept, sorted({told for told in missing.values() if told})
+
+
 def changed(found: Iterable[Entry]) -> Iterator[str]:
     """Make every problem again by its name; a line for each that has other numbers."""
     for entry in found:
-        (case,) = suite.cases(entry.name)
-        if (now := fingerprint(case.problem)) != entry.sha:
-            yield f"{entry.name}: {now} here, {entry.sha} in the manifest"
+        problem = suite.case(entry.name).problem
+        if (now := fingerprint(problem)) != entry.sha:
+            here = suite.versions(suite.package_of(entry.name))
+            why = f"; made with {entry.made}, here {here}" if here != entry.made else ""
+            yield f"{entry.name}: {now} here, {entry.sha} in the manifest{why}"
 
 
-def page(found: list[Entry]) -> str:
-    """The catalogue: what is known of how many, and the problems that have no solution, several, or none known."""
+def told(entry: Entry) -> str:
+    """What is known of a problem, in a few words."""
+    words = f"enclosed within {entry.radius:.1e} m/s" if entry.radius is not None else entry.known
+    more = ", one motion" if entry.unique else ""
+    return words + more + (f", at least {entry.motions} motions" if entry.motions > 1 else "")
+
+
+def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
+    """The catalogue: what is known of how many, and the problems that have no solution, several, or none known.
+
+    `recorded` are files of other projects.
+    """
+    found = [*found, *recorded]
     count = Counter(e.known for e in found)
-    radius = max((e.radius for e in found if e.radius is not None), default=0.0)
+    near = sum(e.radius is not None and e.radius <= NEAR for e in found)
     unique = sum(e.unique for e in found)
     first = (
-        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to lie "
-        f"within {radius:.0e} m/s of a known answer; for {unique} no other motion exists; {count['infeasible']} have "
-        "no solution, with a certificate."
+        f"Of these {len(found)} contact problems {count['enclosed']} have an exact solution that is proved to stand "
+        f"beside a known answer, {near} within {NEAR:.0e} m/s of it; for {unique} no other motion exists; "
+        f"{count['infeasible']} have no solution, with a certificate."
     )
     how = (
         "`lavender problems` makes them from their names, `lavender problems --check` compares every number with "
-        "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page."
+        "`lavender/lab/manifest.json`, from which `lavender problems --page docs/catalogue.md` writes this page. "
+        "Robots need the extra `robots`: models of gymnasium (MIT) and dm_control (Apache-2.0). Recorded are files of "
+        "other projects that are not part of this one: test data of FCLIB and Siconos (Apache-2.0), and two of "
+        "ContactBench (BSD-2-Clause); `lavender problems FOLDER --certify FILE` says the same of yours."
     )
     columns = (
         "Rows from the least to the most; sweeps of PGS to a thousandth of the error of doing nothing, in the median "
-        f"({SWEEPS:,} where it does not get there or does not take the problem); problems by law; and what is known. "
-        "Open are problems on the border of two states, where no proof by signs exists, and those of more than "
-        f"{PROVED:,} rows, which were not tried."
+        f"({SWEEPS:,} where it does not get there or does not take the problem), the same of the condition of A, "
+        "problems with blocks on a border; problems by law; and what is known. "
+        "Open are problems on the border of two states, where no proof by signs exists."
     )
     laws = sorted({e.law for e in found})
     out = [
@@ -195,19 +237,28 @@ def page(found: list[Entry]) -> str:
         first,
         how,
         columns,
-        "| set | problems | rows | sweeps | "
+        "| set | problems | rows | sweeps | condition | on a border | "
         + " | ".join(laws)
         + " | enclosed | one motion | infeasible | open |",
-        "|---|---|---|---|" + "---|" * (len(laws) + 4),
+        "|---|---|---|---|---|---|" + "---|" * (len(laws) + 4),
     ]
     for group in dict.fromkeys(e.group for e in found):
         own = [e for e in found if e.group == group]
-        cells = [f"`@{group}`", len(own), f"{min(e.rows for e in own)} to {max(e.rows for e in own)}"]
+        cells = [
+            f"`@{group}`" if group in suite.SETS else group,
+            len(own),
+            f"{min(e.rows for e in own)} to {max(e.rows for e in own)}",
+        ]
         cells.append(f"{np.median([SWEEPS if e.sweeps is None else e.sweeps for e in own]):.0f}")
+        conditions = [e.condition for e in own if e.condition is not None]
+        cells += [f"{np.median(conditions):.0e}" if conditions else "", sum(e.degenerate > 0.0 for e in own)]
         cells += [sum(e.law == law for e in own) for law in laws]
         cells += [sum(e.known == "enclosed" for e in own), sum(e.unique for e in own)]
         cells += [sum(e.known == known for e in own) for known in ("infeasible", "open")]
         out.append("| " + " | ".join(map(str, cells)) + " |")
+    if recorded:
+        out += ["## Recorded files", "| file | sha | rows | law | known |\n|---|---|---|---|---|"]
+        out += [f"| `{e.name}` | `{e.sha}` | {e.rows} | {e.law} | {told(e)} |" for e in recorded]
     several = [e for e in found if e.motions > 1]
     for title, chosen, tell in (
         ("No solution", [e for e in found if e.known == "infeasible"], lambda e: e.reason),

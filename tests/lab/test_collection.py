@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lavender as lv
-from lavender import suite
+from lavender import bench, suite
 from lavender.lab import collection
 from lavender.lab.bench.cases import resolve
 
@@ -18,12 +18,15 @@ ENTRIES = collection.load()
 
 
 def test_the_manifest_has_every_problem_of_every_set_in_order():
-    assert [e.name for e in ENTRIES] == [suite.case(n).name for names in suite.SETS.values() for n in names]
+    names = [n for chosen in suite.SETS.values() for n in chosen]
+    assert [e.name for e in ENTRIES] == [n if suite.package_of(n) else suite.case(n).name for n in names]
+    assert all(e.licence and e.made for e in ENTRIES if suite.package_of(e.name))
 
 
 @pytest.mark.parametrize("start", range(5))
 def test_problems_are_made_again_with_the_same_numbers(start):
-    chosen = [e for e in ENTRIES[start::15] if e.rows < 2000]
+    chosen, _ = collection.makeable(e for e in ENTRIES[start::15] if e.rows < 2000)
+    chosen = [e for e in chosen if e.made == suite.versions(suite.package_of(e.name))]
     assert list(collection.changed(chosen)) == []
     wrong = replace(chosen[0], sha="0" * 16)
     (line,) = collection.changed([wrong])
@@ -41,11 +44,14 @@ OTHERS = {
 @pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
 def test_no_problem_hangs_on_the_processor(other):
     """Where it has not all that a core asks for, OpenBLAS chooses by itself; NumPy warns of what it does not know."""
-    code = "from lavender.lab import collection as c; print(*c.changed(c.load()), sep='\\n', end='')"
+    found = "c.changed(e for e in c.load() if not e.made)"
+    code = f"from lavender.lab import collection as c; print(*{found}, sep='\\n', end='')"
     assert subprocess.check_output([sys.executable, "-c", code], env=os.environ | other, text=True) == ""
 
 
-@pytest.mark.parametrize("entry", [e for e in ENTRIES if e.rows <= 40][::6], ids=lambda e: e.name)
+@pytest.mark.parametrize(
+    "entry", [e for e in ENTRIES if e.rows <= 40 and not e.made][::6], ids=lambda e: e.name
+)
 def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
     pytest.importorskip("flint")
     (case,) = suite.cases(entry.name)
@@ -57,7 +63,7 @@ def test_what_the_manifest_says_of_a_problem_is_found_again(entry):
 
 def test_the_page_is_that_of_the_manifest():
     text = (Path(__file__).resolve().parents[2] / "docs" / "catalogue.md").read_text(encoding="utf-8")
-    assert text == collection.page(ENTRIES)
+    assert text == collection.page(ENTRIES, collection.load(collection.RECORDED))
 
 
 def test_a_manifest_comes_back_as_it_was_written(tmp_path):
@@ -83,6 +89,16 @@ def test_a_set_is_named_by_its_sign_wherever_cases_are():
     assert [item.name for item in resolve("@walking")] == [e.name for e in ENTRIES if e.group == "walking"]
     with pytest.raises(lv.UnknownName, match=r"unknown set .*did you mean .walking"):
         resolve("@walkin")
+
+
+def test_robots_whose_package_is_absent_are_left_out_with_what_to_install(monkeypatch):
+    monkeypatch.setattr("lavender.lab.suite.robots.find_spec", lambda name: None)
+    names = [n for n in suite.SETS["robots"] if "dm_control" in n][:2]
+    records = bench.run(["two_particles", *names], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), orders=()))
+    assert [s.case for s in records.skips] == names and len(records) == 1
+    assert all("lavender-contact[robots]" in s.reason for s in records.skips)
+    here, missing = collection.makeable(ENTRIES)
+    assert len(missing) == 2 and not [e for e in here if e.made]
 
 
 def test_walking_is_the_quadratic_program_that_it_says():

@@ -69,8 +69,11 @@ def files(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_python_of_a_page_runs(page, files, capsys):
-    if ".hdf5" in "".join(text for *_, text in blocks(page, "python")):
+    whole = "".join(text for *_, text in blocks(page, "python", "pycon"))
+    if ".hdf5" in whole:
         pytest.importorskip("h5py", reason="the page reads HDF5 files")
+    if "lv.prove(" in whole:
+        pytest.importorskip("flint", reason="the page proves (extra: proof)")
     names = {"np": np, "lv": lv}
     for line, kind, text in blocks(page, "python", "pycon"):
         where = f"{page.name}:{line}"
@@ -91,6 +94,8 @@ def test_the_test_of_the_quick_start_passes_as_a_file_of_its_own(tmp_path):
 
 @pytest.mark.parametrize("name", list(modules_with_doctests()))
 def test_doctests_of_a_module(name):
+    if name == "lavender.lab.proof":
+        pytest.importorskip("flint", reason="its example proves (extra: proof)")
     failures, tried = doctest.testmod(importlib.import_module(name), optionflags=FLAGS)
     assert tried > 0
     assert failures == 0

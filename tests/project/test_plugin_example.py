@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import shutil
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,9 @@ FOLDER = ROOT / "examples" / "plugin"
 
 if importlib.util.find_spec("pip") is None:
     pytest.skip("pip is not installed: plug-ins are installed with it", allow_module_level=True)
+FOUND = {d.name: d.version for d in metadata.distributions(name="setuptools")}
+if int(FOUND.get("setuptools", "0").split(".")[0]) < 77:
+    pytest.skip("the plug-in is built by the setuptools that is here, 77 or newer", allow_module_level=True)
 
 SOLVES = """
 import sys, warnings

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, SolverUnavailable
 from lavender.io.stored import ENGINE, SUFFIXES, whole_file
 from lavender.judge.residuals import ENOUGH, Residual, nothing_to_do, residual
 from lavender.lab.bench.record import CaseInfo, file_name, printable
@@ -29,6 +29,7 @@ from lavender.problem.derived import cached_property
 __all__ = ["Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
 
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
+SINGULAR = 1e-12  # of the largest singular value: far below any condition number met in practice
 MANIFOLD = 8  # blocks between one pair of bodies, at most
 LARGE_RATIO = 1e3  # mass ratio from which the velocity form changes everything
 ASYMMETRY = 0.1  # of A, relative: recorded contact problems stay below a hundredth
@@ -142,7 +143,8 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         else:
             from lavender.lab import suite
 
-            items += [_from_case(case, case.name) for case in suite.cases(str(word))]
+            chosen = [_from_name(name) for name in suite.names(str(word))]
+            items += _as_steps(chosen) if str(word).removeprefix("@") == "sequences" else chosen
     return _unique_names(items)
 
 
@@ -259,6 +261,33 @@ def _from_case(case: Case, source: str) -> Item:
     return Item(case.name, source, _constant(case.problem), case.reason)
 
 
+def _from_name(name: str) -> Item:
+    """A case of the suite; where it needs a package that is not there, one that does not load."""
+    from lavender.lab import suite
+
+    try:
+        return _from_case(suite.case(name), name)
+    except SolverUnavailable as error:
+        return Item(name, name, _raising(error))
+
+
+def _as_steps(items: list[Item]) -> list[Item]:
+    """Cases that differ in `at` alone, one after the other: the steps of sequences."""
+    out, count = [], Counter[str]()
+    for item in items:
+        name = item.name.rpartition(", at=")[0] + ")"
+        out.append(replace(item, name=f"{name}[{count[name]}]", sequence=name, step=count[name]))
+        count[name] += 1
+    return out
+
+
+def _raising(error: Exception) -> Callable[[], Problem]:
+    def load() -> Problem:
+        raise error
+
+    return load
+
+
 def _from_file(path: Path) -> Item:
     def load() -> Problem:
         from lavender import io
@@ -318,6 +347,7 @@ def describe(item: Item, run: str) -> CaseInfo:
         nothing_to_do=nothing_to_do(p),
         suspicions=tuple(map(str, diagnose(p))),
         guess=_guess_of(item),
+        condition=condition(p),
     )
 
 
@@ -474,9 +504,21 @@ def _coupled_blocks(problem: Problem) -> Edges:
 def _redundant(problem: Problem) -> bool:
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
+    values = _singular_values(problem)
+    return len(values) > 0 and bool(values[-1] <= SINGULAR * values[0])
+
+
+def condition(problem: Problem) -> float | None:
+    """Of A, scaled to a diagonal of 1, over its range, to two digits; None above RANK_ROWS rows, and of A = 0."""
+    values = _singular_values(problem)
+    live = values[values > SINGULAR * values.max(initial=0.0)]
+    return float(f"{live[0] / live[-1]:.1e}") if len(live) else None
+
+
+def _singular_values(problem: Problem) -> NDArray[Any]:
     if problem.m > RANK_ROWS:
-        return False
-    scale = 1.0 / np.sqrt(problem.d)
-    a = problem.dense() * scale[:, None] * scale[None, :]
-    values = np.linalg.svd(a, compute_uv=False)
-    return bool(values[-1] <= 1e-12 * values[0])  # far below any condition number met in practice
+        return np.zeros(0)
+    with np.errstate(all="ignore"):
+        scale = 1.0 / np.sqrt(problem.d)
+        a = problem.dense() * scale[:, None] * scale[None, :]
+    return np.linalg.svd(a, compute_uv=False) if np.isfinite(a).all() else np.zeros(0)

@@ -153,6 +153,12 @@ class CaseInfo(_Texts):
     )
     suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
     guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
+    condition: float | None = (
+        None  # of A, scaled to a diagonal of 1, over its range; None where it was not computed
+    )
+    proof: str = (
+        ""  # how near an exact solution is enclosed, or why none is; empty where it was not asked for
+    )
 
 
 @dataclass(frozen=True)
@@ -202,6 +208,8 @@ class Record(_Texts):
     motion: float | None = None  # -, relative motion error; None if it was not requested, or if there is none
     motion_speed: float | None = None  # m/s, of the body that is furthest off (row, without bodies)
     bound: float | None = None  # sqrt J, proved bound of the motion error
+    degenerate: float | None = None  # -, share of blocks on a border at the answer
+    bits: str = ""  # hash of the answer: equal where two answers are, to the last bit
     worst_row: int = -1
     worst_name: str = ""
     success: bool = False  # the judge: relative <= tol (a budget: false)

@@ -166,7 +166,7 @@ def _same(records: Records, words: Sequence[Source]) -> tuple[list[Item], list[s
 
 def _plan(theirs: Run) -> Plan:
     """The plan of the submission, each measurement once."""
-    own = {f.name for f in fields(Plan)} - {"repeats", "motion", "speed_levels"}
+    own = {f.name for f in fields(Plan)} - {"repeats", "motion", "prove", "speed_levels"}
     values = {name: value for name, value in theirs.plan.items() if name in own}
     try:
         return Plan(**values, repeats=1)

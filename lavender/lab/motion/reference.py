@@ -21,6 +21,7 @@ __all__ = ["Reference", "adopt", "reference"]
 SOLVER = "auto"
 ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
 ACCEPTED = 1e-10  # relative residual that makes a reference, as does the floor
+PROOF = "proof: "  # who solved what `enclosed` gives
 CONVEX = ("linear", "lcp", "cone")
 
 
@@ -38,6 +39,11 @@ class Reference:
     def accepted(self) -> bool:
         """Near enough to a solution that distances to it are told: relative <= 1e-10, or at the floor."""
         return self.residual.relative <= ACCEPTED or self.residual.at_floor
+
+    @property
+    def enclosed(self) -> bool:
+        """An exact solution, rounded, that was enclosed with proof."""
+        return self.solver.startswith(PROOF)
 
     def __str__(self) -> str:
         quality = "" if self.accepted else ", no solution"

@@ -28,11 +28,12 @@ from __future__ import annotations
 from typing import Any
 
 from lavender.judge.solution import Solution
+from lavender.lab.motion.reference import PROOF, judged, kept, reference
 from lavender.lab.proof.numbers import balls
 from lavender.lab.proof.search import Enclosure, Search
 from lavender.problem import Problem, check_problem
 
-__all__ = ["Enclosure", "prove", "require"]
+__all__ = ["Enclosure", "enclosed", "prove", "require"]
 
 BITS = (128, 256)  # of the balls: what the first leave undecided the second try
 
@@ -81,6 +82,17 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
             found = search.run()
         if found.proven or search.singular:
             break
+    return found
+
+
+def enclosed(problem: Problem) -> Enclosure:
+    """Enclose an exact solution near the reference of the problem's motions, and keep it as that reference."""
+    problem = problem.disk
+    found = prove(problem, reference(problem).impulse)
+    if found.impulse is not None:
+        kept(problem).reference = judged(
+            problem, found.impulse, f"{PROOF}an exact solution within {found.velocity_radius:.1e} m/s"
+        )
     return found
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "case_table",
     "change_table",
     "claim_table",
+    "difficulty_table",
     "engine_table",
     "failure_table",
     "idle_table",
@@ -80,6 +81,10 @@ def sections(report: Report) -> list[Section]:
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
+        hard = (
+            "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks "
+            "on the border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
+        )
         every = "floor: rounding to float64 allows no better"
         carried = "median residual, time of all steps; carried from step to step, or cold"
         cases = reach_table(tables.reaches(records, levels), levels).without("form")
@@ -90,6 +95,7 @@ def sections(report: Report) -> list[Section]:
             Section("By motion error", moved, speed_table(report)),
             Section("Motion error of each case", moved, moved_table(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
+            Section("Difficulty", hard, difficulty_table(tables.difficulties(records))),
             Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True),
         ]
     if report.before is not None:
@@ -232,6 +238,28 @@ def reach_table(reaches: Sequence[tables.Reach], levels: Sequence[float]) -> Tab
     marks = ["bad" if r.contradicted else "" for r in reaches]
     heads = ["case", "solver", *(f"to {level_name(x)}" for x in levels), "best", "status", "claim", "form"]
     return Table(heads, rows, marks)
+
+
+def difficulty_table(found: Sequence[tables.Difficulty]) -> Table:
+    """Each case: what makes it hard, and how near an exact solution is enclosed where that was asked for."""
+    rows: Rows = [
+        [
+            d.case,
+            str(d.rows),
+            NONE if d.sweeps is None else str(d.sweeps),
+            NONE if d.condition is None else f"{d.condition:.1e}",
+            NONE if d.degenerate is None else f"{d.degenerate:.0%}",
+            ", ".join(d.same),
+            d.proof,
+        ]
+        for d in found
+    ]
+    heads = ["case", "rows", "sweeps", "condition", "on a border", "same answer", "exact solution"]
+    table = Table(heads, rows)
+    unused = [head for i, head in ((5, heads[5]), (6, heads[6])) if not any(row[i] for row in rows)]
+    for head in unused:
+        table = table.without(head)
+    return table
 
 
 def moved_table(report: Report) -> Table:

@@ -76,6 +76,10 @@ def _notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     kinds = {
         "false claim": ("red", wrong),
         "suspicious": ("yellow", [f"{case}: {told}" for case, told in suspicions(records)]),
+        "same answer without an iteration": (
+            "yellow",
+            [f"{d.case}: {', '.join(d.same)}" for d in tables.difficulties(records) if d.same],
+        ),
         "left out": ("yellow", [f"{what}: {reason}" for what, reason in left_out(records)]),
     }
     for kind, (style, texts) in kinds.items():

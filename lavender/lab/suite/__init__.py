@@ -31,10 +31,12 @@ from lavender.lab.suite.families import (
     two_particles,
 )
 from lavender.lab.suite.lots import drawn, wild
+from lavender.lab.suite.robots import LICENCES, missing, package_of, robot, versions
 from lavender.lab.suite.steps import engine_step, walking
 
 __all__ = [
     "FAMILIES",
+    "LICENCES",
     "MAX_SIZE",
     "SETS",
     "Case",
@@ -52,15 +54,34 @@ __all__ = [
     "granular",
     "hang",
     "hard",
+    "missing",
+    "names",
+    "package_of",
     "parse",
     "pyramid",
     "random_spd",
+    "robot",
     "stack",
     "toy_stack",
     "two_particles",
+    "versions",
     "walking",
     "wild",
 ]
+
+ROBOTS = {
+    "gymnasium": ("ant", "half_cheetah", "hopper", "humanoid", "humanoidstandup", "pusher_v5", "walker2d_v5"),
+    "dm_control": (
+        "cheetah",
+        "dog",
+        "humanoid",
+        "humanoid_CMU",
+        "manipulator",
+        "quadruped",
+        "stacker",
+        "walker",
+    ),
+}
 
 #: Lists of cases by name. "default" is what `lavender report` runs with no files: one case for each thing that
 #: separates solvers, small enough for all of them.
@@ -96,6 +117,19 @@ SETS: dict[str, tuple[str, ...]] = {
         for at in (3, 30)
     ),
     "walking": tuple(f"walking(seed={i})" for i in range(12)),
+    "robots": tuple(
+        f"robot(package={package}, model={model}, cone={cone}, at={at})"
+        for package, models in ROBOTS.items()
+        for model in models
+        for cone in ("pyramidal", "elliptic")
+        for at in (200, 400)
+    ),
+    "sequences": tuple(
+        f"robot(package=gymnasium, model={model}, cone={cone}, at={at})"
+        for model in ("ant", "humanoid")
+        for cone in ("pyramidal", "elliptic")
+        for at in range(200, 208)
+    ),
 }
 
 
@@ -132,12 +166,23 @@ def cases(text: str) -> Iterator[Case]:
     UnknownName, InputError
         As `case`, at once.
     """
+    if (chosen := names(text)) == (text,):
+        return iter([case(text)])
+    return (case(one) for one in chosen)
+
+
+def names(text: str) -> tuple[str, ...]:
+    """The names of a set's cases ("default", "@hard"), or this one alone.
+
+    Raises
+    ------
+    UnknownName
+        No such set.
+    """
     name = text.removeprefix("@")
     if text.startswith("@") and name not in SETS:
         raise UnknownName("set of cases", name, SETS)
-    if name in SETS:
-        return (case(one) for one in SETS[name])
-    return iter([case(text)])
+    return SETS.get(name, (text,))
 
 
 def default() -> list[Case]:

@@ -1,12 +1,17 @@
 """Motion errors on records: what they say, what they cost those who do not ask, levels in metres per second."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
 import lavender as lv
 from lavender import bench, suite
 from lavender.lab.bench.record import from_json, to_json
+from lavender.lab.bench.running.runner import with_motion
+from lavender.lab.motion.reference import as_reference
+from lavender.lab.proof import enclosed
+from lavender.lab.report import tables
 
 SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 60.0}
 
@@ -82,3 +87,38 @@ def test_what_has_nothing_to_do_is_described_so():
     (busy,) = resolve(["stack(n=4)"])
     assert describe(idle, "run").nothing_to_do
     assert not describe(busy, "run").nothing_to_do
+
+
+def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_residual_is_contradicted(
+    monkeypatch,
+):
+    pytest.importorskip("flint", reason="python-flint (extra proof) is not installed")
+    plan = bench.Plan(levels=(1e-6,), prove=True, **SHORT)
+    records = bench.run(["granular(n=2)", "threshold"], ["newton"], plan)
+    assert plan.motion and [r.contradicted for r in records] == ["", ""]
+    near, border = (records.cases[name].proof for name in ("granular(n=2)", "threshold"))
+    assert near.startswith("within ") and float(near.split()[1]) < 1e-9
+    assert border.startswith("none: contact 0, normal")
+    # A judge that finds no error in an answer that is wrong: only the exact solution tells.
+    problem = suite.case("granular(n=2)").problem
+    enclosed(problem)
+    wrong = 0.9 * lv.solve(problem, tol=1e-9).impulse
+    record = next(r for r in records if r.case == "granular(n=2)")
+    assert not with_motion(record, problem, wrong).contradicted  # its residual says so
+    blind = as_reference(problem, wrong)
+    monkeypatch.setattr(
+        "lavender.lab.bench.running.runner.as_reference",
+        lambda *_: replace(blind, residual=replace(blind.residual, error=0.0 * wrong)),
+    )
+    assert "from the exact solution" in with_motion(record, problem, wrong).contradicted
+
+
+def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration():
+    plan = bench.Plan(levels=(1e-3, 1e-6), **SHORT)
+    records = bench.run(["stack(n=8)", "threshold"], ["pgs", "newton", "lemke", "direct"], plan)
+    stack, border = tables.difficulties(records)
+    assert stack.sweeps > 10 and stack.condition > 10.0 and stack.degenerate == 0.0 and stack.same == ()
+    assert border.degenerate == 1.0
+    told = [replace(r, iterations=0, bits="x") if r.solver in ("lemke", "direct") else r for r in records]
+    shared = replace(records, records=told)
+    assert tables.difficulties(shared)[0].same == ("direct", "lemke")

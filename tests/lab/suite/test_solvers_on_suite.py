@@ -128,6 +128,8 @@ def test_a_sliding_pile_is_found_sooner_where_the_direction_is_kept():
 
 @pytest.mark.parametrize("name", suite.families())
 def test_families_of_few_rows(name):
+    if missing := suite.missing(suite.package_of(name)):
+        pytest.skip(missing)
     problem = suite.case(name).problem
     if problem.m > SMALL_ROWS:
         pytest.skip("many rows")

@@ -95,7 +95,8 @@ def test_sets_and_families_are_listed():
     listed = suite.families()
     assert all(summary.strip() for summary in listed.values())
     for name in listed:
-        assert suite.case(name).problem.m > 0  # the listing is itself a valid name
+        if not suite.missing(suite.package_of(name)):
+            assert suite.case(name).problem.m > 0  # the listing is itself a valid name
 
 
 # -- geometry -------------------------------------------------------------------------------------

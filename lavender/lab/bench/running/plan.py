@@ -41,6 +41,8 @@ class Plan:
     orders : sweep orders beside "given", each at the middle budget, for solvers that take an order;
         "random:3" is random with seed 3
     motion : tell how wrong the bodies move, by a reference that is solved for once a case
+    prove : compare motions with an exact solution where one is enclosed (`lavender.prove`); implies `motion`. A claim
+        that is further from it than the claim's own residual allows is contradicted
     speed_levels : m/s, motion errors to reach; implies `motion`. Each solver is asked for the residual that takes it
         there: again and tighter while it misses, at most `SPEED_TRIES` times a level
     times : s, in which the report is asked to name a solver
@@ -63,6 +65,7 @@ class Plan:
     orders: Sequence[str] = ("reverse", "symmetric", "random:0", "random:1", "random:2")
     campaign: bool = False
     motion: bool = False
+    prove: bool = False
     speed_levels: Sequence[float] = ()
     times: Sequence[float] = ()
     sweeps: Sequence[int] = ()
@@ -80,7 +83,7 @@ class Plan:
         whole_number("repeats", self.repeats, 1)
         number("time_limit", self.time_limit, above=0.0)
         number("pass_limit", self.pass_limit, above=0.0)
-        for name in ("warm", "campaign", "motion"):
+        for name in ("warm", "campaign", "motion", "prove"):
             flag(name, getattr(self, name))
         for word in self.orders:
             name, _, seed = word.partition(":")
@@ -98,7 +101,7 @@ class Plan:
             object.__setattr__(self, name, tuple(sorted(counts)))
         object.__setattr__(self, "times", tuple(sorted({float(t) for t in self.times})))
         object.__setattr__(self, "orders", tuple(dict.fromkeys(self.orders)))
-        object.__setattr__(self, "motion", self.motion or bool(self.speed_levels))
+        object.__setattr__(self, "motion", self.motion or self.prove or bool(self.speed_levels))
 
     way = "call"  # what of a single problem is timed, as `Record.way`
 

@@ -12,6 +12,8 @@ from typing import Any
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import LavenderError
+from lavender.judge.residuals import residual
+from lavender.judge.states import states_of
 from lavender.lab import motion
 from lavender.lab.bench import machine
 from lavender.lab.bench.cases import Item, Source, describe, resolve
@@ -20,7 +22,10 @@ from lavender.lab.bench.running.plan import Plan, passes
 from lavender.lab.bench.running.timing import Ask, Task, measure, one_thread
 from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.store import Records, Store, opened
+from lavender.lab.check import distance
 from lavender.lab.motion import load_reference
+from lavender.lab.motion.reference import as_reference
+from lavender.lab.proof import enclosed
 from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
@@ -64,7 +69,28 @@ def with_motion(record: Record, problem: Problem, impulse: Any) -> Record:
         motion.motion_error(problem, impulse) if found is None else motion.nearest(problem, impulse, found)
     )
     speed = error.rows if error.speed is None else error.speed
-    return replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
+    told = replace(record, motion=error.relative, motion_speed=speed, bound=error.bound)
+    reference = error.reference
+    if (
+        record.claims
+        and record.status != "INFEASIBLE"
+        and reference.enclosed
+        and reference.witness is not None
+    ):
+        apart, allowed = distance(problem, as_reference(problem, impulse), reference)
+        if apart > allowed:
+            words = (
+                f"says {record.status}, {apart:.1e} sqrt(J) from the exact solution, {allowed:.1e} allowed"
+            )
+            return replace(told, contradicted=record.contradicted or words)
+    return told
+
+
+def with_answer(record: Record, problem: Problem, impulse: FloatArray) -> Record:
+    """The record with what its impulses (m,) [N s] are: their bits, and how many blocks are on a border."""
+    states = states_of(problem, impulse, residual(problem, impulse))
+    bits = hashlib.sha256(impulse.tobytes()).hexdigest()[:16]
+    return replace(record, bits=bits, degenerate=len(states.borders) / max(len(states), 1))
 
 
 def is_foreign(spec: SolverSpec) -> bool:
@@ -199,6 +225,10 @@ class Runner:
             info = describe(item, self.this.run)
             if self.plan.motion:
                 load_reference(item.problem, item.source)
+            if self.plan.prove:
+                found = enclosed(item.problem)
+                told = f"within {found.velocity_radius:.1e} m/s" if found.proven else f"none: {found.reason}"
+                info = replace(info, proof=told)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
             self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error), item.sequence))
             self.done += len(self.names)
@@ -326,6 +356,8 @@ class Runner:
             record, found = self.worker.measure(replace(problem, copy=False), task, impulse)
         else:
             record, found = measure(problem, task, impulse)
+        if found is not None:
+            record = with_answer(record, problem, found)
         return with_motion(record, problem, found) if self.plan.motion else record, found
 
 

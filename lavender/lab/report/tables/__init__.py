@@ -14,10 +14,12 @@ from lavender.lab.report.tables.advice import (
 from lavender.lab.report.tables.campaigns import Robustness, robustness
 from lavender.lab.report.tables.cases import (
     Claims,
+    Difficulty,
     Reach,
     Spread,
     budgets,
     claims,
+    difficulties,
     failures,
     reaches,
     spreads,
@@ -46,6 +48,7 @@ __all__ = [
     "Change",
     "Choice",
     "Claims",
+    "Difficulty",
     "Final",
     "Line",
     "Pass",
@@ -60,6 +63,7 @@ __all__ = [
     "by_sequence",
     "changes",
     "claims",
+    "difficulties",
     "drift",
     "failures",
     "families",

@@ -16,7 +16,20 @@ from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.groups import DIED, levels_of, pairs
 
-__all__ = ["Claims", "Reach", "Spread", "budgets", "claims", "failures", "reaches", "spreads"]
+__all__ = [
+    "Claims",
+    "Difficulty",
+    "Reach",
+    "Spread",
+    "budgets",
+    "claims",
+    "difficulties",
+    "failures",
+    "reaches",
+    "spreads",
+]
+
+EASY = 1e-3  # relative residual to which sweeps are counted
 
 
 @dataclass(frozen=True)
@@ -42,6 +55,19 @@ class Reach:
     def at_floor(self) -> bool:
         """No better residual can be asked of float64."""
         return at_floor(self.best, self.floor)
+
+
+@dataclass(frozen=True)
+class Difficulty:
+    """What makes a case hard, and who did not solve it by a way of its own."""
+
+    case: str
+    rows: int
+    sweeps: int | None  # of `pgs` to EASY; None where it did not get there, or was not asked
+    condition: float | None  # of A, as `CaseInfo.condition`
+    degenerate: float | None  # share of blocks on a border at the best answer
+    proof: str
+    same: tuple[str, ...]  # solvers that gave the same bits without an iteration: a shortcut of all was timed
 
 
 @dataclass(frozen=True)
@@ -128,6 +154,32 @@ def failures(records: Records) -> list[Record]:
         lost = not math.isfinite(r.relative) or r.status.startswith(DIED)
         if (missed and not proven) or lost or r.contradicted:
             out.append(r)
+    return out
+
+
+def difficulties(records: Records) -> list[Difficulty]:
+    """Each case of the records."""
+    out = []
+    for name, info in records.cases.items():
+        mine = [r for r in records if r.case == name]
+        swept = [r.iterations for r in mine if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY]
+        known = [r for r in mine if r.degenerate is not None]
+        idle = [r for r in mine if r.bits and r.iterations == 0 and r.claims]
+        groups = defaultdict(set)
+        for r in idle:
+            groups[r.bits].add(r.solver)
+        same = max(groups.values(), key=len, default=set())
+        out.append(
+            Difficulty(
+                case=name,
+                rows=info.rows,
+                sweeps=min(swept, default=None),
+                condition=info.condition,
+                degenerate=min(known, key=lambda r: r.relative).degenerate if known else None,
+                proof=info.proof,
+                same=tuple(sorted(same)) if len(same) > 1 and not info.nothing_to_do else (),
+            )
+        )
     return out
 
 
