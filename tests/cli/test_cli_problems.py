@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import pytest
+
 import lavender as lv
 from lavender.lab import collection
 
@@ -33,6 +35,7 @@ def test_who_knows_the_secret_makes_the_same(lavender, tmp_path):
 
 
 def test_a_manifest_is_made_with_proofs(lavender, tmp_path, monkeypatch):
+    pytest.importorskip("flint")
     monkeypatch.setattr(collection.suite, "SETS", {"walking": ("walking(n=4)", "walking(n=5)")})
     code, out, _ = lavender("problems", "@walking", "--certify", tmp_path / "m.json")
     assert code == 0 and out.count(": enclosed") == 2

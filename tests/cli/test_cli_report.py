@@ -62,6 +62,7 @@ def test_without_a_problem_nothing_is_printed_but_why(tmp_path):
 
 
 def test_the_command_refuses_what_it_does_not_know(capsys):
+    pytest.importorskip("flint")
     from lavender.cli import main
 
     with pytest.raises(SystemExit) as ended:

@@ -114,6 +114,7 @@ process.exit(readFileSync(process.argv[2], "utf8") === "lavender" && newton === 
 
 
 def test_command_writes_a_page_without_outside_addresses(lavender, module, tmp_path):
+    pytest.importorskip("Cython", reason="the command translates the kernels (extra: test)")
     assert lavender("web", "page", tmp_path / "site")[0] == 0
     files = {
         path.relative_to(tmp_path / "site").as_posix()
