@@ -14,7 +14,7 @@ limit is the problem given. It begins the larger the further steps lead astray: 
 under the cone law, 3e-2 d under Coulomb's (docs/auto.md).
 
 Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
-that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| + mu_r |w_r| (3)
+that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = sum of a_g |w_g| over parts (3)
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
@@ -23,9 +23,10 @@ N and its factor serve the next step where no block has changed its V.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, n_apart, n_tangents
+from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport length
 from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.parts cimport CONE, COULOMB, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
@@ -177,9 +178,10 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
     """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own, 1e-3 d in contacts.
 
-    A disk's tangents get the largest.
+    Rows of one part get the largest.
     """
-    cdef int32_t a, i, j, k, nt, end, last
+    cdef int32_t a, i, j, k, g, end, last
+    cdef parts_t q
     cdef const double* compliance = f.g.compliance
     cdef const double* d = f.p.d
     cdef double* theta = f.theta
@@ -191,7 +193,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = 1e-6 if f.p.kind[i] == ROW else 1e-3
+            low = 1e-6 if is_rows(&f.p, i) else 1e-3
             if share < low:
                 low = share
             for k in range(j, end):
@@ -199,11 +201,10 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
                 if not x >= low * d[k]:
                     x += share * d[k]
                 theta[k] = x
-            nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], end - j)
-            if nt > 1:
-                one_theta(theta, j + 1, j + 1 + nt)
-            if f.p.kind[i] == CONTACT_ROLLING:
-                one_theta(theta, end - 2, end)
+            parts_of(&f.p, i, &q)
+            for g in range(q.n):
+                if q.size[g] > 1:
+                    one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
@@ -342,12 +343,12 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
 
 cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
-    cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
-    cdef double out = f.p.mu[i] * length(f.w + j + 1, nt)
-    if n_apart(f.p.kind[i], end - j) & 1:
-        out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[j + 1 + nt])
-    if f.p.kind[i] == CONTACT_ROLLING:
-        out += f.p.rolling[i] * length(f.w + end - 2, 2)
+    cdef int32_t g
+    cdef double out = 0.0
+    cdef parts_t q
+    parts_of(&f.p, i, &q)
+    for g in range(q.n):
+        out += q.reach[g] * length(f.w + f.p.ptr[i] + q.first[g], q.size[g])
     return out
 
 
@@ -358,7 +359,7 @@ cdef inline void lower_normals(const flow_t* f, int32_t island, const double* la
     measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
-            if f.p.kind[i] != ROW and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
+            if not is_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
                 f.phi[f.p.ptr[i]] = slip(f, i)
 
 

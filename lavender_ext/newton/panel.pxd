@@ -2,7 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.rows cimport contact_jacobian, rows_t
 from lavender_ext.newton.elements cimport elements_t
 
@@ -138,7 +138,7 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
             a = r.contact_body[2 * c]
             b = r.contact_body[2 * c + 1]
             n = p.ptr[i + 1] - j
-            contact_jacobian(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), jac)
+            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):
             out = panel + 12 * <int64_t>q

@@ -22,9 +22,9 @@ from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport COULOMB, ROW
-from lavender_ext.newton.cones cimport PARTS, cone_at, cone_size, is_high, is_low, ratio
-from lavender_ext.newton.elements cimport elements_t, invert_small
+from lavender_ext.core.parts cimport COULOMB
+from lavender_ext.newton.cones cimport is_high, is_low
+from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
 from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
 from lavender_ext.newton.system cimport OF_NATURAL, all_finite, solve_natural, system_factor, system_times
@@ -141,18 +141,16 @@ cdef inline double smooth_row(const elements_t* e, int32_t j, double z, double s
 cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
                                 double* f, double* p, double* rest, double* ft) noexcept nogil:
     """(1) of one contact, P (nr, nr), I - P without cancellation, and dF / d log tau."""
-    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, which
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, g
     cdef double y = z[0] - s[0], normal = plus(y, tau), dn = slope(y, tau), a, r, q, d, root, more, m, fr, across, along, x, own
     memset(p, 0, nr * nr * sizeof(double))
     memset(rest, 0, nr * nr * sizeof(double))
     f[0] = s[0] - plus(-y, tau) if y > 0.0 else z[0] - normal
     p[0], rest[0], ft[0] = dn, slope(-y, tau), -rise(y, tau)
-    for which in range(PARTS):
-        n = cone_size(e, i, which) - 1
-        if n < 1:
-            continue
-        first = cone_at(e, i, which) - e.ptr[i]
-        a = ratio(e, i, which)
+    for g in range(e.part[i], e.part[i + 1]):
+        n = e.size[g]
+        first = e.first[g] - e.ptr[i]
+        a = e.reach[g]
         r, q = a * normal, 0.0
         for k in range(first, first + n):
             q += (z[k] - s[k]) * (z[k] - s[k])
@@ -192,7 +190,7 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             n.f[j] = smooth_row(e, j, z[j], n.rest[j], tau, p, rest, ft)
         else:
             smooth_contact(e, i, z + j, n.rest + j, tau, n.path.wide * tau, n.f + j, p, rest, ft)
@@ -216,7 +214,7 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
 cdef inline double change(newton_t* n, const double* dz, double tau) noexcept nogil:
     """Largest relative change of a distance to the next piece by dz, at the y of the last `smooth`."""
     cdef const elements_t* e = n.s.e
-    cdef int32_t i, j, k, first, size, which
+    cdef int32_t i, j, k, first, size, g
     cdef double worst = 0.0, x, y, dy, r, q, along, square, wide = n.path.wide * tau
     cdef double* d = n.hdz
     system_times(&n.s, dz, d)
@@ -225,7 +223,7 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
     for i in range(e.n):
         j = e.ptr[i]
         y, dy = n.t1[j], d[j]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             if is_low(e, j):
                 x = fabs(dy) / (fabs(y - e.lower[j]) + 2.0 * tau)
                 worst = worst if x <= worst else x
@@ -235,12 +233,10 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
             continue
         x = fabs(dy) / (fabs(y) + 2.0 * tau)
         worst = worst if x <= worst else x
-        for which in range(PARTS):
-            size = cone_size(e, i, which) - 1
-            if size < 1:
-                continue
-            first = cone_at(e, i, which)
-            r, q = ratio(e, i, which) * plus(y, tau), 0.0
+        for g in range(e.part[i], e.part[i + 1]):
+            size = e.size[g]
+            first = e.first[g]
+            r, q = e.reach[g] * plus(y, tau), 0.0
             along = square = 0.0
             for k in range(first, first + size):
                 q += n.t1[k] * n.t1[k]
@@ -248,7 +244,7 @@ cdef inline double change(newton_t* n, const double* dz, double tau) noexcept no
                 square += d[k] * d[k]
             q = sqrt(q)
             along = along / q if q > 0.0 else 0.0
-            x = fabs(ratio(e, i, which) * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * wide)
+            x = fabs(e.reach[g] * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * wide)
             worst = worst if x <= worst else x
             square -= along * along
             x = (sqrt(square) if square > 0.0 else 0.0) / (q + r + 2.0 * wide)
