@@ -85,6 +85,7 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
     for stage in islice(rule(tree), 60):
         curve, (before, spent) = curves.get(stage.solver), at.get(stage.solver, (0.0, 0.0))
         if curve is None or not curve.points or before >= curve.points[-1][0]:
+            tree.left += stage.cost
             continue
         time, end = curve.to(level)
         n = before + max(1.0, stage.iterations)
@@ -171,7 +172,7 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
     def model(q: Any) -> Any:
         start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))
         steps = (
-            (costs.STEPS * count[n] if n in count else n)
+            (c.steps * count[n] if n in count else n)
             * (each * c.rows + entry * c.entries + work[c.form] * c.work)
             for c, _, n in newton
         )

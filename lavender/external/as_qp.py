@@ -41,7 +41,6 @@ from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 
 __all__ = ["FORMS", "QP", "bound_rows", "impulse_form", "pick_form", "target", "two_sided", "velocity_form"]
 
@@ -440,7 +439,7 @@ class _Parts:
         known = (c.lower == c.upper) & np.isfinite(c.lower)
         fixed = np.where(known, c.lower, 0.0)
         size = np.diff(c.ptr)
-        alone = np.repeat((c.kind == ROW) | (size == 1), size)
+        alone = np.repeat(~c.is_contact | (size == 1), size)
         for i in np.asarray(problem.metric.empty, int):
             # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
             if alone[i]:

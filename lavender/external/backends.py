@@ -146,7 +146,7 @@ def _spec(backend: Backend) -> SolverSpec:
         external=True,
         impulse=backend.warm,
         round_cones=backend.cones,
-        rolling=backend.cones,
+        parts=backend.cones,
         max_iter=backend.max_iter,
         options=OPTIONS,
         requires=backend.modules,

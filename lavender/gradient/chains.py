@@ -11,7 +11,6 @@ from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.gradient.result import BODIES, Gradient
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT_BOX, CONTACT_ELLIPSE
 
 __all__ = ["Bodies", "Parts"]
 
@@ -23,9 +22,9 @@ class Parts:
         c = problem.cones
         self.mu, self.radius = c.mu, c.patch_radius
         self.first = np.where(c.n_tangents > 0, c.ptr[:-1] + 1, -1)
-        self.ellipse = c.kind == CONTACT_ELLIPSE
+        self.ellipse = c.is_ellipse
         self.second = np.where(self.ellipse, c.ptr[:-1] + 2, c.apart_rows)
-        self.two = self.ellipse | (c.kind == CONTACT_BOX)
+        self.two = self.ellipse | c.is_box
         self.rolls = c.rolling_rows
         self.m = c.n_rows
 

@@ -16,7 +16,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.gradient import derivative
 from lavender.problem import Problem
-from lavender.problem.cones import ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.solving.many import solve_many
 
 __all__ = ["Step", "shapes", "step"]
@@ -36,7 +36,7 @@ class Step:
 
     def problems(self, arrays: Sequence[FloatArray]) -> Iterator[Problem]:
         """One for each member of the batch, in C order."""
-        contacts = self.cones.kind != ROW
+        contacts = self.cones.is_contact
         for jac, mass, free, mu, target, soft in zip(*arrays, strict=True):
             cones = self.cones
             if contacts.any():
@@ -66,7 +66,7 @@ class Step:
         ]
         for p, x, y, c in zip(self.problems(flat), *others, strict=True):
             g = derivative(p, x).vjp(velocity=y, impulse=c)
-            whole = (g.full("J"), g.full("M"), g.v_free, g.mu[p.cones.kind != ROW], g.target, g.compliance)
+            whole = (g.full("J"), g.full("M"), g.v_free, g.mu[p.cones.is_contact], g.target, g.compliance)
             for to, value in zip(found, whole, strict=True):
                 to.append(value)
         made = (np.array(x).reshape(*batch, *like.shape[1:]) for x, like in zip(found, flat, strict=True))
@@ -122,7 +122,7 @@ def step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str,
                 f"J has {m} rows for {k} values of mu; without cones= each contact has a normal and up to two tangents"
             )
         cones = Cones.contacts(0.0, m // k - 1, count=k)
-    contacts = int(np.count_nonzero(cones.kind != ROW))
+    contacts = int(np.count_nonzero(cones.is_contact))
     if cones.n_rows != m or contacts != k:
         raise InputError(
             f"cones have {cones.n_rows} rows and {contacts} contacts; J has {m} rows and mu {k} values"

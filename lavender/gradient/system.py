@@ -12,7 +12,6 @@ from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender.solvers._factor import WIDE
 from lavender.solvers.newton_systems.systems import is_full
 from lavender_ext.derivative.linear import Linear
@@ -90,7 +89,7 @@ class System:
         h = sp.csr_array((data, indices, indptr), shape=(self.n, self.n))
         c, one = self.problem.cones, sp.eye_array(self.n)
         block = np.repeat(np.arange(c.n_blocks), np.diff(c.ptr))
-        alone = (c.kind == ROW)[block]
+        alone = ~c.is_contact[block]
         ends = np.concatenate([[0], np.cumsum(np.where(alone, 1, np.diff(c.ptr)[block]))])
         first = np.where(alone, np.arange(c.n_rows), c.ptr[block])
         columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], np.diff(ends))

@@ -23,7 +23,7 @@ from lavender.base.arrays import FloatArray, as_array, number, precision_of, who
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io import mujoco as single
 from lavender.problem.batch import Batch, check_errors
-from lavender.problem.cones import CONTACT, ROUND, ROW, Cones
+from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]
@@ -242,10 +242,9 @@ def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any,
         s = scale[0]
         jac *= s[:, None]
         goal, soft, lam = goal * s, soft * s * s, lam / s
-    whole = whole_mass(model, mass)
     batch = Batch(
         jac,
-        whole,
+        (mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))),
         before + dt * smooth,
         target=goal,
         cones=cones,
@@ -281,7 +280,7 @@ def _check_mass(mass: Any, smooth: FloatArray, force: FloatArray, precision: str
 def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple[Cones, FloatArray | None]:
     """Blocks of all rows that count, one world after the other, and the factor of each row (n, m), None: 1."""
     n, m = of.shape
-    begins, kind, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
+    begins, tangents, mu = np.ones((n, m), bool), np.zeros((n, m), np.int32), np.zeros((n, m))
     scale = None
     elliptic = (of == ELLIPTIC) & counted
     if elliptic.any() and contacts is None:
@@ -297,7 +296,7 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
             raise InputError(
                 f"efc_type has {rows} rows of elliptic contacts, contacts name {np.sum(dim)} of them"
             )
-        kind[world, address], mu[world, address] = np.where(dim > 3, ROUND, CONTACT), rub[:, 0]
+        tangents[world, address], mu[world, address] = dim - 1, rub[:, 0]
         factor = np.ones((n, m))
         for j in range(1, int(np.max(dim, initial=1))):
             at = dim > j
@@ -312,7 +311,8 @@ def _blocks(of: Any, loss: Any, counted: Any, contacts: Any, dt: float) -> tuple
     first = begins[counted]
     ptr = np.append(np.flatnonzero(first), len(first)).astype(np.int32)
     none = np.zeros(len(ptr) - 1)
-    kinds = np.where(kind[counted][first] == 0, ROW, kind[counted][first]).astype(np.int32)
+    tangents = tangents[counted][first]
+    kinds = kinds_of(tangents > 0, tangents=tangents)
     return Cones(
         ptr=ptr, kind=kinds, lower=lower, upper=upper, mu=mu[counted][first], patch_radius=none
     ), scale

@@ -3,7 +3,7 @@
     local     u = W r + q                                         A = W, b = -q, lambda = r, w = u
     global    M v = H r + f,  u = H^T v + w                       A = H^T M^-1 H,  b = -(w + H^T M^-1 f)
     with equations (V, R, s or G, b): free rows after the contacts, w = 0 there
-    rolling   five rows a contact, |r_T| <= mu r_N and |r_R| <= mu_r r_N on the last two: CONTACT_ROLLING
+    rolling   five rows a contact, |r_T| <= mu r_N and |r_R| <= mu_r r_N on the last two: a contact that rolls
 
 FCLIB's vector `w` is an offset of the velocity, not our slack. Format: Acary, Bremond, Huber et al.,
 "FCLIB: a collection of discrete 3D frictional contact problems", Inria RT-444, 2014.
@@ -27,7 +27,7 @@ from lavender.io.condensed import ENTRY, condensed
 from lavender.io.npz import compressed
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_bytes
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT_ROLLING, ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 
 __all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
@@ -468,19 +468,19 @@ def _mass(problem: Problem) -> tuple[sp.csr_array, FloatArray]:
 def _cannot_hold(problem: Problem, form: str, drop: Collection[str]) -> list[str]:
     c = problem.cones
     reasons = []
-    if np.any(c.kind == ROW):
+    if np.any(~c.is_contact):
         free = np.isneginf(c.lower) & np.isposinf(c.upper)
         rows = ~c.contact_rows
         what = "free rows" if np.all(free[rows]) else "bounded rows"
-        reasons.append(f"ROW blocks ({int(rows.sum())} {what}; contacts only)")
+        reasons.append(f"blocks of bounded rows ({int(rows.sum())} {what}; contacts only)")
     if c.has_ellipse:
         reasons.append("ellipses (give problem.disk, whose impulses are problem.on_disk of those here)")
     if c.has_box:
         reasons.append("boxes (its friction is a disk: give cones.shaped('disk'), which is another law)")
     if np.any(c.spin_rows >= 0) or c.has_round:
         reasons.append("spin rows")
-    rolls = np.count_nonzero(c.kind == CONTACT_ROLLING)
-    contacts = c.n_tangents[c.kind != ROW]
+    rolls = np.count_nonzero(c.rolling_rows >= 0)
+    contacts = c.n_tangents[c.is_contact]
     if 0 < rolls < len(contacts):
         reasons.append(f"contacts with rolling beside others ({rolls} of {len(contacts)}; all, or none)")
     if problem.n_blocks == 0:

@@ -28,7 +28,7 @@ from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.io.stored import MAX_BYTES, NUMBER, Budget, Stored, write_arrays
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.cones import CONTACT, ROW, Cones
+from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 
@@ -387,13 +387,12 @@ def _box_cones(archive: Archive, m: int) -> Cones:
     for s, e in zip(start, end, strict=True):
         inside[s + 1 : e] = True
     first = np.flatnonzero(~inside)
-    kind = np.full(len(first), ROW, np.int32)
-    friction = np.zeros(len(first))
+    contact, friction = np.zeros(len(first), bool), np.zeros(len(first))
     at = np.searchsorted(first, start)
-    kind[at], friction[at] = CONTACT, mu
+    contact[at], friction[at] = True, mu
     return Cones(
         ptr=np.append(first, m),
-        kind=kind,
+        kind=kinds_of(contact),
         lower=lower,
         upper=upper,
         mu=friction,

@@ -13,7 +13,6 @@ import numpy as np
 from lavender.base.arrays import ArrayLike, FloatArray
 from lavender.base.errors import InputError
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT_ELLIPSE, ROUND, ROW
 
 __all__ = ["QPResidual", "natural_map", "qp_residual", "siconos_error"]
 
@@ -54,20 +53,20 @@ def siconos_error(problem: Problem, impulse: ArrayLike) -> dict[str, float]:
     lam = problem.impulse_array(impulse)
     u = problem.slack(lam)
     c = problem.cones
+    if (c.apart_rows >= 0).any() or c.has_round or c.has_ellipse:
+        raise InputError("siconos_error has no spin rows, and no boxes or ellipses: its friction is a disk")
+    own: dict[int, list[tuple[slice, float]]] = {}
+    reach, contact = c.reach, c.is_contact
+    for i, rows in c.parts():
+        at = slice(int(rows[0] - c.ptr[i]), int(rows[-1] - c.ptr[i]) + 1)
+        own.setdefault(i, []).append((at, float(reach[rows[0]])))
     out = np.empty(problem.m)
     for i in range(c.n_blocks):
         s = slice(c.ptr[i], c.ptr[i + 1])
-        if c.kind[i] == ROW:
+        if not contact[i]:
             out[s] = lam[s] - np.clip(lam[s] - u[s], c.lower[s], c.upper[s])
             continue
-        if c.apart_rows[i] >= 0 or c.kind[i] in (ROUND, CONTACT_ELLIPSE):
-            raise InputError(
-                "siconos_error has no spin rows, and no boxes or ellipses: its friction is a disk"
-            )
-        z = lam[s] - u[s]
-        parts = [(slice(1, 1 + int(c.n_tangents[i])), float(c.mu[i]))]
-        if c.rolling_rows[i] >= 0:
-            parts.append((slice(3, 5), float(c.rolling[i])))
+        z, parts = lam[s] - u[s], own.get(i, [])
         z[0] -= sum(a * float(np.linalg.norm(u[s][at])) for at, a in parts)
         out[s] = lam[s] - _project_unit_cone(z, parts)
     total, q, r, v = (float(np.linalg.norm(x)) for x in (out, problem.b, lam, u))

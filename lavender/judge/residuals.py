@@ -391,18 +391,10 @@ def unstretched(problem: Problem, found: Residual) -> Residual:
 def _in_float32(problem: Problem, found: Residual, impulse: FloatArray) -> Residual:
     """The same error beside the floor of float32."""
     with np.errstate(over="ignore", invalid="ignore"):  # an impulse that is not finite has no floor
-        squares = rounded(problem, impulse)
-        parts = [_relative_size(problem, x) for x in squares]
-        floor = _relative_size(problem, sum(squares))
+        own, data, velocities = rounded(problem, impulse)
+        squares = own, data, velocities, own + data + velocities
+    *parts, floor = (measure.size_of_square(problem.metric, x) for x in squares)
     return replace(found, precision="float32", floor=floor, rounding=Rounding(*parts))
-
-
-def _relative_size(problem: Problem, square: Any) -> float:
-    """Changes of w in the judge's two norms, relative; their squares (m,) given."""
-    d = problem.d
-    energy = float(np.sqrt(np.sum(square / d)))
-    velocity = float(np.max(problem.metric.weight * np.sqrt(square) / d, initial=0.0))
-    return float(relative_of(problem.metric, energy, velocity))
 
 
 def rounded(problem: Problem, impulse: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

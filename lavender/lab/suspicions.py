@@ -30,7 +30,6 @@ from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import residual
 from lavender.problem import Problem, check_problem
-from lavender.problem.cones import ROUND, ROW
 from lavender.problem.rows import Rows
 from lavender.solvers.certify import conflict_of
 
@@ -147,7 +146,7 @@ def _keys(p: Problem) -> Iterator[Suspicion]:
 def _order(p: Problem) -> Iterator[Suspicion]:
     # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
     c = p.cones
-    full = np.flatnonzero((c.kind != ROUND) & (c.n_tangents == 2))
+    full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
@@ -175,7 +174,7 @@ def _order(p: Problem) -> Iterator[Suspicion]:
 def _twins(p: Problem) -> Iterator[Suspicion]:
     # Blocks of the same rows, or of opposed ones that cannot both hold.
     c = p.cones
-    contacts = np.flatnonzero(c.kind != ROW)
+    contacts = np.flatnonzero(c.is_contact)
     if p.rows is not None or len(contacts) < 2:
         return
     a = p.csr if p.generalized is None else p.generalized.jac
@@ -241,7 +240,7 @@ def _motion(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
 def _targets(p: Problem) -> Iterator[Suspicion]:
     c = p.cones
     motion = _motion(p)
-    contact = c.kind != ROW
+    contact = c.is_contact
     if motion is None or not contact.any():
         return
     u, target, _ = motion
@@ -283,7 +282,7 @@ def _targets(p: Problem) -> Iterator[Suspicion]:
 
 def _speeds(p: Problem) -> Iterator[Suspicion]:
     motion, r = _motion(p), _bodies(p)
-    contact = np.flatnonzero(p.cones.kind != ROW)
+    contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
     if r is not None and np.any(r.inv_mass > 0.0):
@@ -313,9 +312,7 @@ def _above(p: Problem) -> Iterator[Suspicion]:
     toward = np.where(r.contact_body[still, 1:] < 0, -1.0, 1.0) * r.normal[still] @ fall[:, None] / size
     if toward.mean() > 0.3 and (toward > -0.1).mean() > 0.9:
         reason = "what stands still pushes bodies the way they fall: are normals flipped, or bodies swapped?"
-        yield _of(
-            p, "normals", reason, np.flatnonzero(p.cones.kind != ROW)[still], along=float(toward.mean())
-        )
+        yield _of(p, "normals", reason, np.flatnonzero(p.cones.is_contact)[still], along=float(toward.mean()))
 
 
 def _conflict(p: Problem) -> Iterator[Suspicion]:
@@ -355,14 +352,14 @@ def _state(
     if gap is not None:
         if dt is None:
             raise InputError("gap [m] is held to targets [m/s] by the step: give dt [s] too")
-        gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.kind != ROW)),), unit="m")
+        gap = as_array("gap", gap, (int(np.count_nonzero(p.cones.is_contact)),), unit="m")
     return velocity, gap, 0.0 if dt is None else number("dt [s]", dt, above=0.0)
 
 
 def _stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicion]:
     # v* = v + dt a; the target of a normal is -gap/dt, or a share of it where surfaces overlap
     motion = None if velocity is None and gap is None else _motion(p)
-    contact = np.flatnonzero(p.cones.kind != ROW)
+    contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
     normal = p.cones.normal_rows
@@ -407,7 +404,7 @@ def _stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspici
 def _bodies(p: Problem) -> Rows | None:
     """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
     g, c = p.generalized, p.cones
-    contact = c.kind != ROW
+    contact = c.is_contact
     if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
         return p.rows
     mass, part = g.mass.toarray(), g.jac.toarray()[c.ptr[:-1][contact][:, None] + np.arange(3)]
@@ -445,7 +442,7 @@ def _geometry(p: Problem) -> Iterator[Suspicion]:
     r = _bodies(p)
     if r is None or not r.n_contacts:
         return
-    blocks = np.flatnonzero(p.cones.kind != ROW)
+    blocks = np.flatnonzero(p.cones.is_contact)
     a, b = r.contact_body.T
     reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
     size = reach.sum(axis=0)
@@ -637,7 +634,7 @@ def _free(mass: FloatArray) -> list[int]:
 def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
     """Most contacts that move a free body do so by three orthogonal unit vectors."""
     c = p.cones
-    first = c.ptr[:-1][(c.kind != ROW) & (np.diff(c.ptr) == 3)]
+    first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
     eye = np.eye(3)
     for j in free:
         parts = [jac[i : i + 3][:, j : j + 3].toarray() for i in first]

@@ -6,7 +6,7 @@
 Even worlds are chosen on, odd ones held back. Each world is cut into stretches of `ahead` steps of a run with the
 settings that the model has. From the start of each, a setting makes its own steps, warm from its own answers:
 
-    time    of mj_step, over all steps [s]: the least of several rounds, in which all settings take turns
+    time    of mj_step, the mean of all steps [s], of each the least of several rounds, in which settings take turns
     error   of the engine's answer to the problem of each step, by the judge [m/s]
     motion  how far the body that is furthest off is, after `ahead` steps, from where the converged run has it [m]
 
@@ -46,6 +46,7 @@ __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
 WORST = 0.99  # quantile of the error by which settings are compared
 EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
 SLOW = 2.0  # times the time now, above which a setting is timed no more
+TRIAL = 2  # rounds after which settings near the front are varied
 NEAR = 1.5  # times the time now, up to which settings of the front are varied
 TOLERANCES = (1e-3, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-15)
 ITERATIONS = {"Newton": (1, 2, 3, 5, 10), "CG": (3, 6, 12, 25, 50), "PGS": (3, 6, 12, 25, 50, 100)}
@@ -119,7 +120,14 @@ class Measured:
     solver: str
     error: FloatArray = field(repr=False)  # (steps,) m/s
     motion: FloatArray = field(repr=False)  # (stretches,) m
-    time: float = np.inf  # s, of a step
+    times: FloatArray = field(
+        repr=False
+    )  # (steps,) s, each the least of all rounds: what interrupts one is no part of it
+
+    @property
+    def time(self) -> float:
+        """Of a step [s]; infinite where it was not timed."""
+        return float(self.times.mean())
 
     @property
     def worst(self) -> float:
@@ -158,11 +166,12 @@ class Stage:
             raise InputError(f"{runs.model}: MuJoCo ends in an error, {error}") from None
         return made
 
-    def run(self, model: Any, states: FloatArray | None = None) -> tuple[float, FloatArray]:
-        """Seconds of a step, and places of bodies after each stretch (n, bodies, 3) [m]; states before each step."""
+    def run(self, model: Any, states: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Seconds of each step, and places of bodies after each stretch (n, bodies, 3) [m]; states before each step."""
         mj, kind = self.mj, self.mj.mjtState.mjSTATE_INTEGRATION
-        data, spent = mj.MjData(model), 0.0
+        data = mj.MjData(model)
         n, ahead, _ = self.controls.shape
+        spent = np.empty(n * ahead)
         ends = np.empty((n, model.nbody, 3))
         for i in range(n):
             mj.mj_setState(model, data, self.starts[i], kind)
@@ -172,15 +181,16 @@ class Stage:
                     mj.mj_getState(model, data, states[ahead * i + k], kind)
                 begin = perf_counter()
                 mj.mj_step(model, data)
-                spent += perf_counter() - begin
+                spent[ahead * i + k] = perf_counter() - begin
             mj.mj_kinematics(model, data)
             ends[i] = np.nan if flew_apart(mj, data) else data.xpos
-        return spent / (n * ahead), ends
+        return spent, ends
 
     def measured(self, setting: Setting) -> Measured:
         """A setting judged, not timed yet; its errors are infinite where a world flies apart."""
         mj, model = self.mj, setting.on(self.mj, self.model)
-        apart = Measured(setting, str(_word(mj, model, "solver")), np.full(1, np.inf), np.full(1, np.inf))
+        never = np.full(1, np.inf)
+        apart = Measured(setting, str(_word(mj, model, "solver")), never, never, never)
         states = np.empty((self.controls.shape[0] * self.controls.shape[1], self.starts.shape[1]))
         judge = copy.copy(model)
         judge.opt.noslip_iterations = 0
@@ -198,7 +208,7 @@ class Stage:
         return replace(apart, error=np.nan_to_num(np.concatenate(errors), nan=np.inf), motion=off)
 
     def time(self, some: list[Measured], rounds: int, tell: Callable[[str], None]) -> None:
-        """The least of several rounds in which all take turns, the first of them the model's own setting.
+        """Steps of several rounds in which all take turns, the first of them the model's own setting.
 
         Worlds that fly apart tell no time.
         """
@@ -206,8 +216,9 @@ class Stage:
         models = [m.setting.on(self.mj, self.model) for m in some]
         for turn in range(rounds):
             for m, model in zip(some, models, strict=True):
-                if turn == 0 or m.time <= SLOW * some[0].time:
-                    m.time = min(m.time, self.run(model)[0])
+                # Medians: one step that was interrupted in the first round says nothing of a setting.
+                if turn == 0 or np.median(m.times) <= SLOW * np.median(some[0].times):
+                    m.times = np.minimum(m.times, self.run(model)[0])
                     tell("timed")
 
 
@@ -459,7 +470,7 @@ def tune(
         if not np.isfinite(measured[0].error).all():
             raise InputError(f"{runs.model}: these worlds fly apart with the model's own setting")
         measured += judge(stage, grid(mj, made)[1:])
-        stage.time(measured, 1, tell)
+        stage.time(measured, min(TRIAL, rounds), tell)
         near = [m.setting for m in found(False).front if m.time <= NEAR * measured[0].time]
         known = {m.setting for m in measured}
         more = dict.fromkeys(x for s in [Setting(), *near] for x in around(mj, made, s) if x not in known)

@@ -12,7 +12,6 @@ from lavender.base.errors import InputError
 from lavender.out.header import constants, struct_fields
 from lavender.out.library import HEADER
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT_ROLLING, ROUND, ROW
 from lavender.solvers import registry
 
 __all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "takes", "view"]
@@ -73,7 +72,7 @@ def view(problem: Problem) -> View:
         Ellipses; generalised velocities in an order of lavender's own.
     """
     c = problem.cones
-    if max(c.kind, default=0) > CONTACT_ROLLING:
+    if c.has_ellipse:
         raise NotTaken("the library has no ellipses: give it the same in longer rows, `problem.disk`")
     arrays: dict[str, Any] = dict.fromkeys(ARRAYS)
     arrays |= {"block_ptr": c.ptr, "kind": c.kind, "lower": c.lower, "upper": c.upper, "mu": c.mu}
@@ -110,13 +109,12 @@ def view(problem: Problem) -> View:
 def takes(problem: Problem, solver: str) -> bool:
     """Whether the library's method takes a problem that the package's solver takes, as `lav_takes` says it."""
     form = 2 if problem.rows is not None else 3 if problem.generalized is not None else 1
-    kinds = set(problem.cones.kind.tolist())
+    c = problem.cones
     if form not in FORMS.get(solver, (1, 2, 3)):
         return False
     if solver in ("direct", "lemke"):
-        c = problem.cones
-        return not np.any((c.kind != ROW) & (np.diff(c.ptr) > 1))
-    return solver != "newton" or form == 3 or not kinds & {ROUND, CONTACT_ROLLING}
+        return not np.any(c.is_contact & (np.diff(c.ptr) > 1))
+    return solver != "newton" or form == 3 or not (c.has_round or c.has_more_parts)
 
 
 def choices(solver: str, options: Mapping[str, Any]) -> tuple[tuple[int, ...], float]:

@@ -38,6 +38,8 @@ class Batch(Sequence[Problem]):
     J : (n, m, nv), or ragged (rows of all worlds, nv), or of worlds of several nv one array of all entries
         Rows in the order of the cones.
     M : (n, nv, nv), or (nv, nv) of all; or one array of all entries
+        Or lower triangles in compressed rows of one pattern, as MuJoCo holds them: (values (n, entries), indices,
+        indptr), columns ascending in each row and the diagonal last.
     v_free : (n, nv), or one array (with `velocity_ptr`), m/s, rad/s
     target : scalar, (m,), (n, m), or ragged one array of all rows, m/s
     cones : Cones, or a sequence of n of them
@@ -93,7 +95,8 @@ class Batch(Sequence[Problem]):
     ) -> None:
         if friction not in FRICTION:
             raise InputError(f"friction is {friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
-        jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", M), ("v_free", v_free)))
+        values, *pattern = M if isinstance(M, tuple) else (M,)
+        jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
             rows = _pointers("row_ptr", row_ptr)
             if jac.ndim == 2 and velocity_ptr is None:
@@ -128,11 +131,16 @@ class Batch(Sequence[Problem]):
         at[:, PLACE["rows"]], at[:, PLACE["velocities"]] = sizes, nvs
         at[:, PLACE["row"]], at[:, PLACE["velocity"]] = rows[:-1], velocities[:-1]
         self._place_cones(cones)
-        if room is not None and mass.ndim == 2:
+        self._pattern = _triangle(pattern, nvs, mass) if pattern else None
+        if room is not None and mass.ndim == 2 and not pattern:
             mass = np.broadcast_to(mass, (n, *mass.shape))
         square = (None, None) if room is None else ((room, nv), (nv, nv))
         jac, at[:, PLACE["jac"]], self._jac_row = _matrices("J", jac, n, square[0], sizes * nvs)
-        mass, at[:, PLACE["mass"]], self._mass_row = _matrices("M", mass, n, square[1], nvs * nvs)
+        if self._pattern is None:
+            mass, at[:, PLACE["mass"]], self._mass_row = _matrices("M", mass, n, square[1], nvs * nvs)
+        else:
+            entries = len(self._pattern[1])
+            (mass, at[:, PLACE["mass"]]), self._mass_row = _vectors("M", mass, n, entries, None), 0
         free, at[:, PLACE["free"]] = _vectors("v_free", free, n, nv if room is not None else None, nvs)
         goal, at[:, PLACE["target"]] = _vectors("target", target, n, room, sizes)
         soft, at[:, PLACE["soft"]] = _vectors(
@@ -309,6 +317,11 @@ class Batch(Sequence[Problem]):
         first = int(place[PLACE[("jac", "mass", "free", "target", "soft", "mu")[which]]])
         if array is None:
             return None
+        if which == 1 and self._pattern is not None:
+            ptr, col = self._pattern
+            row, whole = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
+            whole[row, col] = whole[col, row] = array[first : first + len(col)]
+            return whole
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
             size = array.itemsize
@@ -341,6 +354,7 @@ class Batch(Sequence[Problem]):
             made.of_arrays(
                 self._arrays,
                 (self._jac_row, self._mass_row),
+                self._pattern,
                 self.cones._blocks,
                 LAWS[self.friction],
                 allowed,
@@ -380,6 +394,31 @@ def _pointers(name: str, given: Any) -> np.ndarray:
     if not len(ptr) or ptr[0] != 0 or (np.diff(ptr) < 0).any():
         raise InputError(f"{name} must start with 0 and not fall: the first of each world, then their number")
     return ptr
+
+
+def _triangle(given: Sequence[Any], nvs: Any, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(indptr, indices) of lower triangles that worlds of nvs velocities share, from (indices, indptr)."""
+    if len(given) != 2:
+        raise InputError(f"M is a tuple of {1 + len(given)}; (values, indices, indptr) is needed")
+    col, ptr = (
+        as_array(name, x, (None,), dtype=np.int32)
+        for name, x in zip(("indices of M", "indptr of M"), given, strict=True)
+    )
+    nv = len(ptr) - 1
+    row = np.repeat(np.arange(nv), np.maximum(np.diff(ptr), 0))
+    sound = nv >= 0 and ptr[:1] == 0 and (np.diff(ptr) > 0).all() and len(row) == len(col)
+    if (
+        not sound
+        or (col[ptr[1:] - 1] != np.arange(nv)).any()
+        or not (np.diff(col)[np.diff(row) == 0] > 0).all()
+    ):
+        raise InputError("M's rows must ascend to a last entry on the diagonal; lower triangles are needed")
+    if (nvs != nv).any() or values.ndim != 2 or values.shape[1] != len(col):
+        raise InputError(
+            f"M has values of shape {values.shape} for {len(col)} entries of {nv} velocities; (worlds, entries), and "
+            f"one number of velocities in all worlds, are needed"
+        )
+    return ptr, col
 
 
 def _counts(given: Any, n: int, room: int) -> np.ndarray:

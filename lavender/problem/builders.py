@@ -10,7 +10,7 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
 from lavender.base.errors import InputError
-from lavender.problem.cones import CONTACT, CONTACT_ROLLING, CONTACT_SPIN, Cones, check_shape
+from lavender.problem.cones import Cones, check_shape, kinds_of
 from lavender.problem.data import checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
 from lavender.problem.generalized import Generalized
@@ -471,7 +471,7 @@ def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: An
             f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
         )
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
-    kind = np.full(c, CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT, np.int32)
+    kind = kinds_of(np.ones(c, bool), spin=spin, rolls=rolls)
     free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)
     cones = Cones(
         ptr=ptr, kind=kind, lower=-free, upper=free, mu=mu,

@@ -51,6 +51,7 @@ __all__ = [
     "SHAPES",
     "Cones",
     "check_shape",
+    "kinds_of",
     "project",
 ]
 
@@ -321,6 +322,11 @@ class Cones:
         return len(self.lower)
 
     @property
+    def is_contact(self) -> npt.NDArray[np.bool_]:
+        """(k,) whether a block is a contact: a normal and what it bounds; else it is bounded rows."""
+        return np.asarray(self.kind != ROW)
+
+    @property
     def is_free(self) -> bool:
         """Every row is unbounded."""
         return bool(self._blocks.is_free)
@@ -341,9 +347,24 @@ class Cones:
         return bool(self._blocks.has_rolling)
 
     @property
+    def has_more_parts(self) -> bool:
+        """Some contact has more than tangents and a row that spins, each with a bound of its own."""
+        return self.has_rolling
+
+    @property
+    def is_box(self) -> npt.NDArray[np.bool_]:
+        """(k,) whether a contact bounds each of its two tangents by itself."""
+        return np.asarray(self.kind == CONTACT_BOX)
+
+    @property
     def has_box(self) -> bool:
         """Some contact bounds each of its two tangents by itself."""
-        return bool((self.kind == CONTACT_BOX).any())
+        return bool(self.is_box.any())
+
+    @property
+    def is_ellipse(self) -> npt.NDArray[np.bool_]:
+        """(k,) whether a contact bounds its two tangents by an ellipse."""
+        return np.asarray(self.kind == CONTACT_ELLIPSE)
 
     @property
     def has_ellipse(self) -> bool:
@@ -479,6 +500,21 @@ class Cones:
             if rolling[i] >= 0:
                 yield i, np.arange(rolling[i], rolling[i] + 2)
 
+    def take(self, blocks: IntArray) -> Cones:
+        """These blocks, by number, in this order."""
+        size = np.diff(self.ptr)[blocks]
+        ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
+        rows = np.arange(ptr[-1]) + np.repeat(self.ptr[:-1][blocks] - ptr[:-1], size)
+        return Cones(
+            ptr=ptr,
+            kind=self.kind[blocks],
+            lower=self.lower[rows],
+            upper=self.upper[rows],
+            mu=self.mu[blocks],
+            patch_radius=self.patch_radius[blocks],
+            rolling=self.rolling[blocks],
+        )
+
     def __add__(self, other: object) -> Cones:
         """These blocks, then those of `other`."""
         if not isinstance(other, Cones):
@@ -498,6 +534,24 @@ class Cones:
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
         return type(self), self._blocks.arrays
+
+
+def kinds_of(
+    contact: Any, *, tangents: Any = 0, sides: Any = False, spin: Any = False, rolls: Any = False
+) -> IntArray:
+    """The kind of each block (k,), by what it is: bounded rows where it is no contact.
+
+    Parameters
+    ----------
+    contact : (k,) bool
+    tangents : int or (k,) int
+        In one cone; more than two make a round one.
+    sides, spin, rolls : bool or (k,) bool
+        Bounds each of two tangents by itself; has a spin row; has two that roll.
+    """
+    kind = np.where(np.asarray(spin), CONTACT_SPIN, np.where(np.asarray(tangents) > 2, ROUND, CONTACT))
+    kind = np.where(sides, CONTACT_BOX, np.where(rolls, CONTACT_ROLLING, kind))
+    return np.where(contact, kind, ROW).astype(np.int32)
 
 
 def _sizes(name: str, value: Any, k: int, unit: str = "") -> FloatArray:

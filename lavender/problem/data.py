@@ -23,7 +23,7 @@ from lavender.base.arrays import (
 )
 from lavender.base.errors import InputError
 from lavender.base.later import issparse
-from lavender.problem.cones import ROUND, ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
@@ -163,16 +163,11 @@ class ProblemData:
         kj = rows.n_joints
         if kj + rows.n_contacts == k and are_joints_then_contacts(self.cones._blocks, rows.joint_ptr):
             return
-        kind = self.cones.kind
-        if (
-            kj + rows.n_contacts != k
-            or np.any(kind[:kj] != ROW)
-            or np.any(kind[kj:] == ROW)
-            or self.cones.has_round
-        ):
+        contact = self.cones.is_contact
+        if kj + rows.n_contacts != k or contact[:kj].any() or not contact[kj:].all() or self.cones.has_round:
             raise InputError(
-                f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many ROW "
-                f"blocks, then contacts (it has {k} blocks)"
+                f"rows has {kj} joints and {rows.n_contacts} contacts; cones must have as many blocks "
+                f"of bounded rows, then contacts (it has {k} blocks)"
             )
         if not np.array_equal(self.cones.ptr[: kj + 1], rows.joint_ptr):
             raise InputError("cones.ptr and rows.joint_ptr disagree about the rows of the joints")
@@ -245,18 +240,18 @@ class ProblemData:
         """
         row = whole_number("row", row, high=self.m - 1)
         i = self.block_of(row)
-        offset, size, kind = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i]), self.cones.kind[i]
+        offset, size = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i])
         spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]
-        if kind == ROW:
+        if not self.cones.is_contact[i]:
             name = self.names[i] if self.names else f"row {row}" if size == 1 else f"joint {i}"
             return name if size == 1 else f"{name}, axis {offset}"
         first_contact = 0 if self.rows is None else self.rows.n_joints
         if self.generalized is not None:
-            first_contact = int(np.count_nonzero(self.cones.kind[:i] == ROW))
+            first_contact = i - int(np.count_nonzero(self.cones.is_contact[:i]))
         name = self.names[i] if self.names else f"contact {i - first_contact}"
         if offset == 0:
             return f"{name}, normal"
-        if kind == ROUND and offset > 2:
+        if self.cones.n_together[i] > 2 and offset > 2:
             return f"{name}, spin" if offset == 3 else f"{name}, roll {offset - 3}"
         if 0 <= roll <= row:
             return f"{name}, roll {row - roll + 1}"
@@ -290,7 +285,7 @@ class ProblemData:
 
     def _repr_html_(self) -> str:
         """For notebooks: what it is, as a small table."""
-        contacts = int(np.count_nonzero(self.cones.kind != ROW))
+        contacts = int(np.count_nonzero(self.cones.is_contact))
         facts = {
             "law": self.law,
             "rows": self.m,

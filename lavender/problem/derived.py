@@ -42,7 +42,8 @@ class Derived:
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
-        self.vain: tuple[str, float, bytes] | None = None  # whose one compiled call did not end, from where
+        # Whose one compiled call did not end, from where, and what it did.
+        self.vain: tuple[str, float, bytes, tuple[int, ...]] | None = None
         self.motion: Any = None  # `Kept` of lavender.lab.motion: the reference of motion errors, its operator
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, as_array
 from lavender.base.errors import InputError
-from lavender.problem.cones import CONTACT, CONTACT_BOX, ROW, Cones
+from lavender.problem.cones import Cones, kinds_of
 
 __all__ = ["arrays_of", "blocks_of", "order_of"]
 
@@ -83,16 +83,14 @@ def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Co
     for column in (0, 1):
         has = np.flatnonzero(size > 1 + column)
         mu[has, column] = high[order[ptr[has] + 1 + column]]
-    kind = np.array([ROW, CONTACT, CONTACT_BOX], np.int32)[size - 1]
-    box = Cones.contacts(mu, shape="box")
-    radius = np.where(kind == CONTACT_BOX, box.patch_radius, 0.0)
+    box, sides = Cones.contacts(mu, shape="box"), size == 3
     return order, Cones(
         ptr=ptr,
-        kind=kind,
+        kind=kinds_of(size > 1, sides=sides),
         lower=low[order],
         upper=high[order],
-        mu=np.where(kind == CONTACT_BOX, box.mu, mu[:, 0]),
-        patch_radius=radius,
+        mu=np.where(sides, box.mu, mu[:, 0]),
+        patch_radius=np.where(sides, box.patch_radius, 0.0),
     )
 
 
@@ -106,14 +104,10 @@ def arrays_of(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
         )
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)
-    sides = cones.coefficients
-    for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
-        j, end = cones.ptr[i], cones.ptr[i + 1]
-        upper[j + 1 : end] = sides[i, 0]
-        if cones.apart_rows[i] >= 0:
-            upper[end - 1] = (
-                sides[i, 1] if cones.kind[i] == CONTACT_BOX else cones.mu[i] * cones.patch_radius[i]
-            )
-        lower[j + 1 : end] = -upper[j + 1 : end]
-        findex[j + 1 : end] = j
+    rows, reach = np.flatnonzero(cones.friction_rows), cones.reach
+    first = cones.ptr[:-1][cones.is_box] + 1
+    reach[first] = cones.coefficients[cones.is_box, 0]  # of a side without friction 0
+    upper[rows] = reach[rows]
+    lower[rows] = -reach[rows]
+    findex[rows] = np.repeat(cones.ptr[:-1], np.diff(cones.ptr))[rows]
     return lower, upper, findex

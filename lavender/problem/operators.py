@@ -213,7 +213,7 @@ class Operators(ProblemData):
         """(m,) 1/kg: diagonal of A with fallbacks, the judge's metric."""
         return self.metric.d
 
-    @property
+    @once
     def vanished_rows(self) -> IntArray:
         """Rows with A_ii = 0 only because products of small numbers vanish: J_i has an entry where M^-1 has one."""
         empty: IntArray = self.metric.empty

@@ -13,7 +13,7 @@ from lavender.base.errors import InputError
 from lavender.base.later import above
 from lavender.base.later import sparse as sp
 from lavender.problem.builders import Builders
-from lavender.problem.cones import ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.problem.derived import once
 from lavender.problem.generalized import Generalized
 
@@ -214,9 +214,7 @@ class Problem(Builders):
         """
         c = self.cones
         load = np.zeros(c.n_blocks)
-        load[c.kind != ROW] = n = as_array(
-            "normal_impulse", normal_impulse, (len(c.normal_rows),), unit="N s"
-        )
+        load[c.is_contact] = n = as_array("normal_impulse", normal_impulse, (len(c.normal_rows),), unit="N s")
         check_not_negative("normal_impulse", n)
         with np.errstate(over="ignore"):
             bound = as_array("mu N", c.reach * np.repeat(load, np.diff(c.ptr)), (self.m,), unit="N s")

@@ -327,7 +327,7 @@ SPEC = SolverSpec(
     laws=frozenset({"linear", "lcp", "coulomb", "cone"}),
     boxes=frozenset({"coulomb", "cone"}),
     round_cones=True,
-    rolling=True,
+    parts=True,
     max_iter=2000,
     options={
         "memory": "iterations that Anderson mixing combines, 0 (none) to 16; default 10",

@@ -38,7 +38,7 @@ SPEC = SolverSpec(
     operators=frozenset({"rows", "matrix", "generalized"}),
     order=True,
     seed=True,
-    rolling=True,
+    parts=True,
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,

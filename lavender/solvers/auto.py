@@ -1,13 +1,12 @@
 """Chooses and combines other solvers: this tree, by two counted costs (`costs.py`).
 
     the start is a solution     nothing is done
-    a small problem             at most 64 rows, or small islands under friction, or cheap velocities: one compiled call
-                                (`small.py`); if that does not solve it, as any other
-    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for twice the factorisations
-                                that `newton` is counted for
-    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it; not
-                                where 100 sweeps cost more
-    a loose pile of bodies      sweeps of the convex relaxation, then a few iterations of `nncg`
+    a small problem             at most 64 rows, or small islands under friction, or velocities that cost less than 100
+                                sweeps: one compiled call (`small.py`); if that does not solve it, as any other
+    a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
+                                factorisations that `newton` is counted for
+    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it
+    a loose pile of bodies      that do not roll: sweeps of the convex relaxation, then a few iterations of `nncg`
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
     all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`; all together LAST times
@@ -24,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -47,7 +46,7 @@ from lavender_ext.factor import graph
 
 SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
-ROUNDS = 2.0  # times the factorisations that Newton's method is counted for, that `direct` has
+ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
@@ -75,6 +74,8 @@ class Tree:
     """What `auto` does with a problem, line by line, and the costs that it compares [ns]."""
 
     begun = 0.0  # ns, of sweeps before Newton's method
+    left = 0.0  # ns, for turns; who takes the lines gives back what did not run
+    tried = False  # velocities of J and M, in the compiled call
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
@@ -105,13 +106,18 @@ class Tree:
                 found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
             except BREAKDOWN:
                 continue
-        return dict(sorted(found.items(), key=lambda pair: pair[1].cost))
+        return dict(sorted(found.items(), key=self._order))
+
+    def _order(self, named: tuple[str, NewtonState]) -> tuple[bool, float]:
+        # The cheaper first; last what has failed.
+        return self.tried and named[1].general is not None, named[1].cost
 
     def _rows_may_pay(self, over: NewtonState | None) -> bool:
-        """Whether rows of an A that is formed of J and M are counted to cost less than velocities, at least."""
+        """Whether rows of an A that is formed of J and M are counted to cost less than what velocities still have."""
         if over is None or over.general is None or self.problem.cones.has_round:
             return False
-        return costs.newton_cost(costs.formed(self.problem), self.law) < over.cost
+        left = MOST if self.tried else 1.0
+        return costs.newton_cost(costs.formed(self.problem), self.law) < left * over.cost
 
     def _forms_late(self) -> bool:
         """Rows of an A of J and M are not there in time, with what of SciPy reads them."""
@@ -163,9 +169,11 @@ class Tree:
 
     @property
     def is_loose(self) -> bool:
-        """Bodies under Coulomb's law, nearly each contact between another pair: sweeps then decide what sticks."""
+        """Bodies under Coulomb's law that do not roll, nearly each contact between another pair: sweeps then decide
+        what sticks.
+        """
         rows = self.problem.rows
-        if rows is None or not rows.n_bodies or self.law != "coulomb":
+        if rows is None or not rows.n_bodies or self.law != "coulomb" or self.problem.cones.has_rolling:
             return False
         return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
 
@@ -178,7 +186,10 @@ class Tree:
         if self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
             yield Stage(
-                "direct", n, self.least, "bounded rows of a narrow band: twice newton's factorisations"
+                "direct",
+                n,
+                self.least,
+                f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations",
             )
         yield from self.sweeps_first(self.least)
         if self.is_loose:
@@ -190,13 +201,14 @@ class Tree:
         # What follows where these fail has its line here.
         self.add_rows()
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
-        spent = self.begun + MOST * unit
+        self.left = (LAST - MOST) * unit - self.begun
         for k in range(TURNS):
             for stage in self.in_turn(2.0**k):
-                spent += stage.cost
-                if spent > LAST * unit:
+                if self.left <= 0.0:
                     return
-                yield stage
+                share = min(1.0, self.left / stage.cost)
+                self.left -= share * stage.cost
+                yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
 
     def factorisations(self, times: float) -> Iterator[Stage]:
         """Newton's method for so many times its counted cost."""
@@ -209,7 +221,7 @@ class Tree:
         cost, short = SHARE * newton - self.begun, self.is_short(newton)
         if short and not self.begun:
             cost = max(cost, 0.5 * self.deadline.nanoseconds())
-        pays = short or self.is_loose or costs.SWEEPS * self.sweep <= newton
+        pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", newton)
@@ -257,18 +269,20 @@ class Auto:
         self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
     ) -> Claim:
         problem, state.log = state.problem, None
-        deadline = Deadline(time_limit)
+        deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
         if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
-            made = AUTO.solve(problem, impulse, tol, share * deadline.nanoseconds())
-            if made is not None and made[0].relative <= tol:
-                claim = AUTO.claim(problem, made[1], impulse, made[0].relative)
+            found, counts = AUTO.attempt(problem, impulse, tol, share * deadline.nanoseconds())
+            if found is not None and found.relative <= tol:
+                claim = AUTO.claim(problem, counts, impulse, found.relative)
                 if claim.iterations <= max_iter:
-                    impulse[:] = made[0].impulse
+                    impulse[:] = found.impulse
                     return claim
+            failed = AUTO.failed(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
         tree, sweeps = Tree(problem, deadline), None
+        tree.tried = bool(failed) and problem.generalized is not None
         if deadline.is_set and not problem.cones.has_round:
             if deadline.passed(sweeping(problem)):
                 return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
@@ -282,6 +296,8 @@ class Auto:
         state.log = log
         try:
             if max_iter > 0 and log.best > tol and not log.done():
+                for name, claim in failed:
+                    log.note(name, claim, log.best)
                 solve(log, tree, sweeps)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
@@ -309,8 +325,10 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         return
     steps: dict[str, Step] = {}
     idle = 0  # lines in a row that had nothing to do
-    for stage in tree:
-        if log.done() or idle > len(METHODS):
+    lines = iter(tree)
+    while not log.done() and idle <= len(METHODS):  # before the next line counts what it needs
+        stage = next(lines, None)
+        if stage is None:
             break
         step = steps.get(stage.solver)
         if step is None:
@@ -323,7 +341,9 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
                 set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
                 step.over = log.ends_late(set_up + SURE * once(stage))
         idle = idle + 1 if step.over else 0
-        if not step.over:
+        if step.over:
+            tree.left += stage.cost
+        else:
             step.least, step.cost = stage.least, stage.cost
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
@@ -364,7 +384,7 @@ SPEC = SolverSpec(
     boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
-    rolling=True,
+    parts=True,
     small=AUTO,
     resumable=False,
     delegates=True,

@@ -5,9 +5,9 @@
 
 m rows; e multiply-adds of a sweep or entries of A, which one step reads; w multiply-adds of one factorisation and its
 solution, as the solver's own analysis tells them (`NewtonState.count`); n factorisations, by law. Over generalised
-velocities all is compiled: no start, nothing for a row, and n is STEPS times as large. No clock is read: the same
-problem has the same counts on every machine. The twelve rates of `rates.json` are written by
-`python -m benchmarks auto --fit`.
+velocities all is compiled: no start, nothing for a row, and n is STEPS times as large where a row has no compliance and
+not all are bounded. No clock is read: the same problem has the same counts on every machine. The twelve rates of
+`rates.json` are written by `python -m benchmarks auto --fit`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 # By os.path: pathlib would be 4 % of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
     RATES: dict[str, Any] = json.load(_file)
-STEPS = 4.0  # over generalised velocities for each factorisation elsewhere
+STEPS = 4.0  # over generalised velocities for each factorisation elsewhere, if a row is rigid
 SWEEPS = 100.0  # that a problem is counted to take: Newton's method comes first where its cost is less
 
 
@@ -48,6 +48,7 @@ class Count:
     entries: float  # read beside it
     rows: float  # 0 over generalised velocities
     set_up: float = 0.0  # ns, A formed of J and M
+    steps: float = 1.0  # for each factorisation by law
 
 
 def factorisations(law: str) -> float:
@@ -60,8 +61,8 @@ def newton_cost(count: Count, law: str) -> float:
     """(1)."""
     r = RATES
     each = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
-    start, steps = (r["start"], 1.0) if count.rows else (0.0, STEPS)
-    return float(start + count.set_up + steps * factorisations(law) * each)
+    start = r["start"] if count.rows else 0.0
+    return float(start + count.set_up + count.steps * factorisations(law) * each)
 
 
 def least(problem: Problem) -> Count:

@@ -9,7 +9,6 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.problem import Problem
-from lavender.problem.cones import Cones
 from lavender_ext.factor import graph
 
 
@@ -39,18 +38,7 @@ def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
 
 def restrict(problem: Problem, blocks: IntArray, rows: IntArray) -> Problem:
     """The problem of these blocks alone; exact where they are whole islands."""
-    c = problem.cones
-    size = np.diff(c.ptr)[blocks]
-    ptr = np.concatenate([[0], np.cumsum(size)]).astype(np.int32)
-    cones = Cones(
-        ptr=ptr,
-        kind=c.kind[blocks],
-        lower=c.lower[rows],
-        upper=c.upper[rows],
-        mu=c.mu[blocks],
-        patch_radius=c.patch_radius[blocks],
-        rolling=c.rolling[blocks],
-    )
+    cones = problem.cones.take(blocks)
     names = None if problem.names is None else [problem.names[i] for i in blocks]
     more: dict[str, Any] = {"friction": problem.friction, "names": names, "name": problem.name}
     b: FloatArray = problem.b[rows]

@@ -71,7 +71,8 @@ class NewtonState:
         problem, system = self.problem, self.system
         read = float(problem.metric.work)
         if self.general is not None:
-            return Count("velocities", self.general.work, read, 0.0)
+            steps = 1.0 if problem.law == "lcp" or self.general.soft else STEPS
+            return Count("velocities", self.general.work, read, 0.0, steps=steps)
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
@@ -88,8 +89,8 @@ class NewtonState:
     @property
     def steps(self) -> float:
         """Iterations that it is counted to take: over velocities each is one of an island."""
-        steps = 1.0 if self.general is None else STEPS * max(1, self.general.islands)
-        return factorisations(self.problem.law) * steps
+        islands = 1 if self.general is None else max(1, self.general.islands)
+        return factorisations(self.problem.law) * self.count.steps * islands
 
     @property
     def cost(self) -> float:
@@ -335,7 +336,7 @@ SPEC = SolverSpec(
     boxes=frozenset({"coulomb", "cone"}),
     operators=frozenset(OPERATORS),
     round_cones=True,
-    rolling=True,
+    parts=True,
     refusal=_refusal,
     small=NEWTON,
     resumable=False,

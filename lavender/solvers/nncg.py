@@ -48,7 +48,7 @@ SPEC = SolverSpec(
     order=True,
     seed=True,
     round_cones=True,
-    rolling=True,
+    parts=True,
     max_iter=1000,
     options={
         "sweep": SWEEP_OPTION,

@@ -28,7 +28,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.problem.cones import ROW, project
+from lavender.problem.cones import project
 
 # Of (1) and (2): times that they have the problem's rows, and s of making them for each of those.
 FEW, ROW_TIME = 3.0, 2e-5
@@ -47,11 +47,11 @@ class AsRows:
     def start(self, impulse: FloatArray) -> FloatArray:
         """Some z (n,) of a feasible impulse (m,), or of the nearest feasible one."""
         c, out = self.problem.cones, []
-        x = project(c, impulse)
+        x, contact = project(c, impulse), c.is_contact
         for i, sides in _blocks(self.problem):
             j = c.ptr[i]
-            if c.kind[i] == ROW or not sides:
-                out += list(x[j : c.ptr[i + 1]] if c.kind[i] == ROW else x[j : j + 1])
+            if not sides:
+                out += list(x[j : j + 1] if contact[i] else x[j : c.ptr[i + 1]])
             elif self.problem.law == "cone":
                 share = [np.divide(x[j + t], s * x[j]) if x[j] > 0.0 else 0.0 for t, s in sides]
                 for signs in product((1.0, -1.0), repeat=len(sides)):
@@ -68,27 +68,23 @@ class AsRows:
 def _blocks(problem: Problem) -> list[tuple[int, list[tuple[int, float]]]]:
     """Blocks, and of each the offset and the c_i of every row that its normal bounds, where c_i > 0."""
     c = problem.cones
-    apart, sides, out = c.apart_rows >= 0, c.mu * c.patch_radius, []
-    for i in range(c.n_blocks):
-        found = []
-        if c.kind[i] != ROW:
-            last = int(c.ptr[i + 1] - c.ptr[i]) - 1
-            bounds = [(t, float(sides[i] if apart[i] and t == last else c.mu[i])) for t in range(1, last + 1)]
-            found = [(t, s) for t, s in bounds if s > 0.0]
-        out.append((i, found))
-    return out
+    reach = c.reach
+    return [
+        (i, [(t, float(reach[j + t])) for t in range(1, end - j) if reach[j + t] > 0.0])
+        for i, (j, end) in enumerate(zip(c.ptr[:-1].tolist(), c.ptr[1:].tolist(), strict=True))
+    ]
 
 
 def as_rows(problem: Problem) -> AsRows:
     """(1) or (2) of a problem without disks."""
-    c, d = problem.cones, problem.d
+    c, d, contact = problem.cones, problem.d, problem.cones.is_contact
     entries: list[tuple[int, int, float]] = []  # of E
     more: list[tuple[int, int, float]] = []  # couplings of s
     low: list[float] = []
     high: list[float] = []
     for i, sides in _blocks(problem):
         j, n = int(c.ptr[i]), len(low)
-        if c.kind[i] == ROW:
+        if not contact[i]:
             size = int(c.ptr[i + 1]) - j
             entries += [(j + k, n + k, 1.0) for k in range(size)]
             low += c.lower[j : j + size].tolist()
@@ -123,9 +119,9 @@ def count_rows(problem: Problem) -> int:
     """Upper bound of the number of rows n of (1) or (2), for a problem without disks."""
     c = problem.cones
     if problem.law == "cone":
-        sides = np.where(c.kind == ROW, 0, np.diff(c.ptr) - 1)
-        return int(np.where(c.kind == ROW, np.diff(c.ptr), 2**sides).sum())
-    return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.kind != ROW].sum()) if problem.law == "coulomb" else 0)
+        sides = np.where(c.is_contact, np.diff(c.ptr) - 1, 0)
+        return int(np.where(c.is_contact, 2**sides, np.diff(c.ptr)).sum())
+    return problem.m + (2 * int((np.diff(c.ptr) - 1)[c.is_contact].sum()) if problem.law == "coulomb" else 0)
 
 
 def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> sp.csr_array:

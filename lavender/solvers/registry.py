@@ -122,7 +122,7 @@ class SolverSpec:
     # itself. A law that is not in `laws` is taken only without disks (by our own solvers as bounded rows:
     # solvers/polyhedral.py).
     boxes: frozenset[str] = frozenset()
-    rolling: bool = False  # takes contacts that resist rolling, each part with a bound of its own
+    parts: bool = False  # takes contacts of more parts than tangents and one row that spins
     external: bool = False  # another project's code solves; its claims are its own
     max_iter: int = 1000  # default budget
     options: Mapping[str, str] = field(default_factory=dict)  # own options: name -> one line
@@ -176,7 +176,7 @@ class SolverSpec:
     @cached_property
     def takes_all(self) -> bool:
         """No problem is refused."""
-        kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.rolling
+        kinds = self.boxes == {"coulomb", "cone"} and self.round_cones and self.parts
         return kinds and self.laws == set(LAWS) and "matrix" in self.operators and self.refusal is None
 
     def refuses(self, problem: Problem) -> str | None:
@@ -208,9 +208,9 @@ class SolverSpec:
                 "takes no round cones (more than two tangents in one): use one of those that do, "
                 "lavender.available(problem) lists them, or give the edges of a pyramid as rows"
             )
-        if problem.cones.has_rolling and not self.rolling:
+        if problem.cones.has_more_parts and not self.parts:
             return (
-                "takes no contacts that resist rolling: use one of those that do, lavender.available(problem) lists "
+                "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
             )
         return self.refusal(problem) if self.refusal is not None else None

@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 START = 5e-5  # s, of each
-ROW, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
+EACH, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
 # s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.
 LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
 # s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
@@ -58,7 +58,7 @@ def formed_once(problem: Problem) -> float:
         entries = PRODUCT * float(problem.metric.products_of_a)
     else:
         entries = FORMED * entries_of(problem)
-    return START + ROW * problem.m + entries
+    return START + EACH * problem.m + entries
 
 
 def loading(*modules: str) -> float:

@@ -9,7 +9,7 @@ solver runs as on any other problem, from the beginning.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from math import inf, nan
 from typing import Any
@@ -20,7 +20,7 @@ from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import judged, reference
 from lavender.judge.solution import Claim, Status, Turn, counted
 from lavender.problem import Problem
-from lavender.solvers.costs import RATES, STEPS, factorisations, sweep_cost
+from lavender.solvers.costs import RATES, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import SMALL_ROWS
@@ -40,13 +40,16 @@ ISLAND = 150
 SWEPT = 32  # the most sweeps of a part before its first factorisation
 QUARTER = 0.25  # of the time left, that islands may take
 SPLIT = 200.0  # ns for each row of what tells islands apart
+TREE = 2e5  # ns, Python's share of two lines of the tree, which one compiled call does without
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
-def limits(most: float) -> Limits:
-    """Limits of the compiled calls over generalised velocities: rates, room, and the most counted cost [ns]."""
-    count = (STEPS * factorisations(law) for law in ("lcp", "coulomb", "cone"))
-    return Limits(np.array([RATES["entry"], RATES["work"]["velocities"], *count, general.ROOM, most]))
+def limits(sweeps: float, most: float = MOST) -> Limits:
+    """Limits of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`."""
+    count = (factorisations(law) for law in ("lcp", "coulomb", "cone"))
+    sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
+    step = RATES["entry"], RATES["work"]["velocities"]
+    return Limits(np.array([*step, *count, STEPS, *sweep, general.ROOM, most]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:
@@ -75,7 +78,7 @@ def prepared(problem: Problem) -> Any:
 def _make(problem: Problem) -> Small | None:
     law, cones, count, label = problem.law, problem.cones, 1, None
     bounded = law in ("linear", "lcp")
-    if cones.has_round or cones.has_rolling:
+    if cones.has_round or cones.has_more_parts:
         return None
     if problem.m > SMALL_ROWS:
         if bounded:
@@ -102,9 +105,10 @@ def who(problem: Problem) -> str:
     """Who solves a problem in the compiled call of `auto`, in words; "" where that is not made."""
     if problem.generalized is not None:
         kernel = general.prepare(problem)
-        limits = AUTO.limits
-        cost = np.inf if kernel is None or limits is None else limits.cost(problem.metric, kernel.work)[0]
-        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= MOST else ""
+        if kernel is None or AUTO.limits is None:
+            return ""
+        cost, most = AUTO.limits.cost(problem.metric, kernel.work)
+        return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= most else ""
     small = prepared(problem)
     if small is None:
         return ""
@@ -129,31 +133,44 @@ class SmallCall:
 
         most: counted cost [ns] at which it ends with what was found by then, above tol.
         """
+        made = self.attempt(problem, impulse, tol, most)
+        return None if made[0] is None else made
+
+    def attempt(
+        self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf
+    ) -> tuple[Any, Any]:
+        """The same, and what was done in vain where the judge finds nothing (None): () where no call was made."""
         kept = problem.derived
         if not tol > 0.0 or problem.m == 0:
-            return None
+            return None, ()
         if kept.vain is not None:
             at = (problem._start if impulse is None else impulse).tobytes()
-            if kept.vain == (self.name, tol, at):
-                return None
+            if kept.vain[:3] == (self.name, tol, at):
+                return None, kept.vain[3]
         if problem.generalized is not None:
             if self.limits is None:
-                return None
-            if most < inf:
-                return solve_first(kept.view, impulse, tol, self.limits, most)
-            found = solve_first(kept.view, impulse, tol, self.limits)
+                return None, ()
+            found = solve_first(kept.view, impulse, tol, self.limits, most)
         else:
             small = kept.small
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
                 small = prepared(problem)
             if not small or not (self.pivots if small.pivots else self.hands_over):
-                return None
-            if most < inf:
-                return small.run(impulse, tol, self.hands_over, WARM, most)
-            found = small.run(impulse, tol, self.hands_over, WARM)
-        if found is None:  # the same steps need not be done again before the full solver
-            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes())
-        return found
+                return None, ()
+            found = small.run(impulse, tol, self.hands_over, WARM, most)
+        if found[0] is None and most == inf:  # the same steps need not be done again before the full solver
+            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes(), found[1])
+        made: tuple[Any, Any] = found
+        return made
+
+    def failed(self, problem: Problem, counts: tuple[int, ...]) -> list[tuple[str, Claim]]:
+        """Who did what in a call of these counts, which did not solve the problem."""
+        if not any(counts):
+            return []
+        if problem.generalized is not None:
+            return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]
+        done = (_by_pivots if problem.derived.small.pivots else _in_turns)(counts)
+        return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def claim(
         self,
@@ -252,6 +269,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(MOST), True, True)
+AUTO = SmallCall("auto", limits(SWEEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
-NEWTON = SmallCall("newton", limits(MOST), False)
+NEWTON = SmallCall("newton", limits(inf), False)

@@ -466,7 +466,8 @@ def solve_many(
         if made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
             # The same steps need not be done again.
             at = problem._start if start is None else start
-            problem.derived.vain = (spec.name, tol, np.ascontiguousarray(at, float).tobytes())
+            done = tuple(made._worlds.counts[i].tolist())
+            problem.derived.vain = (spec.name, tol, np.ascontiguousarray(at, float).tobytes(), done)
         if deadline.is_set and not isinstance(given, Batch):
             deadline.keep(-UNREAD)
             if deadline.passed():

@@ -14,7 +14,6 @@ from lavender.judge.certificates import prove, rounded_down
 from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
 from lavender.judge.solution import Claim, History, Solution, SolverRun, Status
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender.solvers.registry import SolverSpec, in_one_call
 from lavender_ext.judge.measure import Judged, all_finite
 
@@ -145,16 +144,13 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
 def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
     cones, worst, empty = problem.cones, -1, problem.metric.empty
-    if not len(empty):
+    # What is behind a normal is bounded by its impulse.
+    asks = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
+    if not len(asks):
         return None
-    for i in np.setdiff1d(empty, problem.vanished_rows).tolist():
-        block = problem.block_of(i)
-        if cones.kind[block] != ROW and i != cones.ptr[block]:
-            continue  # tangents and spin: bounded by mu lambda_n
+    for i in np.setdiff1d(asks, problem.vanished_rows).tolist():
         b = problem.b[i]
         bound = cones.upper[i] if b > 0.0 else cones.lower[i]
-        if b == 0.0:
-            continue
         if np.isfinite(bound):
             impulse[i] = bound
         elif worst < 0 or abs(b) > abs(problem.b[worst]):

@@ -26,6 +26,7 @@ cdef struct descent_t:          # Newton steps under one law
     int32_t fresh               # s was formed anew, not moved
     int32_t stale               # N is to be formed anew
     int32_t known               # lambda and V are those at s
+    int32_t moved               # the centre has moved since the last step
     double share                # of d
     double least                # lowest error, that of `best`,
     double lowest               # and of its own steps

@@ -18,15 +18,15 @@ that lacks symmetry, as long as |G| falls; where it does not, normals are lowere
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
-N and its factor serve the next step where no block has changed its V.
+N and its factor serve the next step where no block has changed its V, and the first after the centre has moved: lambda
+leaps there, along the law that it has settled on, and so does V.
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
-from lavender_ext.core.contact_map cimport length
-from lavender_ext.core.generalized cimport dot
-from lavender_ext.core.parts cimport CONE, COULOMB, is_rows, parts_of, parts_t
+from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
@@ -175,8 +175,23 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
         theta[k] = big
 
 
+cdef inline double enough(const blocks_t* p, int32_t i) noexcept nogil:
+    """Compliance over d with which a block needs no proximal term."""
+    return 1e-6 if is_rows(p, i) else 1e-3
+
+
+cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
+    """Needs no block one?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not g.compliance[k] >= enough(p, i) * p.d[k]:
+                return False
+    return True
+
+
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
-    """theta' of (2): rho is `share` d on rows with less than 1e-6 d of their own, 1e-3 d in contacts.
+    """theta' of (2): rho is `share` d on rows with less than `enough` of their own.
 
     Rows of one part get the largest.
     """
@@ -193,7 +208,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = 1e-6 if is_rows(&f.p, i) else 1e-3
+            low = enough(&f.p, i)
             if share < low:
                 low = share
             for k in range(j, end):
@@ -244,7 +259,7 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double le
     """Newton steps under a law from y, s still to be formed; `best` has that error, or none has."""
     cdef descent_t* x = &f.descent
     f.p.law = law
-    x.idle = x.n = x.known = 0
+    x.idle = x.n = x.known = x.moved = 0
     x.fresh = x.stale = 1
     x.share = f.share
     x.least = least
@@ -299,6 +314,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         if rigid and (size <= 0.1 * energy or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
             follow(f, island)
+            x.moved = 1
             if x.last_center >= 0.0 and energy > 0.3 * x.last_center and x.share > 1e-9:
                 x.share = 0.1 * x.share
                 soften(f, island, x.share)
@@ -308,11 +324,11 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             x.sizes[0] = x.sizes[1] = x.sizes[2] = -1.0
             continue
         f.steps -= 1
-        if x.stale or not is_held(f, island):
+        if x.stale or not (x.moved or is_held(f, island)):
             form(f, island, square)
             if not factor(f, island, square):
                 return FAILED
-        x.stale = 0
+        x.stale = x.moved = 0
         newton_step(f, island, square)
         if square:
             bound = size

@@ -5,7 +5,7 @@ from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.sparse cimport per_column
-from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, descend_all
+from lavender_ext.generalized.newton cimport DONE, FAILED, LOST, SPENT, STUCK, descend_all, is_soft
 
 ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": LOST}
 
@@ -14,15 +14,15 @@ cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
     `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. `work`:
-    multiply-adds of N and one factor of each island. Where N of an island has more than `most` values (`fits`) there is no
-    room, and no `run`.
+    multiply-adds of N and one factor of each island. `soft`: no row needs a proximal term. Where N of an island has more
+    than `most` values (`fits`) there is no room, and no `run`.
     """
     cdef flow_t f
     cdef Data data
     cdef list keep
     cdef readonly int largest
     cdef readonly double work
-    cdef readonly bint fits
+    cdef readonly bint fits, soft
 
     def __init__(self, Data p, double most):
         cdef need_t need
@@ -36,6 +36,7 @@ cdef class Newton:
                 break
             per *= 2
         self.largest, self.work = need.wide, need.work
+        self.soft = is_soft(&p.blocks, &p.general)
         self.fits = not need.crowded and need.values <= most
         if not self.fits:
             return

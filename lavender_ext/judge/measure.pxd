@@ -289,16 +289,12 @@ cdef inline void general_slack(const blocks_t* p, const generalized_t* g, const 
         w[i] = jac_row(g, i, x) + (g.compliance[i] * lam[i] - p.b[i])
 
 
-cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
-                               double* x, bint floor, score_t* out) noexcept nogil:
-    """The pass over J and M; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n) is scratch, with the floor (n + m)."""
+cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const double* lam, const double* w,
+                               const double* e, double* x, score_t* out) noexcept nogil:
+    """The floor of that; |Y| |Y|^T |lam| + c |lam| stands for |A| |lam|. x (n + m) is scratch."""
     cdef int32_t i
     cdef floor_t f = no_floor()
     cdef double* size = x + g.n
-    general_slack(p, g, lam, x, w)
-    score_rows(p, lam, w, e, out)
-    if not floor:
-        return
     for i in range(g.n):
         x[i] = 0.0
     for i in range(g.n_panels):
@@ -310,6 +306,15 @@ cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const 
     for i in range(p.n_blocks):
         add_block_floor(p, i, lam, w, e, size + p.ptr[i], &f)
     floor_from(&f, out)
+
+
+cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
+                               double* x, bint floor, score_t* out) noexcept nogil:
+    """The pass over J and M. x (n) is scratch, with the floor (n + m)."""
+    general_slack(p, g, lam, x, w)
+    score_rows(p, lam, w, e, out)
+    if floor:
+        general_floor(p, g, lam, w, e, x, out)
 
 
 # -- any form ------------------------------------------------------------------------------------------

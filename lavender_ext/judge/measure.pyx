@@ -9,7 +9,7 @@ from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport (csr_slack, general_slack, judge_nothing, judge_view, relative_of, rows_slack,
                                          scratch_of)
-from lavender_ext.judge.rounding cimport mass_t, squares32
+from lavender_ext.judge.rounding cimport mass_t, relative_size, squares32
 from lavender_ext.judge.score cimport are_numbers, is_at_floor, norms_of_rhs, relative, score_rows, score_t
 
 
@@ -202,3 +202,8 @@ def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] l
         with nogil:
             squares32(&p.blocks, &p.general, &at, v, &lam[0], &x[0, 0], &x[1, 0], &x[2, 0], &work[0])
     return out
+
+
+def size_of_square(Data p, const double[::1] square):
+    """Changes of w in the judge's two norms beside those of doing nothing; their squares (m) [m2/s2] given."""
+    return relative_size(&p.blocks, &square[0] if square.shape[0] else NULL, p.start_energy, p.start_velocity)

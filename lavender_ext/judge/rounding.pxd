@@ -10,7 +10,7 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve
+from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve, whitened_push
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.judge.score cimport relative
 
@@ -30,11 +30,25 @@ cdef inline double square_row(const generalized_t* g, int32_t i, const double* x
     return s
 
 
+cdef inline void unwhitened(const generalized_t* g, int32_t panel, int32_t row, double* z) noexcept nogil:
+    """z (n) = M^-1 J_row^T = L^-1 D^-1/2 Y_row^T: half of a solve by M's factor."""
+    cdef int32_t k, q
+    cdef double x
+    for k in range(g.n):
+        z[k] = 0.0
+    whitened_push(g, panel, row, 1.0, z)
+    for k in range(g.n):
+        x = z[k] * g.root[k]
+        for q in range(g.lptr[k], g.lptr[k + 1]):
+            x -= g.lval[q] * z[g.lidx[q]]
+        z[k] = x
+
+
 cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass_t* mass, const double* free,
                            const double* lam, double* impulse, double* data, double* velocities,
                            double* work) noexcept nogil:
     """(1), (4) and (5), (m) [m2/s2] each; free (n) is v*, work (4 n + m)."""
-    cdef int32_t i, j, q, k, m = p.n_rows, n = g.n
+    cdef int32_t i, j, q, k, m = p.n_rows, n = g.n, panel = 0
     cdef double* x = work
     cdef double* xx = x + n
     cdef double* f = xx + n
@@ -69,11 +83,9 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
     for k in range(n):
         xx[k] = free[k] * free[k]
     for i in range(m):
-        for k in range(n):
-            z[k] = 0.0
-        for q in range(g.jptr[i], g.jptr[i + 1]):
-            z[g.jidx[q]] = g.jval[q]
-        tree_solve(g, z)
+        while g.prow[panel + 1] <= i:
+            panel += 1
+        unwhitened(g, panel, i, z)
         data[i] += 2.0 * square_row(g, i, xx)
         for k in range(n):
             data[i] += z[k] * z[k] * f[k]

@@ -72,7 +72,7 @@ cdef class Small:
 
         follows: another method comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
         nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
-        with Lemke's path where exchanges are stuck. None where it does not end below tol. What was done is
+        with Lemke's path where exchanges are stuck. The judge finds None where it does not end below tol. What was done is
         None where `impulse` is the solution. most: counted cost [ns] where what was found by then is the result.
         """
         cdef Judged found
@@ -90,14 +90,13 @@ cdef class Small:
             if not before <= (warm if self.pivots else 1.0):
                 impulse = None
         own = (self.start if impulse is None else impulse).copy()
-        counts = self.solve(own, tol, follows, &most)
-        if counts is None:
-            return None
-        found = Judged(self.data, own)
-        return (found, counts) if self.pivots or found.relative <= tol or not most > 0.0 else None
+        good, counts = self.solve(own, tol, follows, &most)
+        found = Judged(self.data, own) if good else None
+        good = good and (self.pivots or found.relative <= tol or not most > 0.0)
+        return found if good else None, counts
 
     cdef solve(self, own, double tol, bint follow, double* most):
-        """`own` (m,) N s in place; counts, or None. What it cost is taken off `most`, which then ends it at 0 or below."""
+        """`own` (m,) N s in place: is it good, and counts. What it cost is taken off `most`, which ends it at 0 or below."""
 
 
 cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
@@ -165,13 +164,13 @@ cdef class Bounded(Small):
             ended = pivot(&t, &start[0], tol, follow, most[0] / each)
         most[0] -= t.s.n_rounds * each
         if not ended and most[0] > 0.0:
-            if not follow or t.linear or t.solved:
-                return None
-            path = self.followed(&t, own, tol, most)
-        if not ended and (path < 0 or not t.relative <= tol) and (most[0] > 0.0 or not t.relative < INFINITY):
-            return None
-        memcpy(&start[0], t.best, t.s.n * sizeof(double))
-        return t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank, max(path, 0)
+            path = self.followed(&t, own, tol, most) if follow and not t.linear and not t.solved else -1
+        if not ended:
+            ended = (path >= 0 and t.relative <= tol) or (not most[0] > 0.0 and t.relative < INFINITY)
+        if ended:
+            memcpy(&start[0], t.best, t.s.n * sizeof(double))
+        return ended, (t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank,
+                       max(path, 0))
 
     cdef int followed(self, direct_t* t, own, double tol, double* most) except -2:
         """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
@@ -409,7 +408,7 @@ cdef class Friction(Small):
             free(r.real)
         most[0] = o.left
         done = o.longest, o.swept, o.undone, o.factorisations, o.driven, self.count
-        return done if good or (self.count == 1 and not o.left > 0.0) else None
+        return good or (self.count == 1 and not o.left > 0.0), done
 
     cdef bint whole(self, double[::1] own, ask_t* o, room_t* r) except -1:
         cdef part_t s

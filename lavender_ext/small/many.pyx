@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
-from lavender_ext.core.generalized cimport generalized_t, jac_push, tree_solve
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
@@ -24,11 +24,11 @@ from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, 
                                        AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all
+from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
 from lavender_ext.generalized.sparse cimport per_column
-from lavender_ext.judge.measure cimport do_nothing, general_judge, judge_nothing, judged_from, relative_of
+from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
-from lavender_ext.judge.score cimport norms_of_rhs, relative, score_t
+from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
 
 cdef extern from *:
     """
@@ -56,9 +56,14 @@ cdef enum:
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double entry                # each multiply-add of a sweep, and
     double work                 # of a factor,
-    double bounded              # factorisations by law
+    double bounded              # factorisations by law,
     double coulomb
     double cone
+    double rigid                # times as many with friction and a rigid row
+    double start                # what a solve beside this call takes at least,
+    double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
+    double sweep_cone
+    double sweeps               # and how many of them
     double values               # of one island's N
     double most                 # what all may cost to be asked at all
 
@@ -75,6 +80,7 @@ cdef struct job_t:
     int32_t counts[4]           # steps, factorisations, rounds, evaluations
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
+    const double* push          # (n) M^-1 J^T lam of the judge, in room that the next world takes
     score_t score
     double relative, floor
 
@@ -96,7 +102,16 @@ cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limi
     cdef double count = l.bounded
     if has_friction(p):
         count = l.coulomb if p.law == COULOMB else l.cone
+        if not is_soft(p, g):
+            count *= l.rigid
     return count * step_cost(p, g, l, work)
+
+
+cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
+    """What it may cost [ns]: as much as sweeps, which may do with less."""
+    cdef double each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.entry
+    cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
+    return min(l.most, l.start + l.sweeps * sweep)
 
 
 cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
@@ -149,10 +164,13 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
 
 
 cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
-    """The judge's pass over lam; x (n + m) is scratch."""
+    """The judge's pass over lam, `general_judge` with what it pushes kept; x (2 n + m) is scratch."""
     cdef int32_t m = j.p.n_rows
     j.score = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-    general_judge(&j.p, &j.g, j.lam, j.both, j.both + m, x, True, &j.score)
+    general_slack(&j.p, &j.g, j.lam, x, j.both)
+    score_rows(&j.p, j.lam, j.both, j.both + m, &j.score)
+    general_floor(&j.p, &j.g, j.lam, j.both, j.both + m, x + j.g.n, &j.score)
+    j.push = x
     j.relative = relative_of(&j.score, j.both, m, j.begin[0], j.begin[1])
     j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
 
@@ -161,16 +179,23 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     cdef flow_t f
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
+    j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE or first_outside(j.p.d, m) >= 0:
         return
-    if not has_room(room, marks_of(&j.p, &j.g, per), 3 * <ssize_t>m + j.g.n):
+    if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
         return
     if j.begin[0] < 0.0:
         begin(j, room.real)
-    settle(&f, &j.p, &j.g, per, room.index, &need)
+    while True:
+        if not has_room(room, marks_of(&j.p, &j.g, per), 0):
+            return
+        settle(&f, &j.p, &j.g, per, room.index, &need)
+        if not need.crowded or <double>per * j.g.n > limits.values:
+            break
+        per *= 2                                        # L has more entries than that in a row
     if f.n_islands <= MOST // STEPS:
         steps = STEPS * f.n_islands
-    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > limits.most:
+    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > allowed(&j.p, &j.g, limits):
         return
     if not has_room(room, 0, numbers_of(&f, &need)):
         return
@@ -181,10 +206,10 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
         return
     aim_at(&f, tol, steps, j.begin[0], j.begin[1])
     code = descend_within(j, &f, limits, need.work)
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
     if code != DONE and not j.spent:
         return
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
-    if not has_room(room, 0, <ssize_t>j.g.n + m):
+    if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
         return
     judge_job(j, room.real)
     j.solved = j.relative <= tol
@@ -218,9 +243,9 @@ cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
 
 
 cdef result(job_t* j, Data p, impulse, both):
-    """(What the judge found, counts as of `Newton.run`); doing nothing is kept with the data."""
-    return judged_from(p, impulse, both, &j.score, j.relative, j.floor), (
-        j.counts[0], j.counts[1], j.counts[2], j.counts[3])
+    """(What the judge found, None where nobody asked him, counts as of `Newton.run`)."""
+    found = judged_from(p, impulse, both, &j.score, j.relative, j.floor) if j.solved or j.spent else None
+    return found, (j.counts[0], j.counts[1], j.counts[2], j.counts[3])
 
 
 cdef void remember(job_t* j, Data p):
@@ -230,28 +255,23 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (7,)."""
+    """Of the numbers of a `limits_t` (12,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
 
     def cost(self, Data p, double work):
-        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and of a step."""
-        return cost_of(&p.blocks, &p.general, &self.at, work), step_cost(&p.blocks, &p.general, &self.at, work)
-
-    @property
-    def most(self):
-        """What it may cost to be asked at all [ns]."""
-        return self.at.most
+        """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and may cost."""
+        return cost_of(&p.blocks, &p.general, &self.at, work), allowed(&p.blocks, &p.general, &self.at)
 
 
 def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     """A problem of at least one row of which nothing was worked out: what is worked out of its data, solved, judged, at once.
 
-    What the judge finds and the counts, as `Batch.judged`; None where it does not end below tol, an empty row cannot be
-    met or it costs more than the limits (`limits_t`) let in; most: counted cost [ns] where what was found by then is the
-    result. d, Y and the error of doing nothing stay with the data.
+    What the judge finds, None where it does not end below tol, an empty row cannot be met or it costs more than the limits
+    (`limits_t`) let in, and the counts, zeros where nothing was done; most: counted cost [ns] where what was found by then
+    is the result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL)
@@ -269,7 +289,7 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     if not known and j.made.numbers != NULL:
         p.adopt(&j.made)
     remember(&j, p)
-    return result(&j, p, impulse, results) if j.solved or j.spent else None
+    return result(&j, p, impulse, results)
 
 
 cdef enum:                      # what is known of a world when it is done, rows of `Worlds.numbers`
@@ -317,6 +337,8 @@ cdef class Worlds:
         J, M, v*, target, compliance, mu (or None), flat float64 or float32.
     strides : (int, int)
         Numbers from one row to the next of J and of M, 0: as many as velocities.
+    pattern : (indptr, indices) int32, or None
+        Of M, where it holds lower triangles in compressed rows of one pattern.
     impulse, velocity : float64
         Of the results; of arrays the impulse holds the starts, unless `cold`.
     """
@@ -351,15 +373,20 @@ cdef class Worlds:
         self.v = &velocity[0] if velocity.shape[0] else NULL
         self.number, self.worst_at, self.count, self.code_at = &numbers[0, 0], &worst[0], &counts[0, 0], &code[0]
 
-    def of_arrays(self, arrays, strides, Blocks blocks, int law, double asymmetry):
+    def of_arrays(self, arrays, strides, pattern, Blocks blocks, int law, double asymmetry):
         """Of arrays, which have passed every check but that of their numbers."""
         cdef const double[::1] wide
         cdef const float[::1] narrow
+        cdef const int32_t[::1] ptr, col
         cdef int32_t i
+        self.w.mass_ptr = NULL
+        if pattern is not None:
+            ptr, col = pattern
+            self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
         self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
-        self.keep += [blocks, *arrays]
+        self.keep += [blocks, pattern, *arrays]
         for i in range(N_ARRAYS):
             self.w.array[i] = NULL
             self.w.narrow[i] = arrays[i] is not None and arrays[i].itemsize == sizeof(float)
@@ -430,10 +457,8 @@ cdef class Worlds:
             self.count[4 * i + k] = j.counts[k]
         if self.jobs == NULL:
             v = self.v + at[VELOCITY]
-            jac_push(&j.g, j.lam, v)
-            tree_solve(&j.g, v)
             for k in range(j.g.n):
-                v[k] = desk.free[k] + v[k]
+                v[k] = desk.free[k] + j.push[k]
 
     cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
         """A world without rows, which nothing moves."""
@@ -454,6 +479,8 @@ cdef class Worlds:
         solve_job(&j, room, limits, tol)
         if j.solved:
             self.keep_result(i, &j, desk)
+        else:
+            memcpy(&self.count[4 * i], j.counts, sizeof(j.counts))
         forget(&j, known)
         if self.jobs != NULL:
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
@@ -472,7 +499,7 @@ cdef class Worlds:
         known = j.made.marks != NULL
         code = LEFT
         if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 and first_outside(j.p.d, m) < 0 \
-                and has_room(room, 0, 4 * <int64_t>m + 4 * j.g.n):
+                and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
             code, x = READY, room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
@@ -481,9 +508,10 @@ cdef class Worlds:
             for k in range(4):
                 j.counts[k] = 0
             if narrow:
+                x += j.g.n                              # behind what is pushed
                 squares32(&j.p, &j.g, &desk.mass, desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
-                    x[k] += x[m + k] + x[2 * m + k]
+                    x[k] = x[k] + x[m + k] + x[2 * m + k]
                 j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
             self.keep_result(i, &j, desk)
         forget(&j, known)

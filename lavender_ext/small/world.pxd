@@ -52,6 +52,8 @@ cdef struct worlds_t:
     int32_t narrow[N_ARRAYS]    # in float32
     int64_t jac_row             # numbers from one row of J to the next, 0: as many as velocities;
     int64_t mass_row            # of M
+    const int32_t* mass_ptr     # (nv + 1) of lower triangles in compressed rows, all of one pattern; NULL: M is dense
+    const int32_t* mass_col     # ascending in each row, the diagonal last
     blocks_t blocks             # of all worlds, or of each
     double asymmetry            # of sqrt(M_ii M_jj), that M may have
 
@@ -133,6 +135,21 @@ cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, in
     return q
 
 
+cdef inline int32_t thinned(const int32_t* given, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
+                            int32_t* idx, double* val) noexcept nogil:
+    """A lower triangle in compressed rows without zeros left of its diagonal; its entries."""
+    cdef int32_t i, k, q = 0
+    ptr[0] = 0
+    for i in range(n):
+        for k in range(given[i], given[i + 1]):
+            if x[k] != 0.0 or col[k] == i:
+                idx[q] = col[k]
+                val[q] = x[k]
+                q += 1
+        ptr[i + 1] = q
+    return q
+
+
 cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t* idx, generalized_t* g) noexcept nogil:
     """The pattern of L, that of the world before where M has its entries in the same places; is there room for it?"""
     cdef int64_t most = <int64_t>n * (n + 1) // 2
@@ -186,9 +203,14 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
         return BAD
     ptr, x = idx + whole, x + whole
     idx = ptr + n + 1
-    row = w.mass_row
-    a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
-    entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
+    if w.mass_ptr != NULL:
+        row = entries = w.mass_ptr[n]
+        a = widened(w, 1, at[MASS], 1, entries, &row, d.room.real + numbers)
+        entries = thinned(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
+    else:
+        row = w.mass_row
+        a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
+        entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
     if entries < 0 or first_outside(x, entries) >= 0:
         return BAD
     d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x

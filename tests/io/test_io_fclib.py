@@ -287,9 +287,9 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
     )  # fmt: skip
     heavy, pinned = one_body(inv_mass=[0.0]), one_body(inv_inertia=[np.diag([1.0, 0.0, 1.0])])
     cases = [
-        (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 bounded rows"]),
-        (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["ROW blocks .*2 free rows"]),
-        (random_contact_problem(0), {}, ["ROW blocks", "spin rows", "contacts of"]),
+        (lv.Problem.lcp(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 bounded rows"]),
+        (lv.Problem.linear(np.eye(2), [1.0, 1.0]), {}, ["blocks of bounded rows .*2 free rows"]),
+        (random_contact_problem(0), {}, ["blocks of bounded rows", "spin rows", "contacts of"]),
         (lv.Problem.contact(np.eye(4), np.ones(4), [0.5], patch_radius=[0.1]), {}, ["spin rows"]),
         (lv.Problem.contact(np.eye(2), np.ones(2), [0.0, 0.0]), {}, ["contacts of 1 rows"]),
         (lv.Problem.contact(np.eye(3), np.ones(3), [0.5], friction="cone"), {}, ["'cone' law"]),

@@ -41,6 +41,24 @@ def test_the_converged_run_does_not_move_away_from_itself(boxes):
     assert same.motion.max() == 0.0 and same.worst < 1e-9
 
 
+def test_what_interrupts_a_step_in_one_round_is_not_its_time(boxes, monkeypatch):
+    runs = Runs(str(boxes()), 1, 40)
+    handle, made = runs.load()
+    stage = Stage.of(handle, made, runs, [0], 10)
+    found = [stage.measured(s) for s in (Setting(), Setting((("iterations", 5),)))]
+    rng, now = np.random.default_rng(1), 0.0
+
+    def busy():
+        nonlocal now
+        now += 1e-6 + (rng.random() < 0.05)  # one time in twenty somebody else has a second
+        return now
+
+    monkeypatch.setattr(module, "perf_counter", busy)
+    stage.time(found, 6, lambda _: None)
+    for m in found:
+        assert m.time == pytest.approx(1e-6, abs=1e-9)  # the clock itself rounds to 1e-14 of its 30 s
+
+
 @pytest.mark.parametrize("options", ["", 'solver="CG" cone="elliptic" jacobian="sparse" impratio="3"'])
 def test_a_line_means_in_a_model_what_was_measured(options):
     plain = mj.MjModel.from_xml_string(BOXES.format(options=options))
@@ -56,7 +74,9 @@ def test_a_line_means_in_a_model_what_was_measured(options):
 
 
 def measured(time, error, **options):
-    return Measured(Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), time)
+    return Measured(
+        Setting(tuple(options.items())), "Newton", np.full(100, error), np.zeros(10), np.full(3, time)
+    )
 
 
 def chosen(*some, held=(), threshold=1e-6):

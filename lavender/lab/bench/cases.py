@@ -24,7 +24,6 @@ from lavender.lab.bench.record import CaseInfo, file_name, printable
 from lavender.lab.suite import Case
 from lavender.lab.suspicions import diagnose
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender.problem.derived import cached_property
 
 __all__ = ["Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
@@ -295,7 +294,7 @@ def _unique_names(items: list[Item]) -> list[Item]:
 def describe(item: Item, run: str) -> CaseInfo:
     """What the report says of a case; loads its problem."""
     p = item.problem
-    contacts = int(np.count_nonzero(p.cones.kind != ROW))
+    contacts = int(np.count_nonzero(p.cones.is_contact))
     answer = item.judged()
     return CaseInfo(
         run=run,
@@ -428,7 +427,7 @@ def _is_bilateral(problem: Problem) -> bool:
             len(np.unique(np.sort(x, axis=1), axis=0)) for x in (r.joint_body, r.contact_body)
         )
         return joints > contacts
-    first = c.ptr[:-1][c.kind == ROW]
+    first = c.ptr[:-1][~c.is_contact]
     free = np.count_nonzero(np.isinf(c.lower[first]) & np.isinf(c.upper[first]))
     return bool(2 * free > c.n_blocks)
 

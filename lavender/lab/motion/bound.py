@@ -39,7 +39,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.lab.motion.operator import Operator, Size, U
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender_ext.judge import measure
 
 __all__ = ["Witness", "difference", "witness"]
@@ -81,7 +80,7 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
     fuzz = 8.0 * U * size
     # A contact: about twenty operations on the entries of sqrt(d) (y - w / d), in any of which they may meet.
     count = np.diff(c.ptr)
-    together = np.repeat((c.kind != ROW) & (count > 1), count)
+    together = np.repeat(c.is_contact & (count > 1), count)
     if together.any():
         block = np.repeat(np.arange(len(count)), count)
         with np.errstate(over="ignore", invalid="ignore"):

@@ -19,7 +19,6 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.problem import Problem
-from lavender.problem.cones import CONTACT, ROW
 
 __all__ = ["CONTACTS", "enumerated"]
 
@@ -48,8 +47,8 @@ def enumerated(problem: Problem) -> tuple[list[FloatArray], bool] | None:
     many singular modes.
     """
     c = problem.cones
-    contact = c.kind != ROW
-    flat = (c.kind == CONTACT) & ((c.n_tangents <= 1) | (c.mu == 0.0))
+    contact = c.is_contact
+    flat = (np.diff(c.ptr) == 1 + c.n_together) & ((c.n_tangents <= 1) | (c.mu == 0.0))
     if np.count_nonzero(contact) > CONTACTS or not np.all(flat[contact]):
         return None
     counts = np.where(contact, 2 + 2 * (c.n_tangents > 0) * (c.mu > 0.0), 1).astype(float)
@@ -98,7 +97,7 @@ def _ways(problem: Problem, block: int, a: FloatArray, b: FloatArray, scale: Flo
     one = np.eye(problem.m)
     none, nothing = np.zeros(problem.m), 0.0
     start, end = c.ptr[block], c.ptr[block + 1]
-    if c.kind[block] == ROW:
+    if not c.is_contact[block]:
         for i in range(start, end):
             low, high = c.lower[i] / scale[i], c.upper[i] / scale[i]
             some = []

@@ -48,7 +48,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.lab.motion.reference import kept, reference
 from lavender.problem import Problem
-from lavender.problem.cones import ROW, Cones
+from lavender.problem.cones import Cones
 from lavender.problem.ordering import rows_of_each
 
 __all__ = ["Uniqueness", "uniqueness"]
@@ -140,7 +140,7 @@ def _sticks(
     if not found.accepted or np.max(np.abs(w), initial=0.0) > at_rest:
         return False
     block = np.unique(np.searchsorted(c.ptr, rows, side="right") - 1)
-    bounded = rows[(c.kind == ROW)[np.searchsorted(c.ptr, rows, side="right") - 1]]
+    bounded = rows[~c.is_contact[np.searchsorted(c.ptr, rows, side="right") - 1]]
     if np.any(c.lower[bounded] > 0.0) or np.any(c.upper[bounded] < 0.0):
         return False
     rubbing, left = _rubbing(c), []

@@ -16,7 +16,6 @@ from lavender.lab.proof.island import Island, NoZero, Sticks
 from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, squared, upper_end
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 
 __all__ = ["NAMED", "RATIONAL", "ROUNDS", "SMALL", "Enclosure", "Search"]
 
@@ -101,14 +100,15 @@ class Search:
         cones = self.problem.cones
         lam, w, d = self.given, self.problem.slack(self.given), self.problem.d
         parts: dict[int, list[_Part]] = {}
+        contact, reaches = cones.is_contact, cones.reach
         for i, rows in cones.parts():
-            reach = cones.reach[rows]
+            reach = reaches[rows]
             if (reach > 0.0).any():
                 live = rows[reach > 0.0]
                 parts.setdefault(i, []).append(_Part(live.tolist(), reach[reach > 0.0].tolist()))
         out = []
         for i, (first, end) in enumerate(zip(cones.ptr[:-1].tolist(), cones.ptr[1:].tolist(), strict=True)):
-            if cones.kind[i] == ROW:
+            if not contact[i]:
                 for r in range(first, end):
                     low, high, x = cones.lower[r], cones.upper[r], lam[r] - w[r] / d[r]
                     inside = (low < x or low == -math.inf) and (x < high or high == math.inf)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,10 +20,12 @@ __all__ = [
     "Bodies",
     "Contacts",
     "contact_problem",
+    "each",
     "joint_problem",
     "manifold",
     "sideways",
     "static_loads",
+    "tenfold",
     "tower",
 ]
 
@@ -29,6 +34,16 @@ STEP = 0.01  # s
 FALL = GRAVITY * STEP  # m/s, speed that one step of gravity adds
 
 FRICTIONS = ("none", "coulomb", "cone")
+
+
+def each(function: Callable[[float], float], x: Any) -> FloatArray:
+    """A function of `math` of every number: the last bits of NumPy's own hang on the processor's vectors."""
+    return np.array([function(value) for value in x.ravel().tolist()]).reshape(x.shape)
+
+
+def tenfold(exponent: Any) -> FloatArray:
+    """10 to the power of every number, by the same."""
+    return each(partial(pow, 10.0), exponent)
 
 
 class Bodies:
@@ -125,8 +140,8 @@ def tower(n: int) -> tuple[FloatArray, IntArray, FloatArray]:
 def sideways(bodies: Bodies, speed: float, seed: int = 5) -> None:
     """Add a horizontal velocity of `speed` [m/s] to every body, each in a direction of its own."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, len(bodies.mass))
-    bodies.v_free[:, 0] += speed * np.cos(angle)
-    bodies.v_free[:, 1] += speed * np.sin(angle)
+    bodies.v_free[:, 0] += speed * each(math.cos, angle)
+    bodies.v_free[:, 1] += speed * each(math.sin, angle)
 
 
 def static_loads(bodies: Bodies, contacts: Contacts) -> FloatArray:

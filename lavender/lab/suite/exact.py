@@ -21,7 +21,6 @@ from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
-from lavender.problem.cones import ROW
 from lavender_ext.core.checks import LEAST
 
 __all__ = ["Wide", "at_rest", "solve_boxed", "solve_linear"]
@@ -150,7 +149,7 @@ def at_rest(problem: Problem) -> FloatArray:
         No such impulses were found: the bodies cannot stay at rest, or a row has no room for rounding.
     """
     c, rows = problem.cones, problem.rows
-    if rows is None or np.any(c.kind == ROW):
+    if rows is None or np.any(~c.is_contact):
         raise InputError("at_rest needs contacts given by rows")
     normal = c.ptr[:-1]
     weight = np.repeat(np.stack([1.0 / rows.inv_mass, 1.0 / rows.inv_inertia[:, 0, 0]], 1), 3, axis=1)

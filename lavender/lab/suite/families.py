@@ -8,6 +8,7 @@ relaxation have the same answer.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -19,6 +20,7 @@ from lavender.lab.suite.build import (
     Bodies,
     Contacts,
     contact_problem,
+    each,
     joint_problem,
     manifold,
     sideways,
@@ -285,7 +287,7 @@ def chain(n: int = 33, tip_mass: float = 1.0) -> Draft:
     at_least(1, n=n)
     positive(tip_mass=tip_mass)
     k = np.arange(n)
-    link = np.stack([0.8 + 0.0 * k, 0.3 * np.cos(k), -0.5 + 0.3 * np.sin(1.7 * k)], 1)
+    link = np.stack([0.8 + 0.0 * k, 0.3 * each(math.cos, k), -0.5 + 0.3 * each(math.sin, 1.7 * k)], 1)
     problem = _chain(link, tip_mass, 0.02)
     return Draft(
         problem,
@@ -303,7 +305,7 @@ def hang(n: int = 33, tip_mass: float = 1.0) -> Draft:
     at_least(1, n=n)
     positive(tip_mass=tip_mass)
     k = np.arange(n)
-    link = np.stack([1e-4 * np.cos(k), 1e-4 * np.sin(1.7 * k), -1.0 + 0.0 * k], 1)
+    link = np.stack([1e-4 * each(math.cos, k), 1e-4 * each(math.sin, 1.7 * k), -1.0 + 0.0 * k], 1)
     problem = _chain(link, tip_mass, 1e-4)
     return Draft(
         problem,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from decimal import Decimal, localcontext
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.lab.suite.build import FALL, Bodies, Contacts, contact_problem, manifold
+from lavender.lab.suite.build import FALL, Bodies, Contacts, contact_problem, each, manifold
 from lavender.lab.suite.case import Draft, Reference, family
 from lavender.lab.suite.families import BOX, at_least, positive, rest_reference
 from lavender.lab.suite.hard import EXACT
@@ -26,7 +27,7 @@ def slider(mu: float = 0.3, speed: float = 0.5, angle: float = 10.0, friction: s
         raise InputError(f"mu is {mu}; 0 or more is needed")
     a = np.deg2rad(angle)
     bodies = Bodies([[0.0, 0.0, 0.0]], 1.0, 0.0)
-    bodies.v_free[0, :3] = [speed, -FALL * np.sin(a), -FALL * np.cos(a)]
+    bodies.v_free[0, :3] = [speed, -FALL * math.sin(a), -FALL * math.cos(a)]
     contacts = Contacts([[-1, 0]], np.zeros((1, 3)), [0.0, 0.0, 1.0])
     problem = contact_problem(bodies, contacts, friction, mu)
 
@@ -50,11 +51,11 @@ def ramp(angle: float = 20.0, mu: float = 0.5) -> Draft:
     """A cube on four points of a ramp of `angle` [degrees]; tan 26.6 = 0.5 is where it begins to slide."""
     a = np.deg2rad(angle)
     bodies = Bodies([[0.0, 0.0, 0.5]], 1.0, BOX)
-    bodies.v_free[0, :3] = [FALL * np.sin(a), 0.0, -FALL * np.cos(a)]
+    bodies.v_free[0, :3] = [FALL * math.sin(a), 0.0, -FALL * math.cos(a)]
     problem = contact_problem(bodies, manifold([[-1, 0]], [[0.0, 0.0, 0.0]], 0.5), "coulomb", mu)
 
     def closed_form() -> Reference:
-        n, t = FALL * np.cos(a), min(FALL * np.sin(a), mu * FALL * np.cos(a))
+        n, t = FALL * math.cos(a), min(FALL * math.sin(a), mu * FALL * math.cos(a))
         # Friction at the foot tips the cube forwards: the front pair carries t/2 more than half, of lever 1/2.
         rear, front = 0.25 * n - 0.25 * t, 0.25 * n + 0.25 * t
         normal = np.array([rear, rear, front, front])
@@ -148,7 +149,7 @@ def painleve(slide: float = 3.0, lift: float = 0.1) -> Draft:
 
 def _painleve(slide: float, lift: float) -> Problem:
     positive(lift=lift)
-    c, s = np.cos(1.2), np.sin(1.2)
+    c, s = math.cos(1.2), math.sin(1.2)
     a = np.array([[1.0 + 3.0 * c * c, 3.0 * c * s], [3.0 * c * s, 1.0 + 3.0 * s * s]])
     return Problem.contact(a, [-lift, -slide], [2.0])
 
@@ -177,16 +178,17 @@ def arch(n: int = 9, mu: float = 0.6) -> Draft:
     at_least(3, n=n)
     angle = np.pi * np.arange(n + 1) / n
     middle = 0.5 * (angle[1:] + angle[:-1])
-    position = np.stack([-5.0 * np.cos(middle), 0.0 * middle, 5.0 * np.sin(middle)], 1)
+    position = np.stack([-5.0 * each(math.cos, middle), 0.0 * middle, 5.0 * each(math.sin, middle)], 1)
     bodies = Bodies(position, 1.0, 0.3)
     k = np.arange(n + 1)
     pairs = np.stack([np.where(k == 0, -1, k - 1), np.where(k == n, -1, k)], 1)
     # Joint k looks along the arch; the corner points are at radii 4.5 and 5.5, half a metre either side.
     radius, side = (g.ravel() for g in np.meshgrid([4.5, 5.5], [-0.5, 0.5], indexing="ij"))
+    along, up = each(math.cos, angle), each(math.sin, angle)
     point = np.stack([
-        (-np.cos(angle)[:, None] * radius).ravel(), np.tile(side, n + 1), (np.sin(angle)[:, None] * radius).ravel()
+        (-along[:, None] * radius).ravel(), np.tile(side, n + 1), (up[:, None] * radius).ravel()
     ], 1)  # fmt: skip
-    normal = np.repeat(np.stack([np.sin(angle), 0.0 * angle, np.cos(angle)], 1), 4, axis=0)
+    normal = np.repeat(np.stack([up, 0.0 * angle, along], 1), 4, axis=0)
     problem = contact_problem(bodies, Contacts(np.repeat(pairs, 4, axis=0), point, normal), "coulomb", mu)
     return Draft(
         problem, "held up by friction and thrust alone: errors show as a sag", rest_reference(problem), EXACT
@@ -198,7 +200,7 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     """A house of cards: leaning pairs, cards across their tops, the next level on those; two points per edge."""
     at_least(1, levels=levels)
     lean = np.deg2rad(20.0)
-    d, h = np.sin(lean), np.cos(lean)
+    d, h = math.sin(lean), math.cos(lean)
     half = 0.02  # m, between the edges at a top
     position: list[list[float]] = []
     contacts: list[tuple[int, int, list[float], list[float]]] = []

@@ -17,6 +17,7 @@ from lavender.lab.suite.build import (
     Bodies,
     Contacts,
     contact_problem,
+    each,
     joint_problem,
     manifold,
     sideways,
@@ -166,7 +167,8 @@ def ring(n: int = 8) -> Draft:
     """A closed ring of n rods in a tilted circle, ball joints, hung at one point: a cycle of 3 n + 3 rows."""
     at_least(3, n=n)
     angle = 2.0 * np.pi * np.arange(n + 1) / n
-    anchor = np.stack([np.sin(angle), 0.2 * np.cos(angle), -1.0 + np.cos(angle)], 1)
+    along = each(math.cos, angle)
+    anchor = np.stack([each(math.sin, angle), 0.2 * along, -1.0 + along], 1)
     bodies = Bodies(0.5 * (anchor[1:] + anchor[:-1]), 1.0, 0.1)
     body = np.stack([np.arange(n) - 1, np.arange(n)], 1)
     body[0, 0] = n - 1
@@ -187,13 +189,13 @@ def ring(n: int = 8) -> Draft:
 def near_parallel(angle: float = 1e-4) -> Draft:
     """A point mass on two planes whose normals differ by 2 x `angle` [rad]: A = [[1, c], [c, 1]], c = cos 2 angle."""
     positive(angle=angle)
-    problem = _on_two_planes(np.sin(angle), np.cos(angle))
+    problem = _on_two_planes(math.sin(angle), math.cos(angle))
     unique = (
         "impulse" if angle > 1e-3 else "slack"
     )  # 1 - c^2 = 4 angle^2 amplifies the rounding of the normals
 
     def closed_form() -> Reference:
-        return Reference(np.full(2, 0.5 * FALL / np.cos(angle)), "closed form: symmetric", unique)
+        return Reference(np.full(2, 0.5 * FALL / math.cos(angle)), "closed form: symmetric", unique)
 
     return Draft(
         problem, "two contacts that are almost one: A is singular to float64 below 1e-8", closed_form
@@ -204,7 +206,7 @@ def near_parallel(angle: float = 1e-4) -> Draft:
 def wedge(angle: float = 1e-4) -> Draft:
     """A point mass falls into a slot whose two walls are `angle` [rad] from vertical: impulses 1 / (2 sin angle)."""
     positive(angle=angle)
-    problem = _on_two_planes(np.cos(angle), np.sin(angle))
+    problem = _on_two_planes(math.cos(angle), math.sin(angle))
 
     def closed_form() -> Reference:
         impulse = 0.5 * FALL / problem.rows.normal[:, 2]  # type: ignore[union-attr]

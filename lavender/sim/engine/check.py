@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import InputError
-from lavender.problem.cones import CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROW
+from lavender.problem.cones import kinds_of
 from lavender.sim.engine.layout import HEAD, SETTING, SIZE
 from lavender.sim.engine.state import KEPT, State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
@@ -107,16 +107,18 @@ def _check_contacts(new: State) -> None:
     ptr = b["ptr"][kj : kj + c + 1].astype(np.int64)
     blocks = np.diff(ptr)
     friction = b["mu"][kj : kj + c] > 0.0
-    kind = b["kind"][: kj + c]
-    kinds, rolls = kind[kj:], kind[kj:] == CONTACT_ROLLING
-    expected = np.where(friction, 3, 1) + (kinds == CONTACT_SPIN) + rolls * np.where(blocks == 6, 3, 2)
-    if ptr[0] != mj or ptr[-1] != mj + rows or (blocks != expected).any() or blocks.max(initial=1) > per:
+    box = friction & bool(new.head[HEAD["friction_shape"]])
+    most = np.where(box, 3, np.where(friction, 6, 1))
+    if (
+        ptr[0] != mj or ptr[-1] != mj + rows
+        or (blocks < np.where(friction, 3, 1)).any() or (blocks > most).any() or blocks.max(initial=1) > per
+    ):  # fmt: skip
         raise _damaged("the rows of its contacts do not add up")
-    known = (CONTACT, CONTACT_SPIN, CONTACT_BOX, CONTACT_ROLLING)
-    if c and ((kind[:kj] != ROW).any() or not np.isin(kinds, known).all()):
-        raise _damaged("kind holds what is no block")
-    if ((kind[kj:] == CONTACT_BOX) != (friction & bool(new.head[HEAD["friction_shape"]]))).any():
-        raise _damaged("kind holds contacts of another shape")
+    contact = np.arange(kj + c) >= kj
+    size = np.concatenate([np.ones(kj, np.int64), blocks])
+    sides = np.concatenate([np.zeros(kj, bool), box])
+    if c and (b["kind"][: kj + c] != kinds_of(contact, sides=sides, spin=size == 4, rolls=size > 4)).any():
+        raise _damaged("kind holds what is no such block")
     pair = b["contact_pair"][:c]
     if c and (pair.min() < 0 or pair.max() >= n or not np.array_equal(b["contact_body"][:c], b["dyn"][pair])):
         raise _damaged("contact_pair names bodies that the scene does not have")

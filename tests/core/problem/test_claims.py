@@ -24,7 +24,7 @@ from lavender import registry
 # Worked out anew at each call, and the caller's own.
 ANEW = {
     "contact_rows", "friction_rows", "normal_rows", "n_tangents", "n_together", "apart_rows", "spin_rows",
-    "rolling_rows", "reach", "coefficients", "stretch", "parents", "block_bodies",
+    "rolling_rows", "reach", "coefficients", "stretch", "parents", "block_bodies", "is_contact", "is_box", "is_ellipse",
 }  # fmt: skip
 
 
@@ -228,7 +228,7 @@ def test_a_liar_is_caught_in_every_form_and_law(form, status, plug_in):
                 impulse[:] = told
                 return says(status)
 
-            liar = plug_in(run, operators={"matrix"}, rolling=True, boxes={"coulomb", "cone"})
+            liar = plug_in(run, operators={"matrix"}, parts=True, boxes={"coulomb", "cone"})
             solution = lv.solve(problem, liar)
             assert solution.contradicted, (problem, name, str(solution))
     assert seen == {"linear", "lcp", "coulomb", "cone"}

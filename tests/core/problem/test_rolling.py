@@ -11,7 +11,7 @@ from lavender import registry
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import siconos_error
 
-TAKES = [n for n in lv.available(law="coulomb") if registry.specs()[n].rolling]
+TAKES = [n for n in lv.available(law="coulomb") if registry.specs()[n].parts]
 
 
 def soft_problem(seed, law, spin=True, **sizes):

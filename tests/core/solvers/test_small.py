@@ -18,11 +18,12 @@ from scipy.sparse import block_diag
 import lavender as lv
 from benchmarks.made import forms, fresh, stacks
 from lavender import registry
-from lavender.solvers.costs import newton_cost
+from lavender.solvers.costs import RATES, newton_cost
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.small import (
     AUTO,
     ISLAND,
+    TREE,
     SmallCall,
     call_ends_within,
     limits,
@@ -174,19 +175,32 @@ def test_round_cones_are_never_solved_over_rows_of_a():
 
 @pytest.mark.parametrize("seed", range(16))
 def test_the_compiled_gate_is_the_count_of_newton(seed):
-    """One cost for the compiled loops, for `explain` and for the tree; at the limit it lets in, above it not."""
+    """One cost for the compiled loops, for `explain` and for the tree; at the limits it lets in, above them not."""
     rng = np.random.default_rng(seed)
     friction = ("coulomb", "cone")[seed % 2]
     n, contacts = int(rng.integers(6, 60)), int(rng.integers(0, 60)) if seed % 3 else 0
     problem = random_general(seed, friction, n=n, compliance=False, contacts=contacts)
     state = registry.get("newton").load()().prepare(problem)
     cost = newton_cost(state.count, problem.law)
-    assert limits(1.0).cost(problem.metric, state.count.work)[0] == pytest.approx(cost, rel=1e-12)
+    each = RATES["sweep cone" if problem.law == "cone" else "entry"]
+    sweeps = (cost - TREE) / (RATES["sweep row"] * problem.m + each * problem.metric.work)
+    assert limits(0.0).cost(problem.metric, state.count.work)[0] == pytest.approx(cost, rel=1e-12)
 
     def lets_in(of):
-        return solve_first(problem.metric, None, np.inf, of) is not None
+        return solve_first(problem.metric, None, np.inf, of)[0] is not None
 
-    assert lets_in(limits(1.01 * cost)) and not lets_in(limits(0.99 * cost))
+    assert lets_in(limits(np.inf, 1.01 * cost)) and not lets_in(limits(np.inf, 0.99 * cost))
+    assert lets_in(limits(max(1.01 * sweeps, 0.0)))
+    assert sweeps < 0.0 or not lets_in(limits(0.99 * sweeps))
+
+
+def test_velocities_that_all_meet_are_one_call_as_well():
+    """L has 239 entries in a row, ten times as many as there is room for at first."""
+    rng = np.random.default_rng(0)
+    jac, velocity = rng.normal(size=(300, 240)), rng.normal(size=240)
+    problem = lv.Problem.from_jacobian(jac, np.eye(240), velocity, cones=lv.Cones.free(300), compliance=300.0)
+    found, counts = solve_first(fresh(problem).metric, None, 1e-6, limits(np.inf, np.inf))
+    assert found is not None and found.relative <= 1e-6 and counts[1] == 1
 
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
@@ -313,7 +327,7 @@ def test_ctrl_c_in_the_one_call_of_islands_is_a_result():
     main = threading.get_ident()
 
     def interrupt():
-        while sys._current_frames()[main].f_code is not SmallCall.solve.__code__:
+        while sys._current_frames()[main].f_code is not SmallCall.attempt.__code__:
             pass
         _thread.interrupt_main()
 

@@ -137,7 +137,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     expected = bench.campaign(names, ["pgs", "jacobi"], plan, workers=1)
     with (
         distributed.LocalCluster(
-            n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
+            n_workers=3, threads_per_worker=1, processes=True, dashboard_address=":0"
         ) as cluster,
         distributed.Client(cluster) as client,
     ):

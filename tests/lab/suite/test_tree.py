@@ -51,11 +51,12 @@ FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
     "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
     "linear, J and M": (lambda: over_velocities(None), ["newton"]),
-    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton over rows", "newton"]),
+    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "anderson", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
     "the cone law": (
-        lambda: suite.granular(n=4, friction="coulomb").problem.relaxed("cone"), ["anderson", "newton"],
+        lambda: suite.granular(n=4, friction="coulomb").problem.relaxed("cone"),
+        ["anderson", "anderson", "newton"],
     ),
     "a loose pile": (
         lambda: suite.granular(n=4, friction="coulomb").problem,
@@ -88,7 +89,7 @@ def test_the_tail_doubles(name):
     in_turn = stages[next(i for i, stage in enumerate(stages) if stage.why.startswith("in turn")) :]
     assert tree.begun + MOST * tree.newton + sum(stage.cost for stage in in_turn) <= LAST * tree.newton
     last = {}
-    for stage in in_turn:
+    for stage in in_turn[:-1]:  # the last has what is left
         if stage.solver in last:
             assert stage.iterations == pytest.approx(2.0 * last[stage.solver])
         last[stage.solver] = stage.iterations

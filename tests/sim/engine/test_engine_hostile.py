@@ -185,7 +185,7 @@ def caller(register):
     def make(now, at, resumable=False):
         solver = type("Now", (Caller,), {"now": staticmethod(now), "at": at, "runs": 0})
         laws = {"linear", "lcp", "coulomb", "cone"}
-        spec = {"laws": laws, "rolling": True, "summary": "calls", "resumable": resumable}
+        spec = {"laws": laws, "parts": True, "summary": "calls", "resumable": resumable}
         register(lv.SolverSpec("caller", solver, **spec))
         return solver
 

@@ -39,7 +39,7 @@ __all__ = ["CampaignPlan", "campaign", "seeds"]
 MOST_SEEDS = 1_000_000  # of a family in one run: a case's name and place take a kilobyte
 MOST_WORKERS = 4096  # processes: more than any machine has cores for
 ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost
-ROUND = 256  # pairs handed out together to a backend that cannot give results one by one
+HANDFUL = 256  # pairs handed out together to a backend that cannot give results one by one
 CONNECT = 10.0  # s, for a scheduler to answer
 WATCH = 0.5  # s between looks at whether the parent is still there
 HANG = 60.0  # s, after which a backend of another package is killed; the only clock, and it costs its record
@@ -254,7 +254,7 @@ def hand_out(
                 parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
             except ValueError:  # ray's backend gives whole lists alone: in rounds, each kept when it is done
                 parallel = joblib.Parallel(batch_size=1)
-                while some := list(itertools.islice(calls, ROUND)):
+                while some := list(itertools.islice(calls, HANDFUL)):
                     yield from parallel(some)
                 return
             with _deaf() if hasattr(signal, "pthread_sigmask") else contextlib.nullcontext():

@@ -11,6 +11,7 @@ Which structures are for judging was drawn by lot, below: rates and lines of the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +20,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from lavender.base.errors import UnknownName
-from lavender.lab.suite.build import Bodies, Contacts, sideways
+from lavender.lab.suite.build import Bodies, Contacts, each, sideways, tenfold
 from lavender.lab.suite.case import Draft, family
 from lavender.lab.suite.families import BOX, SPHERE, at_least
 from lavender.lab.suite.lots.wild import (
@@ -53,7 +54,8 @@ def dome(rng: np.random.Generator, rows: int) -> World:
     up = 0.5 * np.pi * (ring + 0.5) / (rings + 1)
     turn = 2.0 * np.pi * (k + 0.5 * (ring % 2)) / around
     size = around / 6.0
-    position = size * np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], 1)
+    high, far = each(math.sin, up), each(math.cos, up)
+    position = size * np.stack([far * each(math.cos, turn), far * each(math.sin, turn), high], 1)
     index = np.arange(rings * around)
     side = np.stack([index, around * ring + (k + 1) % around], 1)
     world = World(position, BOX).add(between(position, side))
@@ -176,8 +178,8 @@ def obstacle(rng: np.random.Generator, rows: int) -> Problem:
         sp.kron(line, eye) + sp.kron(eye, line) + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(side * side)
     )
     x, y = (v.ravel() / side for v in np.meshgrid(np.arange(side), np.arange(side), indexing="ij"))
-    force = rng.standard_normal() + 3.0 * np.sin(2.0 * np.pi * x * rng.integers(1, 4)) * np.cos(
-        3.0 * np.pi * y
+    force = rng.standard_normal() + 3.0 * each(math.sin, 2.0 * np.pi * x * rng.integers(1, 4)) * each(
+        math.cos, 3.0 * np.pi * y
     )
     return Problem.lcp(a, force / side)
 
@@ -193,7 +195,7 @@ def network(rng: np.random.Generator, rows: int) -> Problem:
         (np.concatenate([k, k]), np.concatenate([tail, head])),
     )
     incidence = sp.csr_array(ends, shape=(rows, n))
-    a = sp.csr_array(incidence @ incidence.T + sp.diags_array(10.0 ** rng.uniform(-4, 0, rows)))
+    a = sp.csr_array(incidence @ incidence.T + sp.diags_array(tenfold(rng.uniform(-4, 0, rows))))
     room = rng.exponential(1.0, rows)
     return Problem.lcp(a, incidence @ rng.standard_normal(n), -room * (rng.random(rows) < 0.5), room)
 
@@ -202,7 +204,7 @@ def boxed(rng: np.random.Generator, rows: int) -> Problem:
     """A dense matrix of given condition between bounds on both sides; some rows are free."""
     m = min(rows, LARGEST_DENSE // 2)
     q = np.linalg.qr(rng.standard_normal((m, m)))[0]
-    a = (q * 10.0 ** np.linspace(0.0, rng.uniform(1, 7), m)) @ q.T
+    a = (q * tenfold(np.linspace(0.0, rng.uniform(1, 7), m))) @ q.T
     width = rng.exponential(1.0, m)
     free = rng.random(m) < 0.1
     b = a @ rng.standard_normal(m)
@@ -231,7 +233,7 @@ def hand(rng: np.random.Generator, rows: int) -> Problem:
     keep = rng.random((count, 1, nv)) < rng.uniform(0.2, 0.8)
     jac = (keep * rng.standard_normal((count, size, nv))).reshape(-1, nv)
     root = rng.standard_normal((nv, nv)) / np.sqrt(nv)
-    scale = 10.0 ** rng.uniform(-1.5, 1.5, nv)
+    scale = tenfold(rng.uniform(-1.5, 1.5, nv))
     mass = scale[:, None] * (root @ root.T + 0.1 * np.eye(nv)) * scale
     v_free = rng.standard_normal(nv) / scale
     soft = float(rng.choice([0.0, 1e-4])) * np.einsum("ij,ij->i", jac, np.linalg.solve(mass, jac.T).T).mean()
@@ -256,7 +258,7 @@ def option(rng: np.random.Generator, rows: int) -> Problem:
         offsets=[-1, 0, 1],
     )
     payoff = np.maximum(0.0, rng.uniform(0.2, 0.8) - k / m)
-    held = payoff + 0.1 * np.exp(-(((k / m - 0.5) / 0.2) ** 2))
+    held = payoff + 0.1 * each(math.exp, -(((k / m - 0.5) / 0.2) ** 2))
     return Problem.lcp(sp.csr_array(a), held - a @ payoff)
 
 
@@ -266,7 +268,7 @@ def kernel(rng: np.random.Generator, rows: int) -> Problem:
     x = rng.standard_normal((m, int(rng.integers(1, 6))))
     label = np.where(x.sum(axis=1) + 0.5 * rng.standard_normal(m) > 0.0, 1.0, -1.0)
     square = ((x[:, None] - x[None]) ** 2).sum(axis=2)
-    a = label[:, None] * np.exp(-square * 10.0 ** rng.uniform(-1.0, 1.0)) * label
+    a = label[:, None] * each(math.exp, -square * 10.0 ** rng.uniform(-1.0, 1.0)) * label
     a[np.arange(m), np.arange(m)] += 10.0 ** rng.uniform(-6.0, -1.0)
     return Problem.lcp(a, rng.uniform(0.5, 1.5, m), 0.0, 10.0 ** rng.uniform(-1.0, 2.0))
 
@@ -275,7 +277,7 @@ def deblur(rng: np.random.Generator, rows: int) -> Problem:
     """A signal without negative values, seen through a blur of some width: K^T K, nearly singular."""
     m = min(max(8, rows), LARGEST_DENSE)
     wide = int(rng.integers(1, max(2, min(20, m // 4)) + 1))
-    weight = np.exp(-0.5 * (np.arange(-2 * wide, 2 * wide + 1) / wide) ** 2)
+    weight = each(math.exp, -0.5 * (np.arange(-2 * wide, 2 * wide + 1) / wide) ** 2)
     k = sp.diags_array(
         list(weight / weight.sum()), offsets=list(range(-2 * wide, 2 * wide + 1)), shape=(m, m)
     )
@@ -290,12 +292,12 @@ def beam(rng: np.random.Generator, rows: int) -> Problem:
     """A bent beam over an obstacle: fourth differences, which are no M-matrix and badly conditioned."""
     m = max(4, rows)
     second = sp.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(m, m))
-    stiff = 10.0 ** (rng.uniform(0.0, 1.0) * rng.standard_normal(m))
+    stiff = tenfold(rng.uniform(0.0, 1.0) * rng.standard_normal(m))
     a = sp.csr_array(
         second.T @ sp.diags_array(stiff) @ second + 10.0 ** rng.uniform(-6, -1) * sp.eye_array(m)
     )
     x = (np.arange(m) + 0.5) / m
-    load = -1.0 + 3.0 * np.sin(2.0 * np.pi * x * rng.integers(1, 5)) + 0.3 * rng.standard_normal(m)
+    load = -1.0 + 3.0 * each(math.sin, 2.0 * np.pi * x * rng.integers(1, 5)) + 0.3 * rng.standard_normal(m)
     return Problem.lcp(0.5 * (a + a.T), load / m, 0.0, rng.choice([np.inf, 2.0]))
 
 

@@ -14,6 +14,7 @@ and every problem of symmetric form has a solution: bodies at rest meet all its 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -22,7 +23,7 @@ import scipy.sparse as sp
 from scipy.spatial import cKDTree
 
 from lavender.base.arrays import FloatArray
-from lavender.lab.suite.build import Bodies, Contacts, manifold, sideways, static_loads
+from lavender.lab.suite.build import Bodies, Contacts, each, manifold, sideways, static_loads, tenfold
 from lavender.lab.suite.case import Draft, family
 from lavender.lab.suite.families import BOX, ROD, SPHERE, at_least, ball_joints
 from lavender.problem import Problem
@@ -144,7 +145,7 @@ def net(rng: np.random.Generator, rows: int) -> World:
     """A net of ball joints, held at its corners: loops, so rows that depend on each other."""
     side = max(2, round(np.sqrt(rows / 6)))
     grid = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
-    sag = 0.3 * np.sin(np.pi * grid / (side - 1)).prod(axis=1)
+    sag = 0.3 * each(math.sin, np.pi * grid / (side - 1)).prod(axis=1)
     position = np.stack([grid[:, 0], grid[:, 1], 1.0 - sag], 1) + 1e-3 * rng.standard_normal((side * side, 3))
     pairs = cKDTree(grid).query_pairs(1.01, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
@@ -176,9 +177,9 @@ def snake(rng: np.random.Generator, rows: int) -> World:
     """A chain of rods along the floor, each end of it on the floor or not."""
     n = max(2, rows // 4)
     k = np.arange(n)
-    position = np.stack([1.0 * k, 0.3 * np.sin(0.3 * k), np.full(n, 0.1)], 1) + 0.01 * rng.standard_normal(
-        (n, 3)
-    )
+    position = np.stack(
+        [1.0 * k, 0.3 * each(math.sin, 0.3 * k), np.full(n, 0.1)], 1
+    ) + 0.01 * rng.standard_normal((n, 3))
     joint = np.stack([k[:-1], k[1:]], 1)
     world = World(position, ROD, joint=joint, anchor=0.5 * (position[:-1] + position[1:]))
     return world.add(on_floor(position, rng.random(n) < 0.8))
@@ -264,7 +265,7 @@ def _as_matrix(rng: np.random.Generator, problem: Problem, form: str) -> Problem
     if form == "asymmetric":
         a = a.copy()
         off = np.repeat(np.arange(a.shape[0]), np.diff(a.indptr)) != a.indices
-        size = 10.0 ** rng.uniform(-5.0, np.log10(2e-3))
+        size = 10.0 ** rng.uniform(-5.0, math.log10(2e-3))
         a.data[off] *= 1.0 + size * rng.uniform(-1.0, 1.0, int(off.sum()))
     matrix = a.toarray() if form == "dense" else a
     return Problem(problem.b, problem.cones, matrix=matrix, friction=problem.friction)
@@ -297,7 +298,7 @@ def masses_of(rng: np.random.Generator, word: str, n: int) -> FloatArray:
     if word == "uniform":
         return rng.uniform(0.5, 2.0, n)
     if word == "spectrum":
-        return 10.0 ** (rng.uniform(-0.5, 0.5, n) * rng.uniform(2.0, 8.0))
+        return tenfold(rng.uniform(-0.5, 0.5, n) * rng.uniform(2.0, 8.0))
     if word == "two classes":
         return np.where(rng.random(n) < rng.uniform(0.1, 0.9), 1.0, 10.0 ** rng.uniform(1.0, 5.0))
     mass = np.ones(n)
