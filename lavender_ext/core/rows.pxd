@@ -302,15 +302,13 @@ cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
     # J v (m) of all rows; v (n, 6).
-    cdef int32_t i, j, c, n
+    cdef int32_t i, j, c
     for i in range(r.n_joints):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             out[j] = joint_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
     for c in range(r.n_contacts):
         i = r.n_joints + c
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        contact_slack(r, c, n_directions(p, i), n_turns(p, i), v, out + j)
+        contact_slack(r, c, n_directions(p, i), n_turns(p, i), v, out + p.ptr[i])
 
 
 cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t turns,

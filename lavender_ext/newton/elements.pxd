@@ -4,8 +4,9 @@ With d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
 
     H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
 
-An element is a bounded row, or a contact of a normal and parts g whose cones in z are |z_g| <= a_g z_n. Interior point and natural map both ask for (H + W) dz = r with one small W for
-each element; in the velocity form, with V = (theta + W)^-1 per element,
+An element is a bounded row, or a contact of a normal and parts g whose cones in z are |z_g| <= a_g z_n. Interior point
+and natural map both ask for (H + W) dz = r with one small W for each element; in the velocity form, with
+V = (theta + W)^-1 per element,
 
     N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
 

@@ -137,7 +137,6 @@ cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* ro
         else:
             a = r.contact_body[2 * c]
             b = r.contact_body[2 * c + 1]
-            n = p.ptr[i + 1] - j
             contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
             row = jac
         for q in range(j, p.ptr[i + 1]):

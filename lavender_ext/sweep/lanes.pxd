@@ -1,8 +1,8 @@
 """Two blocks of one kind at once, one in each lane: the update of core/rows.pxd, operation by operation.
 
 A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; one that
-spins; two that roll), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a block of another
-kind, or of more rows, has the kind ALONE and is updated by it.
+spins; two that roll), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a
+block of another kind, or of more rows, has the kind ALONE and is updated by it.
 
 A record holds what an update reads, in pairs, one entry for each lane:
 

@@ -15,7 +15,7 @@ from twins import block_diagonal
 from worked import python
 
 import lavender as lv
-from lavender.problem.cones import CONTACT_SPIN, ROW
+from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
