@@ -186,7 +186,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     found: list[Any] = [None] * n
     held: list[Any] = [np.zeros(0, np.int32)] * n  # what names are made of
     free, smooth = np.full((n, model.nv), np.nan), np.zeros((n, model.nv))
-    mass = np.zeros((n, len(mj.MjData(model).M)))
+    mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
     none = [np.zeros(0) for _ in OF_ROWS]
     todo = iter(range(n))

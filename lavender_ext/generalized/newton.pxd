@@ -435,7 +435,7 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
                 restart(f, island, impulse)
             begin_descent(f, island, CONE if x.at == RELAXED else COULOMB, 1.0 / 0.0)
         f.p.law = CONE if x.at == RELAXED else COULOMB
-        n = descend(f, island, 1e-2 * least if x.at == RELAXED and least > 1e2 else 1.0)
+        n = descend(f, island, 0.1 * least if x.at == RELAXED and least > 1e2 else 1.0)
         if x.at == RELAXED:
             if n == LOST or n == FAILED:
                 return n

@@ -121,7 +121,7 @@ cdef inline void inertia_root(int32_t n, const double* inv_inertia, double* root
 cdef inline void fill_panel(const blocks_t* p, const rows_t* r, const double* root, const double* root_mass,
                             double* panel) noexcept nogil:
     """K (m, 12): D^-1/2 J M^-1/2, columns of body a then b."""
-    cdef int32_t i, j, q, c, k, h, a, b, body, n
+    cdef int32_t i, j, q, c, k, h, a, b, body
     cdef double jac[72]
     cdef double x
     cdef const double *row
