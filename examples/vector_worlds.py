@@ -1,9 +1,9 @@
 """A verdict for every world of a vector environment, at every step of the training loop.
 
-Needs MuJoCo: pip install mujoco. With gymnasium its HalfCheetah-v5; without, hoppers in plain MuJoCo behind the same
-two calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and MuJoCo's
-answers to `residual_many`: worlds that are further off than a trainer would accept are counted, and their samples
-could be left out.
+Needs MuJoCo: pip install mujoco. With "gymnasium[mujoco]" its HalfCheetah-v5; without, hoppers in plain MuJoCo behind
+the same two calls, `reset` and `step`. After each step of the environments the states go to `from_mujoco_many` and
+MuJoCo's answers to `residual_many`: worlds that are further off than a trainer would accept are counted, and their
+samples could be left out.
 
     python examples/vector_worlds.py [WORLDS [STEPS [ITERATIONS]]]
 
@@ -68,9 +68,9 @@ def make(n):
         envs = gymnasium.make_vec("HalfCheetah-v5", num_envs=n, vectorization_mode="sync")
         inner = [env.unwrapped for env in envs.envs]
         return envs, inner[0].model, [env.data for env in inner], "HalfCheetah-v5 of gymnasium"
-    except ImportError:
+    except ImportError as error:
         envs = Hoppers(n)
-        return envs, envs.model, envs.datas, "hoppers in plain MuJoCo"
+        return envs, envs.model, envs.datas, f"hoppers in plain MuJoCo ({error})"
 
 
 def states_of(model, datas):
