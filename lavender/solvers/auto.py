@@ -150,7 +150,7 @@ class Tree:
     def is_short(self, newton: float) -> bool:
         """A limit that Newton's method of this cost [ns] may use up: sweeps tell the pace, and leave something."""
         return self.deadline.is_set and self.deadline.passed(
-            setup_time("newton", self.problem) + 1e-9 * 3.0 * SURE * newton
+            3.0 * (setup_time("newton", self.problem) + 1e-9 * SURE * newton)
         )
 
     @property

@@ -11,7 +11,8 @@
 3. If rows are nearly dependent and 1 and 2 fail: both again, with the augmented system of the bodies.
 4. Coulomb friction: a proximal Newton method on the Alart-Curnier map, and interior points on De Saxce's form of the
    law, whose convex problem changes with every step. Where these stall, a path of smoothed problems (Chen, Mangasarian
-   1996) is followed by its arc length (Keller 1977), through folds where contacts pass from stick to slip.
+   1996) is followed, each step by the coordinate that changes fastest (Rheinboldt 1986), through folds where contacts
+   pass from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
 forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity".

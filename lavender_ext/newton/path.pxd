@@ -5,18 +5,25 @@ With p(x) = (x + sqrt(x^2 + 4 tau^2)) / 2 for max(0, x), y = z - s, s = (H + eps
     n = p(y_n),   r = a n,   m = r + p(|y_t| - r),   F_n = z_n - n,   F_t = z_t - (r / m) y_t                  (1)
 
 (Chen, Mangasarian 1996; of a frictionless contact it is the central path z s = tau^2), with c tau for tau in m. Its
-solutions from a large tau, where there is one, to tau = 0 are a curve in (z, log tau), on which tau may rise for a while:
-where contacts that carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. So it is
-followed by its arc length (Keller 1977): with F_z b = -F_tau the tangent t = (b, 1) / |(b, 1)|, a step along t and half
-the change of t, then Newton's method on F = 0 across t,
+solutions from a large tau to tau = 0 are a curve in (z, log tau), on which tau may rise for a while: where contacts that
+carry load pass from stick to slip, the curve turns back, and what only lowers tau loses it. How far a contact is from
+its next piece is told by coordinates of its own,
 
-    F_z dz + F_tau dl = -F,   t . (dz, dl) = 0     dz = a + b dl,   F_z a = -F                               (2)
+    asinh(y_n / 2 tau)   and   asinh((r - |y_t|) / 2 c tau).                                               (2)
 
-A step is told by what it changes of y_n, |y_t| - r and the direction of y_t, each relative to its size (to tau, where that
-is less). Of one factor, simplified Newton steps follow, which must contract (Deuflhard 2011): a point where they do not is
-not on the curve, however small a step is. Which c leads to a solution soon nobody knows before: some are tried in turn,
-each from the start. eps is a compliance: without it, redundant contacts share their load as tau^2 / z says, which no
-factor sees.
+Whichever changes fastest along the tangent (b, 1), F_z b = -F_tau, be it log tau itself, is the parameter of the next
+step (local parameterisation: Rheinboldt 1986): a contact that slips runs through its own coordinate while the curve turns
+sharply in z and tau. A step follows the tangent and half its change, as far as the fastest coordinate may go; Newton's
+method then leaves the parameter x as it is,
+
+    F_z dz + F_tau dl = -F,   x'(dz, dl) = 0     dz = a + b dl,   F_z a = -F,   dl = -x'(a, 0) / x'(b, 1)         (3)
+
+and is measured by what it changes of (2) and of the direction of y_t. Of one factor, simplified Newton steps follow, which
+must contract (Deuflhard 2011). On the curve the sign of dl is that of -det F_z (Allgower, Georg 2003): at a large tau,
+where tau falls, det F_z > 0. So its direction is known at every point, even at one that a step has come to by chance.
+
+Which c leads to a solution soon nobody knows before: some are tried in turn, each from the start. eps is a compliance:
+without it, redundant contacts share their load as tau^2 / z says, which no factor sees.
 """
 from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
@@ -27,7 +34,7 @@ from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
 from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
-from lavender_ext.newton.system cimport OF_NATURAL, all_finite, solve_natural, system_factor, system_times
+from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, solve_natural, system_factor, system_sign, system_times)
 
 
 cdef inline double exponential(double x) noexcept nogil:
@@ -79,25 +86,30 @@ cdef enum:                      # where a path stands
     TRYING = 4                  # whether Newton's method ends it
 
 cdef enum:
-    PATHS = 4                   # with a c of their own
-    FIRST_STEPS = 40            # factorisations on the first tau
-    CORRECTIONS = 5             # factors of one point
-    SIMPLIFIED = 4              # steps with one factor
+    PATHS = 3                   # with a c of their own
+    STEPS = 600                 # factorisations of one at most
+    FIRST_STEPS = 40            # on the first tau
+    CORRECTIONS = 4             # factors of one point
+    SIMPLIFIED = 3              # steps with one factor
     REPEATED = 4                # factors that make a point exact
-    SHORTER = 3                 # times that a step is shortened before that
-    RETURNS = 3                 # to an earlier point, with points ten times as exact
-    APART = 10                  # steps between two such points
+    SHORTER = 2                 # times that a step is halved before that
+    CLEAN = 6                   # steps after which points may be as inexact as before a return
     ENDING = 4                  # Newton steps of a trial
+
+cdef enum:                      # coordinates: 4 i + FIRST of element i (a contact's normal, a row's lower bound), then its cones
+    LOG_TAU = 0                 # (a row's upper bound)
+    FIRST = 1
+    OF_ONE = 4
 
 
 cdef inline double wide_of(int32_t k) noexcept nogil:
     """c of the k-th path."""
-    return 3.0 if k < 1 else 10.0 if k < 2 else 1.0 if k < 3 else 0.3  # not ==, of which compilers make a table
+    return 1.0 if k < 1 else 3.0 if k < 2 else 10.0     # not ==, of which compilers make a table
 
 
-cdef inline int32_t steps_of(int32_t k) noexcept nogil:
-    """Factorisations of the k-th path at most."""
-    return 350 if k < 1 else 250 if k < 2 else 500 if k < 3 else 400
+cdef inline double exact_of() noexcept nogil:
+    """Change of (2) by what is left of a correction, below which a point counts as one of the curve."""
+    return 0.2
 
 
 cdef inline double path_compliance() noexcept nogil:
@@ -175,7 +187,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
 
 
 cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
-    """F of z into n.f, with a compliance eps; with `derived` its small matrices, dF / d log tau (n.c) and y (n.t1)."""
+    """F of z into n.f and y into n.t1, with a compliance eps; with `derived` small matrices and dF / d log tau (n.c)."""
     cdef const elements_t* e = n.s.e
     cdef double eps = path_compliance()
     cdef int32_t i, j, k, l, t, q, nr
@@ -186,6 +198,7 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
     with_products(n, z, n.rest)
     for j in range(e.m):
         n.rest[j] += eps * z[j]
+        n.t1[j] = z[j] - n.rest[j]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -198,7 +211,6 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
             continue
         for k in range(nr):
             n.c[j + k] = ft[k]
-            n.t1[j + k] = z[j + k] - n.rest[j + k]
             for l in range(nr):
                 n.s.p[q + k * nr + l] = p[k * nr + l]
                 rest[k * nr + l] += p[k * nr + l] * (e.theta[j + l] + eps)
@@ -211,200 +223,264 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
                 n.s.v[q + k * nr + l] = x
 
 
-cdef inline double change(newton_t* n, const double* dz, double tau) noexcept nogil:
-    """Largest relative change of a distance to the next piece by dz, at the y of the last `smooth`."""
+cdef inline void change_of_y(newton_t* n, const double* dz, double* dy) noexcept nogil:
+    """dy = dz - (H + eps) dz."""
+    cdef int32_t j
+    system_times(&n.s, dz, dy)
+    for j in range(n.s.e.m):
+        dy[j] = dz[j] - dy[j] - path_compliance() * dz[j]
+
+
+cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
+                           double* turned) noexcept nogil:
+    """What (dy, dl) changes of a coordinate at the y of the last `smooth`, and of the direction of y_t beside it."""
     cdef const elements_t* e = n.s.e
-    cdef int32_t i, j, k, first, size, g
-    cdef double worst = 0.0, x, y, dy, r, q, along, square, wide = n.path.wide * tau
-    cdef double* d = n.hdz
-    system_times(&n.s, dz, d)
-    for j in range(e.m):
-        d[j] = dz[j] - d[j] - path_compliance() * dz[j]
+    cdef int32_t i = (which - FIRST) // OF_ONE, part = (which - FIRST) % OF_ONE, j, k, first, size
+    cdef double x, dx, y, normal, root, r, q, along, square, a, wide = tau
+    turned[0] = 0.0
+    if which == LOG_TAU:
+        return dl
+    j = e.ptr[i]
+    if is_row(e, i):
+        x = n.t1[j] - e.lower[j] if part == 0 else e.upper[j] - n.t1[j]
+        dx = dy[j] if part == 0 else -dy[j]
+    elif part == 0:
+        x, dx = n.t1[j], dy[j]
+    else:
+        y = n.t1[j]
+        normal, root = plus(y, tau), sqrt(y * y + 4.0 * tau * tau)
+        part += e.part[i] - 1
+        size, first, a = e.size[part], e.first[part], e.reach[part]
+        wide = n.path.wide * tau
+        r, q = a * normal, 0.0
+        along = square = 0.0
+        for k in range(first, first + size):
+            q += n.t1[k] * n.t1[k]
+            along += n.t1[k] * dy[k]
+            square += dy[k] * dy[k]
+        q = sqrt(q)
+        along = along / q if q > 0.0 else 0.0
+        x = r - q
+        dx = a * (normal * dy[j] + 2.0 * tau * tau * dl) / root - along
+        square -= along * along
+        turned[0] = (sqrt(square) if square > 0.0 else 0.0) / (q + r + 2.0 * wide)
+    return (dx - x * dl) / sqrt(x * x + 4.0 * wide * wide)
+
+
+cdef inline double fastest(const newton_t* n, const double* dy, double dl, double tau, int32_t* which,
+                           double* turned) noexcept nogil:
+    """The largest rate of a coordinate, and which it is; the largest of a direction."""
+    cdef const elements_t* e = n.s.e
+    cdef int32_t i, part
+    cdef double worst = fabs(dl), x, turn
+    which[0] = LOG_TAU
+    turned[0] = 0.0
     for i in range(e.n):
-        j = e.ptr[i]
-        y, dy = n.t1[j], d[j]
-        if is_row(e, i):
-            if is_low(e, j):
-                x = fabs(dy) / (fabs(y - e.lower[j]) + 2.0 * tau)
-                worst = worst if x <= worst else x
-            if is_high(e, j):
-                x = fabs(dy) / (fabs(e.upper[j] - y) + 2.0 * tau)
-                worst = worst if x <= worst else x
-            continue
-        x = fabs(dy) / (fabs(y) + 2.0 * tau)
-        worst = worst if x <= worst else x
-        for g in range(e.part[i], e.part[i + 1]):
-            size = e.size[g]
-            first = e.first[g]
-            r, q = e.reach[g] * plus(y, tau), 0.0
-            along = square = 0.0
-            for k in range(first, first + size):
-                q += n.t1[k] * n.t1[k]
-                along += n.t1[k] * d[k]
-                square += d[k] * d[k]
-            q = sqrt(q)
-            along = along / q if q > 0.0 else 0.0
-            x = fabs(e.reach[g] * slope(y, tau) * dy - along) / (fabs(r - q) + 2.0 * wide)
-            worst = worst if x <= worst else x
-            square -= along * along
-            x = (sqrt(square) if square > 0.0 else 0.0) / (q + r + 2.0 * wide)
-            worst = worst if x <= worst else x
+        for part in range(OF_ONE):
+            if is_row(e, i):
+                if not (part == 0 and is_low(e, e.ptr[i]) or part == 1 and is_high(e, e.ptr[i])):
+                    continue
+            elif part > e.part[i + 1] - e.part[i]:
+                continue
+            x = fabs(rate_of(n, OF_ONE * i + FIRST + part, dy, dl, tau, &turn))
+            turned[0] = turned[0] if turn <= turned[0] else turn
+            if not x <= worst:
+                worst = x
+                which[0] = OF_ONE * i + FIRST + part
     return worst
+
+
+cdef inline double change(const newton_t* n, const double* dy, double dl, double tau) noexcept nogil:
+    """Largest change of a coordinate or direction by (dy, dl)."""
+    cdef int32_t which
+    cdef double turned, worst = fastest(n, dy, dl, tau, &which, &turned)
+    return worst if not worst < turned else turned
 
 
 # -- steps -----------------------------------------------------------------------------------------------------
 
 
-cdef inline double inner(const double* x, const double* y, int32_t m) noexcept nogil:
-    cdef int32_t j
-    cdef double total = 0.0
-    for j in range(m):
-        total += x[j] * y[j]
-    return total
-
-
 cdef inline void begin_path(newton_t* n) noexcept nogil:
     """The next, from z = 0, in vectors that interior points and exchanges have left."""
     cdef path_t* x = &n.path
-    cdef int32_t m = n.s.e.m
+    cdef int32_t j, m = n.s.e.m
     x.z, x.t, x.old, x.b = n.ip.z, n.ip.u1, n.ip.u2, n.ip.hz
     x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = n.exchange.z, n.exchange.hz, n.exchange.kept, n.ip.everything
     memset(x.z, 0, m * sizeof(double))
-    x.size = sqrt(inner(n.s.e.g, n.s.e.g, m) / m)
+    x.size = 0.0
+    for j in range(m):
+        x.size += n.s.e.g[j] * n.s.e.g[j]
+    x.size = sqrt(x.size / m)
     x.start = x.l = logarithm(3.0 * x.size)
-    x.exact = 3e-3
+    x.exact = exact_of()
     x.near = 1e-2
-    x.h = 0.5
-    x.last = n.s.factorisations + steps_of(x.paths)
+    x.h = 0.3
+    x.last = n.s.factorisations + STEPS
     x.wide = wide_of(x.paths)
     x.paths += 1
-    x.at = x.points = x.used = x.returns = 0
+    x.at = x.used = x.marks = x.clean = x.bends = x.shorter = 0
     if 0.0 < x.size < 1.0 / 0.0:
         enter(n, PATH)
 
 
 cdef inline bint path_factor(newton_t* n, const double* z, double tau) noexcept nogil:
-    """a of (2) into n.dz and b into x.b; False where they are not finite."""
+    """a of (3) into n.dz and b into x.b, what they change of y into n.t2 and n.psi; False where they are not finite."""
     cdef int32_t j, m = n.s.e.m
     smooth(n, z, tau, True)
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
     system_factor(&n.s, OF_NATURAL, path_compliance())
+    n.path.sign = system_sign(&n.s)
     solve_natural(&n.s, n.f, n.dz)
     solve_natural(&n.s, n.c, n.path.b)
     for j in range(m):
         n.dz[j] = -n.dz[j]
         n.path.b[j] = -n.path.b[j]
+    change_of_y(n, n.dz, n.t2)
+    change_of_y(n, n.path.b, n.psi)
     return all_finite(n.dz, m) and all_finite(n.path.b, m)
 
 
-cdef inline double across_tangent(newton_t* n) noexcept nogil:
-    """dl of (2), with dz = a + b dl in place of a."""
+cdef inline double along_curve(newton_t* n, double tau, double* found) noexcept nogil:
+    """dl of (3), with dz = a + b dl in place of a; how much that changes."""
     cdef path_t* x = &n.path
-    cdef int32_t j, m = n.s.e.m
-    cdef double w = 1.0 / x.square
-    cdef double dl = -w * inner(x.t, n.dz, m) / (x.tl + w * inner(x.t, x.b, m))
-    for j in range(m):
+    cdef int32_t j
+    cdef double turned, dl = 0.0
+    if x.which != LOG_TAU:
+        dl = -rate_of(n, x.which, n.t2, 0.0, tau, &turned) / rate_of(n, x.which, n.psi, 1.0, tau, &turned)
+    for j in range(n.s.e.m):
         n.dz[j] += x.b[j] * dl
+        n.t2[j] += n.psi[j] * dl
+    found[0] = change(n, n.t2, dl, tau)
     return dl
 
 
-cdef inline void new_tangent(newton_t* n, bint first) noexcept nogil:
-    """Of x.z and the last b, in the direction of the one before."""
-    cdef path_t* x = &n.path
-    cdef int32_t j, m = n.s.e.m
-    cdef double size, turned
-    x.square = inner(x.z, x.z, m)
-    if not x.square > 0.0:
-        x.square = 1.0
-    size = 1.0 / sqrt(inner(x.b, x.b, m) / x.square + 1.0)
-    turned = -1.0 if first else inner(x.b, x.t, m) / x.square + x.tl
-    size = -size if turned < 0.0 else size
-    for j in range(m):
-        x.t[j] = size * x.b[j]
-    x.tl = size
+cdef inline void advance(newton_t* n, double* z, double* l, double dl) noexcept nogil:
+    cdef int32_t j
+    for j in range(n.s.e.m):
+        z[j] += n.dz[j]
+    l[0] += dl
 
 
-cdef inline void mark(newton_t* n, int32_t k) noexcept nogil:
+cdef inline void new_tangent(newton_t* n, double tau) noexcept nogil:
+    """The direction of the last b: by the sign of the determinant, or, where that is unknown, on through the parameter."""
     cdef path_t* x = &n.path
-    take(n, x.mark[k], x.z)
-    take(n, x.mark_t[k], x.t)
-    x.mark_l[k], x.mark_tl[k], x.mark_h[k], x.mark_square[k] = x.l, x.tl, x.h, x.square
+    cdef int32_t j
+    cdef double turned
+    x.tl = -1.0 if x.sign > 0 else 1.0
+    if x.sign == 0:
+        x.tl = 1.0 if rate_of(n, x.which, n.psi, 1.0, tau, &turned) * x.speed > 0.0 else -1.0
+    for j in range(n.s.e.m):
+        x.t[j] = x.tl * x.b[j]
+
+
+cdef inline void mark(newton_t* n) noexcept nogil:
+    """The last point, to which steps that fail may return."""
+    cdef path_t* x = &n.path
+    cdef double* place = x.mark[0]
+    cdef double* tangent = x.mark_t[0]
+    x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = x.mark[1], x.mark_t[1], place, tangent
+    x.mark_l[0], x.mark_tl[0], x.mark_h[0] = x.mark_l[1], x.mark_tl[1], x.mark_h[1]
+    take(n, x.mark[1], x.z)
+    take(n, x.mark_t[1], x.t)
+    x.mark_l[1], x.mark_tl[1], x.mark_h[1] = x.l, x.tl, x.h
+    x.marks = 2 if x.marks else 1
+
+
+cdef inline bint go_back(newton_t* n) noexcept nogil:
+    """To the point before, with a shorter step and more exactly; False where there is none."""
+    cdef path_t* x = &n.path
+    cdef double* place = x.mark[0]
+    cdef double* tangent = x.mark_t[0]
+    if x.marks == 0:
+        return False
+    take(n, x.z, x.mark[1])
+    take(n, x.t, x.mark_t[1])
+    x.l, x.tl, x.h = x.mark_l[1], x.mark_tl[1], 0.5 * x.mark_h[1]
+    x.mark[0], x.mark_t[0], x.mark[1], x.mark_t[1] = x.mark[1], x.mark_t[1], place, tangent
+    x.mark_l[1], x.mark_tl[1], x.mark_h[1] = x.mark_l[0], x.mark_tl[0], x.mark_h[0]
+    x.marks -= 1
+    x.exact = 0.1 * x.exact if 0.1 * x.exact > 1e-3 else 1e-3
+    x.bends = x.clean = x.shorter = 0
+    return True
 
 
 cdef inline void predict(newton_t* n) noexcept nogil:
-    """z and l along tangent and curvature, into n.u and x.next."""
+    """The tangent by its fastest coordinate, then z and l along tangent and curvature, into n.u and x.next."""
     cdef path_t* x = &n.path
     cdef int32_t j
-    cdef double c = 0.5 * x.h * x.h / x.before if x.bends else 0.0
+    cdef double c, fast, turned, tau = exponential(x.l)
+    smooth(n, x.z, tau, False)
+    change_of_y(n, x.t, n.t2)
+    fast = fastest(n, n.t2, x.tl, tau, &x.which, &turned)
+    x.speed = rate_of(n, x.which, n.t2, x.tl, tau, &c)
+    fast = fast if not fast < turned else turned
+    c = 0.5 * x.h * x.h / x.before if x.bends else 0.0
     for j in range(n.s.e.m):
+        x.t[j] /= fast
         n.u[j] = x.z[j] + x.h * x.t[j] + (c * (x.t[j] - x.old[j]) if x.bends else 0.0)
+    x.tl /= fast
     x.next = x.l + x.h * x.tl + (c * (x.tl - x.old_l) if x.bends else 0.0)
-    x.corrected = 0
+    x.used = 0
     x.found = x.previous = 1.0 / 0.0
     x.at = CORRECTING
 
 
 cdef inline bint corrected(newton_t* n) noexcept nogil:
-    """One factor, and what follows with it; whether n.u is on the curve. Otherwise x.found says how far it was, inf: no more."""
+    """One factor, and what follows with it; whether n.u is on the curve. Otherwise x.previous < 0: it leads nowhere."""
     cdef path_t* x = &n.path
-    cdef int32_t j, _, m = n.s.e.m
-    cdef double tau = exponential(x.next), dl, found, other
+    cdef int32_t j, k, m = n.s.e.m
+    cdef double tau = exponential(x.next), dl, found, other, contraction = 0.5
     if not path_factor(n, n.u, tau):
         x.previous = -1.0
         return False
-    dl = across_tangent(n)
-    found = change(n, n.dz, tau)
-    if x.corrected == 0:
+    dl = along_curve(n, tau, &found)
+    if x.used == 0:
         x.found = found
-    x.corrected += 1
-    if not found < 0.5 * (x.previous if x.previous < 1.0 else 1.0):
+    x.used += 1
+    if not found < (0.5 * x.previous if x.previous < 2.0 else 1.0):
         x.previous = -1.0
         return False
-    for _ in range(SIMPLIFIED + 1):
-        for j in range(m):
-            n.u[j] += n.dz[j]
-        x.next += dl
-        if _ == SIMPLIFIED:
+    for k in range(SIMPLIFIED + 1):
+        advance(n, n.u, &x.next, dl)
+        if found * contraction < x.exact * (1.0 - contraction):
+            return True
+        if k == SIMPLIFIED:
             break
-        smooth(n, n.u, exponential(x.next), False)
+        tau = exponential(x.next)
+        smooth(n, n.u, tau, False)
         solve_natural(&n.s, n.f, n.dz)
         for j in range(m):
             n.dz[j] = -n.dz[j]
-        dl = across_tangent(n)
-        other = change(n, n.dz, tau)
-        if not other < 0.5 * found:
+        change_of_y(n, n.dz, n.t2)
+        dl = along_curve(n, tau, &other)
+        contraction = other / found
+        if not contraction < 0.5:
             break
         found = other
-        if found < x.exact:
-            for j in range(m):
-                n.u[j] += n.dz[j]
-            x.next += dl
-            return True
-    x.previous = found if x.corrected < CORRECTIONS else -1.0
+    x.previous = found if x.used < CORRECTIONS else -1.0
     return False
 
 
 cdef inline void accept(newton_t* n) noexcept nogil:
     """n.u is the next point."""
     cdef path_t* x = &n.path
-    cdef double found
+    cdef double found = x.tl
+    mark(n)
     take(n, x.old, x.t)
-    x.old_l = x.tl
-    x.before, x.bends = x.h, 1
+    x.old_l, x.before = x.tl, x.h
     take(n, x.z, n.u)
     x.l = x.next
-    new_tangent(n, False)
-    x.points += 1
-    found = exponential(logarithm(0.2 / (x.found if x.found > 1e-9 else 1e-9)) / 3.0)
-    x.h *= 2.0 if found > 2.0 else 0.5 if found < 0.5 else found
+    new_tangent(n, exponential(x.l))
+    x.bends = found * x.tl > 0.0                        # not around a fold
     x.shorter = 0
+    x.clean += 1
+    if x.clean > CLEAN:
+        x.exact = exact_of()
+    found = exponential(logarithm(0.12 / (x.found if x.found > 1e-9 else 1e-9)) / 3.0)
+    x.h *= 2.0 if found > 2.0 else 0.5 if found < 0.5 else found
+    x.h = x.h if x.h < 1.5 else 1.5
     x.at = STEPPING
-    if x.points % APART == 0:
-        take(n, x.mark[0], x.mark[1])
-        take(n, x.mark_t[0], x.mark_t[1])
-        x.mark_l[0], x.mark_tl[0], x.mark_h[0], x.mark_square[0] = x.mark_l[1], x.mark_tl[1], x.mark_h[1], x.mark_square[1]
-        mark(n, 1)
     found = score(n, x.z)
     if found < x.near and not done(n):
         x.near = 0.1 * found
@@ -413,77 +489,76 @@ cdef inline void accept(newton_t* n) noexcept nogil:
         enter_rounds(n, 1, ENDING)
 
 
-cdef inline double change_of_tangent(newton_t* n) noexcept nogil:
-    """By a step of length 1."""
+cdef inline bint repeated(newton_t* n) noexcept nogil:
+    """A Newton step on the last point, in n.u; False where it leads nowhere."""
     cdef path_t* x = &n.path
-    smooth(n, x.z, exponential(x.l), True)
-    return change(n, x.t, exponential(x.l)) + fabs(x.tl)
+    cdef double tau = exponential(x.next), dl, found
+    x.used += 1
+    if not path_factor(n, n.u, tau):
+        return False
+    dl = along_curve(n, tau, &found)
+    if not (found < x.previous and found <= 1.0):
+        return False
+    advance(n, n.u, &x.next, dl)
+    x.previous = found
+    if found < 0.02:
+        take(n, x.z, n.u)
+        x.l = x.next
+        new_tangent(n, exponential(x.l))
+        x.at = STEPPING
+    return x.at == STEPPING or x.used < REPEATED
+
+
+cdef inline void start(newton_t* n) noexcept nogil:
+    """A Newton step on the first tau."""
+    cdef path_t* x = &n.path
+    cdef double tau = exponential(x.l), found
+    x.used += 1
+    x.which = LOG_TAU
+    x.speed = -1.0
+    if x.used > FIRST_STEPS or not path_factor(n, x.z, tau):
+        leave(n)
+        return
+    along_curve(n, tau, &found)
+    advance(n, x.z, &x.l, 0.0)
+    if found < x.exact:
+        new_tangent(n, tau)
+        x.at = STEPPING
 
 
 cdef inline void go_path(newton_t* n) noexcept nogil:
     """A factorisation; until the judge is content, the path is lost, or it returns."""
     cdef path_t* x = &n.path
-    cdef int32_t j, m = n.s.e.m
-    cdef double found, tau, dl
     if x.at == TRYING:
         x.at = STEPPING
     if done(n) or n.s.factorisations >= x.last or x.l > x.start + 1.0 or x.l < logarithm(1e-13 * x.size):
         leave(n)
         return
     if x.at == STARTING:
-        tau = exponential(x.l)
-        x.used += 1
-        if x.used > FIRST_STEPS or not path_factor(n, x.z, tau):
-            leave(n)
-            return
-        for j in range(m):
-            x.z[j] += n.dz[j]
-        if change(n, n.dz, tau) < x.exact:
-            new_tangent(n, True)
-            mark(n, 0)
-            mark(n, 1)
-            x.bends = x.shorter = 0
-            x.at = STEPPING
+        start(n)
         return
     if x.at == REPEATING:
-        x.used += 1
-        if path_factor(n, x.z, exponential(x.l)):
-            dl = across_tangent(n)
-            found = change(n, n.dz, exponential(x.l))
-            if found < 0.5:
-                for j in range(m):
-                    x.z[j] += n.dz[j]
-                x.l += dl
-            if 1e-3 <= found < 0.5 and x.used < REPEATED:
-                return
-            new_tangent(n, False)
-        x.bends = 0
+        if repeated(n):
+            return
+        if not go_back(n):
+            leave(n)
+            return
         x.at = STEPPING
     if x.at == STEPPING:
-        found = change_of_tangent(n)
-        x.h = x.h if x.h < 1.0 / found else 1.0 / found
-        x.h = x.h if x.h < 3.0 else 3.0
         predict(n)
-        return
     if corrected(n):
         accept(n)
         return
     if x.previous > 0.0:
         return
+    x.h *= 0.5
     x.shorter += 1
-    x.h *= 0.6 if x.found <= 1.0 else 0.4
     x.at = STEPPING
-    if x.h < 1e-9:
-        if x.returns == RETURNS:
-            leave(n)
-            return
-        x.returns += 1                                  # from a mark, more exactly
-        x.exact *= 0.1
-        take(n, x.z, x.mark[0])
-        take(n, x.t, x.mark_t[0])
-        x.l, x.tl, x.h, x.square = x.mark_l[0], x.mark_tl[0], x.mark_h[0], x.mark_square[0]
-        mark(n, 1)
-        x.bends = x.shorter = 0
-    elif x.shorter == SHORTER:
-        x.used = 0
+    if x.shorter >= 2:
+        x.bends = 0
+    if x.shorter % SHORTER == 0:
+        take(n, n.u, x.z)
+        x.next, x.used, x.previous = x.l, 0, 1.0 / 0.0
         x.at = REPEATING
+    elif x.h < 1e-6:
+        leave(n)

@@ -5,8 +5,8 @@ decades. Cones: interior points with two weights. What these leave: the augmente
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
 interior point with two shares of phi's derivative, ended by rounds; closed loops of joints through the augmented system;
-rounds from the answer of the convex relaxation, then from nothing; paths of smoothed problems, and the first rounds again:
-two paths, a stretch of rounds, two paths, rounds for what is left of the budget.
+rounds from the answer of the convex relaxation, then from nothing; paths of smoothed problems; and the first rounds again
+for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -41,7 +41,6 @@ cdef enum:
     REFINEMENTS = 3             # of a first point,
     MORE_REFINEMENTS = 20       # and with another factor of rows that all hold
     RELAXED_STEPS = 30          # of the convex problem that rounds start from, at most
-    BETWEEN = 500               # factorisations of rounds between two pairs of paths
     LARGEST_AUGMENTED = 10000   # rows, up to which one factorisation stays well below 0.2 s
 
 
@@ -291,14 +290,12 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
             memset(n.trial, 0, n.s.e.m * sizeof(double))
             begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
             pursue(n, 0, FIRST, 2.0 * first_gain())
-    elif at == 5 or at == 7:                            # stick and slip that fold the way to a solution
-        if n.path.paths < (PATHS // 2 if at == 5 else PATHS):
+    elif at == 5:                                       # stick and slip that fold the way to a solution
+        if n.path.paths < PATHS:
             n.at = at
             begin_path(n)
     elif at == 6:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
-        enter_rounds(n, 0, BETWEEN)
-    elif at == 8:
         enter_rounds(n, 0, LIMITLESS)
     else:
         leave(n)

@@ -156,30 +156,30 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
     double* old                 # the tangent before
     double old_l
     double* b                   # -F_z^-1 F_tau of the last factor
-    double* mark[2]             # earlier points,
+    double* mark[2]             # the points before that,
     double* mark_t[2]           # with their tangents
     double mark_l[2]
     double mark_tl[2]
     double mark_h[2]
-    double mark_square[2]
     double wide                 # tau of friction over that of normals
     double size                 # of g
     double start                # first log tau
-    double square               # |z|^2 of the tangent's metric
     double h                    # length of a step
     double before               # of the last one
     double next                 # log tau of the point that is corrected
+    double speed                # of the parameter along the tangent
     double found                # what its first correction changed
     double previous             # the last; below 0: it is given up
     double exact                # corrections below this leave a point on the curve
     double near                 # relative residual from which Newton steps are tried
     int32_t at
+    int32_t which               # coordinate that is the parameter
+    int32_t sign                # of the determinant, 0: not known
     int32_t bends               # the tangent before is known
-    int32_t points
-    int32_t corrected           # factors of this point
     int32_t shorter             # times in a row
-    int32_t used                # factors of the first point, or of one that is repeated
-    int32_t returns
+    int32_t clean               # steps since a return
+    int32_t used                # factors of this point
+    int32_t marks               # points to which it can return
     int32_t paths               # begun
     int32_t last                # factorisations at which it ends
 

@@ -28,7 +28,7 @@ from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
-                                         system_natural, system_solve, system_times)
+                                         system_natural, system_sign, system_solve, system_times)
 
 OUTCOMES = {"more": MORE, "reached": REACHED, "floor": FLOOR, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT}
 WHATS = {"barrier": OF_BARRIER, "pair": OF_PAIR, "natural": OF_NATURAL}
@@ -361,6 +361,11 @@ cdef class Solve:
         """Factor "barrier", "pair" or "natural"; whether no pivot was lost."""
         self.n.s.augmented = augmented
         return bool(system_factor(&self.n.s, WHATS[what], eps))
+
+    @property
+    def sign(self):
+        """Of the determinant of the last "natural" factor; 0 where others factor."""
+        return system_sign(&self.n.s)
 
     def solve(self, str what, const double[::1] r, bint refined=False):
         """With the last factor."""

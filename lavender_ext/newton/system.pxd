@@ -238,6 +238,28 @@ cdef inline int32_t system_factor(system_t* s, int32_t what, double eps) noexcep
     return (block_lu(s.f) if lu else block_cholesky(s.f)) == 0
 
 
+cdef inline int32_t system_sign(const system_t* s) noexcept nogil:
+    """Sign of the determinant of the last (3); 0 where the caller factors, who does not tell it."""
+    cdef int32_t k, n, size, sign = 1
+    cdef double pivot
+    if s.augmented or s.form == SPARSE:
+        return 0
+    if s.by != BY_LU:
+        return s.by == BY_CHOLESKY
+    if s.form == DENSE:
+        n = s.e.m if s.n_free < 0 else s.n_free
+        for k in range(n):
+            if (s.swap[k] != k) != (s.whole[<int64_t>k * (n + 1)] < 0.0):
+                sign = -sign
+        return sign
+    size = s.f.s
+    for k in range(s.f.n * size):
+        pivot = s.f.dval[<int64_t>(k // size) * size * size + (k % size) * (size + 1)]
+        if (s.f.pivot[k] != k % size) != (pivot < 0.0):
+            sign = -sign
+    return sign
+
+
 cdef inline void over_bodies(system_t* s, const double* x, double* out) noexcept nogil:
     # K N^-1 K^T x
     to_bodies(s.e, s.f.n, x, s.y)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,6 +12,7 @@ from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
+from lavender.problem.derived import cached_property
 
 __all__ = ["DENSE", "LARGEST", "Operator", "Part", "Rounded", "wider"]
 

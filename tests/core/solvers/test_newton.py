@@ -15,6 +15,7 @@ from twins import block_diagonal
 from worked import python
 
 import lavender as lv
+from benchmarks.piles import DT, Pile
 from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import sparse, systems
@@ -129,9 +130,32 @@ def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form,
     assert solve.factor("natural", COMPLIANCE)
     x = solve.solve("natural", f)
     np.testing.assert_allclose(x - p @ x + p @ (matrix @ x), f, rtol=0, atol=1e-5 * (1.0 + np.abs(x).max()))
+    # The path's direction is told by this sign, where who factors knows it.
+    sign = np.linalg.slogdet(np.eye(m) - p + p @ matrix)[0]
+    assert solve.sign == (0 if form == "sparse" else sign)
     # Each map is within a few tau of what it smooths: p(x) - max(0, x) <= tau.
     exact = solve.natural(z, matrix @ z - solve.g, LAWS["coulomb"], COMPLIANCE)
     assert np.abs(f - exact).max() <= 4.0 * max(1.0, wide) * tau * (1.0 + problem.cones.mu.max())
+
+
+def test_a_path_runs_through_its_folds():
+    """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
+    pile, before, impulse, paths = Pile(12), None, None, 0
+    for step in range(201):
+        problem = pile.problem()
+        if step in (160, 180, 200):
+            # Phases before the first path take up to 200; a path that has to search its way around a fold 800 and more.
+            solution = lv.solve(problem, "newton", max_iter=800, impulse=np.zeros(problem.m))
+            assert solution.success, f"step {step}: {solution}"
+            paths += "path steps" in solution.message
+        start = problem.carry((before, impulse)) if before is not None else None
+        impulse, before = (
+            lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse,
+            problem,
+        )
+        pile.velocity = problem.velocity(impulse).reshape(-1, 6)
+        pile.place += DT * pile.velocity[:, :3]
+    assert paths
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
