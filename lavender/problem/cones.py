@@ -630,7 +630,7 @@ def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
+    """Nearest feasible normal and rows, then each part of a contact onto its reach times lambda_n; (m,) [N s].
 
     This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
     clipped first and keeps its value.
@@ -638,20 +638,9 @@ def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     if cones.has_ellipse:
         return cones.stretch * project(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
-    tangents, turning, rolling = cones.n_together, cones.apart_rows, cones.rolling_rows
-    for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
-        j, nt = cones.ptr[i], tangents[i]
-        bound = cones.mu[i] * out[j]
-        t = out[j + 1 : j + 1 + nt]
-        size = np.hypot.reduce(t) if nt else 0.0
+    reach = cones.reach
+    for i, rows in cones.parts():
+        bound, size = reach[rows[0]] * out[cones.ptr[i]], np.hypot.reduce(out[rows])
         if size > bound:
-            t *= bound / size
-        if turning[i] >= 0:
-            spin = bound * cones.patch_radius[i]
-            out[turning[i]] = np.clip(out[turning[i]], -spin, spin)
-        if rolling[i] >= 0:
-            r, bound = out[rolling[i] : rolling[i] + 2], cones.rolling[i] * out[j]
-            size = np.hypot(*r)
-            if size > bound:
-                r *= bound / size
+            out[rows] *= bound / size
     return out

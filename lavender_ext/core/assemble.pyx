@@ -9,9 +9,9 @@ from libc.stdint cimport INT32_MAX, int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.door cimport is_number
+from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
 
@@ -41,7 +41,7 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
                 jac[k] = r.jac[k]
         else:
             c = i - r.n_joints
-            contact_jacobian(r, c, n_directions(p.kind[i], end - j), n_turns(p.kind[i], end - j), jac + 12 * j)
+            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac + 12 * j)
         for k in range(j, end):
             minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
 

@@ -7,8 +7,8 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 from lavender_ext.core.door cimport is_number, is_size
+from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 
 cdef enum:
     CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged

@@ -10,10 +10,11 @@ J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport ROW, block_error, blocks_t, n_directions, n_turns
+from lavender_ext.core.block cimport block_error
 from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
+from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
@@ -40,12 +41,12 @@ cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam,
     for i in range(p.n_blocks):
         j = p.ptr[i]
         for k in range(j, p.ptr[i + 1]):
-            w[k] = csr_dot_size(a, k, lam, size + (0 if p.kind[i] == ROW else k - j)) - p.b[k]
-            if p.kind[i] == ROW:                        # of any number
+            w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+            if is_rows(p, i):                           # of any number
                 add_floor(p, k, size[0], f)
         block_error(p, i, lam, w, e)
         tally_block(p, i, e, s)
-        if p.kind[i] != ROW:
+        if not is_rows(p, i):
             add_block_floor(p, i, lam, w, e, size, f)
 
 
@@ -155,8 +156,8 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_wrench_size(r, c, nt, turns, lam + j, size)
         elif nt == 2:
@@ -248,8 +249,8 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
         i = r.n_joints + c
         j = p.ptr[i]
         n = p.ptr[i + 1] - j
-        nt = n_directions(p.kind[i], n)
-        turns = n_turns(p.kind[i], n)
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_sizes(r, c, nt, turns, sizes, size)
         elif nt == 2:

@@ -10,7 +10,8 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, roll_at)
+from lavender_ext.core.block cimport block_error
+from lavender_ext.core.parts cimport blocks_t, disk_of, groups_of, is_disk, is_rows, parts_t
 
 
 cdef struct score_t:
@@ -86,46 +87,23 @@ cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally
         s.worst = k
 
 
-cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t turns, const double* e,
-                               tally_t* s) noexcept nogil:
-    # A pair of tangents counts once in the maximum, by its norm.
-    cdef double x, y
-    tally_row(p, j, e[j], s)
-    if nt == 1:
-        tally_row(p, j + 1, e[j + 1], s)
-    elif nt == 2:
-        x = p.d[j + 1] * e[j + 1]
-        y = p.d[j + 1] * e[j + 2]
-        s.energy += x * e[j + 1] + y * e[j + 2]
-        x = x * (p.nu[j + 1] * e[j + 1]) + y * (p.nu[j + 1] * e[j + 2])
-        if x > s.fast:
-            s.fast = x
-            s.worst = j + 1
-    if turns & 1:
-        tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
-    if turns & 2:
-        tally_pair(p, j + 1 + nt + (turns & 1), e, s)
-
-
-cdef inline void tally_round(const blocks_t* p, int32_t j, int32_t nt, const double* e, tally_t* s) noexcept nogil:
-    tally_row(p, j, e[j], s)
-    tally_pair(p, j + 1, e, s)
-    tally_row(p, j + 3, e[j + 3], s)
-    if nt == 4:
-        tally_row(p, j + 4, e[j + 4], s)
-    elif nt == 5:
-        tally_pair(p, j + 4, e, s)
-
-
 cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
-    cdef int32_t k, j = p.ptr[i], end = p.ptr[i + 1]
-    if p.kind[i] == ROW:
-        for k in range(j, end):
+    cdef int32_t k, g, j = p.ptr[i]
+    cdef parts_t q
+    if is_rows(p, i):
+        for k in range(j, p.ptr[i + 1]):
             tally_row(p, k, e[k], s)
-    elif p.kind[i] == ROUND:
-        tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
-    else:
-        tally_contact(p, j, n_tangents(p.kind[i], end - j), n_apart(p.kind[i], end - j), e, s)
+        return
+    tally_row(p, j, e[j], s)
+    if is_disk(p, i):                                   # compiled apart
+        tally_pair(p, j + 1, e, s)
+        return
+    groups_of(p, i, &q)
+    for g in range(q.n):
+        if q.size[g] == 2:
+            tally_pair(p, j + q.first[g], e, s)
+        else:
+            tally_row(p, j + q.first[g], e[j + q.first[g]], s)
 
 
 cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
@@ -161,21 +139,26 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
 
 
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
-    cdef int32_t i, j, k, nt, roll
-    cdef double t, sum_ = 0.0, fast = 0.0
+    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
+    cdef int32_t i, j, k, g
+    cdef double t, pair, sum_ = 0.0, fast = 0.0
+    cdef parts_t q
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             t = (p.b[k] / p.d[k]) * p.b[k]
             sum_ += t
-            if is_pair(nt, roll, k - j):
-                t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
             t = t * p.nu[k]
             if t > fast:
                 fast = t
+        groups_of(p, i, &q)
+        for g in range(q.n):
+            if q.size[g] == 2:
+                k = j + q.first[g]
+                pair = (p.b[k] / p.d[k]) * p.b[k] + (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
+                pair = pair * p.nu[k]
+                if pair > fast:
+                    fast = pair
     energy[0] = sqrt(sum_)
     velocity[0] = sqrt(fast)
 
@@ -215,15 +198,25 @@ cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam
     Where the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
     velocity; d_k, of both rows, may be far above A_kk.
     """
-    cdef int32_t k, j = p.ptr[i], n = p.ptr[i + 1] - j
-    cdef int32_t nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], n), roll = roll_at(p.kind[i], n)
+    cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef parts_t q
     cdef double x, own
-    for k in range(n):
-        x = size[k]
-        if (is_pair(nt, roll, k) or is_pair(nt, roll, k - 1)) and e[j + k] != w[j + k] / p.d[j + k]:
-            own = p.d[j + k] * fabs(lam[j + k])
-            x = own if own > x else x
-        add_floor(p, j + k, x, s)
+    if is_rows(p, i):
+        for k in range(n):
+            add_floor(p, j + k, size[k], s)
+        return
+    add_floor(p, j, size[0], s)
+    if is_disk(p, i):                                   # compiled apart
+        disk_of(p, i, &q)
+    else:
+        groups_of(p, i, &q)
+    for g in range(q.n):
+        for k in range(q.first[g], q.first[g] + q.size[g]):
+            x = size[k]
+            if q.size[g] == 2 and e[j + k] != w[j + k] / p.d[j + k]:
+                own = p.d[j + k] * fabs(lam[j + k])
+                x = own if own > x else x
+            add_floor(p, j + k, x, s)
 
 
 cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:

@@ -12,16 +12,16 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
-                                       ROW as AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
+                                       AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
@@ -169,7 +169,7 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
             for q in range(j.g.jptr[k], j.g.jptr[k + 1]):
                 if j.g.jval[q] != 0.0:
                     return False
-            if p.b[k] == 0.0 or (p.kind[i] != ROW and k > p.ptr[i]):
+            if p.b[k] == 0.0 or (not is_rows(p, i) and k > p.ptr[i]):
                 continue                                # asks nothing: tangents and spin have bounds of mu lambda_n
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
             if fabs(bound) < INFINITY:
@@ -348,7 +348,7 @@ cdef class Worlds:
     data : list of Data or None
         Of problems that are objects; None of one that is left to the caller. Starts come with it: (m,) [N s] or None.
     at : (n, PLACES) int64
-        Of arrays, as in `world.pxd`; of objects its columns ROWS and ROW alone.
+        Of arrays, as in `world.pxd`; of objects its columns ROWS and AT_ROW alone.
     arrays : sequence of 6
         J, M, v*, target, compliance, mu (or None), flat float64 or float32.
     strides : (int, int)

@@ -7,9 +7,9 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
-from lavender_ext.core.block cimport ROW as BOUNDED, blocks_t
 from lavender_ext.core.door cimport first_outside, first_unsized, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row, tree_factor, tree_pattern
+from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
@@ -34,7 +34,7 @@ cdef enum:                      # columns of `at`: how many it has, and where th
     MU = 8                      # and of mu, where it has its own
     BLOCK = 9                   # in the blocks of all worlds,
     CONE_ROW = 10               # in their rows,
-    ROW = 11                    # in the impulses
+    AT_ROW = 11                 # in the impulses
     VELOCITY = 12               # and in the velocities that are the results
     PLACES = 13
 
@@ -238,7 +238,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     lay_blocks(w, at, p, idx + half, x + n + 2 * m)
     p.b = b
     for j in range(k):
-        if not is_size(p.mu[j]) or (p.kind[j] != BOUNDED and not is_size(p.mu[j] * p.patch_radius[j])):
+        if not is_size(p.mu[j]) or (not is_rows(p, j) and not is_size(p.mu[j] * p.patch_radius[j])):
             return BAD
     return READY
 

@@ -12,7 +12,8 @@ tol) is left to the caller, with lam as it came.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, row_error
+from lavender_ext.core.block cimport row_error
+from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
@@ -63,7 +64,7 @@ cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velo
                 return 0
             least = p.d[j] if p.d[j] < least else least
             rhs += p.b[j] * p.b[j]
-            if p.kind[i] == ROW:
+            if is_rows(p, i):
                 if not p.lower[j] <= 0.0 <= p.upper[j]:
                     return 0
                 e = row_error(0.0, -p.b[j], p.d[j], p.lower[j], p.upper[j])

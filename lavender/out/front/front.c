@@ -1,6 +1,6 @@
 /* -- from here on: the functions of lavender.h over the kernels above ------------------------------------------------- */
 
-typedef struct core_block_blocks_t blocks_t;
+typedef struct core_parts_blocks_t blocks_t;
 typedef struct core_csr_csr_t csr_t;
 typedef struct core_rows_rows_t rows_t;
 typedef struct core_generalized_generalized_t general_t;
