@@ -103,7 +103,7 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if p.kind[i] != ROW or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
+            if not is_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
                 return False
     return True
 
