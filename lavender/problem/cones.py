@@ -641,6 +641,8 @@ def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     reach = cones.reach
     for i, rows in cones.parts():
         bound, size = reach[rows[0]] * out[cones.ptr[i]], np.hypot.reduce(out[rows])
-        if size > bound:
+        if len(rows) == 1:
+            out[rows] = np.clip(out[rows], -bound, bound)
+        elif size > bound:
             out[rows] *= bound / size
     return out

@@ -113,7 +113,7 @@ def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
         elif nt:
             assert t @ given_t >= 0.0
         if cones.kind[i] == lv.CONTACT_SPIN:
-            assert abs(y[end - 1]) <= limit * cones.patch_radius[i]
+            assert abs(y[end - 1]) <= cones.mu[i] * cones.patch_radius[i] * y[j]  # the reach first
 
 
 def _the_long_way(cones):
