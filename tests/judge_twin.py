@@ -18,6 +18,7 @@ import numpy as np
 L = np.longdouble
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = 0, 1, 2, 3, 4, 5, 7
 NORMAL = L(2.0) ** -1022
+LEAST = L(1e-60)  # below which a row of A is empty
 U = L(2.0) ** -53
 DENORMAL = L(2.0) ** -1074
 ZERO = L(0.0)
@@ -131,13 +132,17 @@ class Problem:
     def _of_matrix(self):
         diag, big = np.diag(self.A).copy(), self.size.max(axis=1, initial=ZERO)
         d = np.where(diag > L(1e-10) * big, diag, big)
-        self.d = self._filled(d)
+        self.d = self._filled(np.where(big < LEAST, ZERO, d))
         self.nu = self.d.copy()
-        self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big))
+        self.d_edge = bool(np.any(np.abs(diag - L(1e-10) * big) <= L(1e-14) * big)) or self._at_least(big)
 
     def _filled(self, d):
-        positive = d[d > 0]
-        return np.where(d > 0, d, positive.mean() if len(positive) else L(1.0))
+        # a row below LEAST counts as empty
+        positive = d[d >= LEAST]
+        return np.where(d >= LEAST, d, positive.mean() if len(positive) else L(1.0))
+
+    def _at_least(self, d):
+        return bool(np.any(np.abs(d - LEAST) <= L(1e-9) * LEAST))
 
     def _of_rows(self, spec):
         r = {key: np.array(value) for key, value in spec["rows"].items()}
@@ -196,7 +201,7 @@ class Problem:
         self.size *= np.outer(self.stretch, self.stretch)
         d = np.diag(self.A).copy()
         self.d = self._filled(d)
-        self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))))
+        self.d_edge = bool(np.any((d > 0) & (d < L(1e-12) * np.diag(self.size)))) or self._at_least(d)
         self.nu = self.d.copy()
         for j in range(joints):
             for row in range(r["joint_ptr"][j], r["joint_ptr"][j + 1]):
@@ -222,14 +227,13 @@ class Problem:
         d = np.diag(self.A).copy()
         self.d = self._filled(d)
         self.nu = self.d.copy()
-        vanished = (d > 0) & (d < NORMAL)  # in float64: such a row has no unit there
         # A solve by the factor of M is as exact as M in the best units of its velocities allows.
         unit = 1 / np.sqrt(np.diag(mass))
         scaled = (unit[:, None] * mass * unit[None, :]).astype(float)
         condition = np.linalg.cond(scaled) if np.isfinite(scaled).all() else np.inf
         self.roundings += 10 * n * L(condition)
         self.d_edge = not np.isfinite(self.A).all() or bool(
-            np.any(vanished | ((d > 0) & (d < L(1e-12) * np.diag(self.size))))
+            np.any((d > 0) & (d < L(1e-12) * np.diag(self.size))) or self._at_least(d)
         )
 
     def _pairs(self):

@@ -1,9 +1,12 @@
-"""One check for arrays: dtype, shape, finiteness, privacy. Kernels behind it check nothing."""
+"""One check for arrays: dtype, shape, size of numbers, privacy. Kernels behind it check nothing.
+
+What numbers may be is said in `lavender_ext/core/door.pxd`: at most 1e60 in size, and masses and their like 0 or at
+least 1e-60. The same problem in other units has the same answer, so the message names a unit to change.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -12,6 +15,7 @@ import numpy.typing as npt
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender_ext.core import checks
+from lavender_ext.core.checks import LEAST, MOST
 from lavender_ext.judge.measure import all_finite
 
 FloatArray = npt.NDArray[np.float64]
@@ -55,20 +59,21 @@ def as_array(
     Raises
     ------
     InputError
-        Not numeric, complex, of another shape, with masked entries, or not finite where it must be.
+        Not numeric, complex, of another shape, with masked entries, or with `finite` a number that is NaN, infinite or
+        beyond MOST.
     """
     # What most callers give: nothing to convert, and no word to be made.
     if dtype is np.float64:
         made = checks.plain(value, shape, finite, copy)
         if made is not None:
             return made
-        if type(value) is float and isfinite(value) and len(shape) == 1 and shape[0] is not None:
+        if type(value) is float and abs(value) <= MOST and len(shape) == 1 and shape[0] is not None:
             plain = np.empty(shape[0])
             plain.fill(value)
             return read_only(plain)
     elif type(value) is np.ndarray and value.dtype is INT32 and _fits(value.shape, shape):
         return read_only(value.copy() if copy or not value.flags.c_contiguous else value)
-    what = f"{name} [{unit}]" if unit else name
+    what = f"{name} [{unit}]" if unit and unit != "-" else name
     try:
         given = np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -99,7 +104,7 @@ def as_array(
         given = _narrowed(given)
     array: np.ndarray = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
     if finite and array.dtype.kind == "f":
-        _check_finite(what, array)
+        check_inside(what, array, unit)
     return read_only(array)
 
 
@@ -132,6 +137,8 @@ def number(
     x = float(value)
     if not np.isfinite(x):
         raise InputError(f"{what} is {x}; a finite number is needed")
+    if abs(x) > MOST:
+        raise InputError(f"{what} is {x:g}; at most {MOST:g} is needed: change a unit")
     if above is not None and not x > above:
         raise InputError(f"{what} is {x:g}; more than {above:g} is needed")
     if x < low or x > high:
@@ -198,13 +205,50 @@ def _narrowed(wide: np.ndarray) -> np.ndarray:
         return wide.astype(np.float64)
 
 
-def _check_finite(what: str, array: np.ndarray) -> None:
+def check_finite(what: str, array: np.ndarray) -> None:
+    """Raise InputError at the first NaN or infinity of `what`."""
     if not all_finite(array.reshape(-1)):
         bad = np.argwhere(~np.isfinite(array))
         where = ", ".join(map(str, bad[0]))
         raise InputError(
             f"{what} must be finite; entry [{where}] is {array[tuple(bad[0])]}, {len(bad)} in all"
         )
+
+
+def check_inside(what: str, array: np.ndarray, unit: str = "") -> None:
+    """Raise InputError at the first number of `what` that is not finite, or beyond MOST in size."""
+    if checks.inside(array.reshape(-1)):
+        return
+    check_finite(what, array)
+    bad = np.argwhere(np.abs(array) > MOST)
+    where = ", ".join(map(str, bad[0]))
+    raise InputError(
+        f"{what} must be at most {MOST:g} in size; entry [{where}] is {array[tuple(bad[0])]:g}, {len(bad)} in all: "
+        f"{_advice(unit)}"
+    )
+
+
+def check_sizes(what: str, array: np.ndarray, unit: str = "") -> None:
+    """Raise InputError at the first number of `what` that is negative, or neither 0 nor from LEAST to MOST."""
+    flat = array.reshape(-1)
+    at = checks.unsized(flat)
+    if at < 0:
+        return
+    check_inside(what, array, unit)
+    check_not_negative(what, flat)
+    where = ", ".join(map(str, np.unravel_index(at, array.shape)))
+    raise InputError(
+        f"{what} must be 0 or at least {LEAST:g}; entry [{where}] is {flat[at]:g}: {_advice(unit)}"
+    )
+
+
+def _advice(unit: str) -> str:
+    """Which units to change, of a quantity that has this one."""
+    if unit == "-":
+        return "it has no unit that could be another"
+    letters = set(unit.replace("rad", "").replace("N s", "kg m/s"))
+    units = [name for letter, name in (("k", "mass"), ("m", "length"), ("s", "time")) if letter in letters]
+    return f"another unit of {' or '.join(units or ['mass, length', 'time'])} brings it nearer to 1"
 
 
 def check_not_nan(what: str, array: np.ndarray) -> None:

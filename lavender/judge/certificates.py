@@ -43,6 +43,7 @@ from lavender.problem import Problem
 __all__ = ["Proof", "check_certificate", "fighting", "prove", "rounded_down"]
 
 UNIT = 2.0**-53
+SPLIT = 2.0**27 + 1.0
 FAR = 1e-10  # of b.y: what z may reach, so that the floor of a solution is above 1e-6
 SURE = 1e3  # times its rounding: a sum beyond is known well enough as it comes
 NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
@@ -147,10 +148,7 @@ def _proof(problem: Problem, y: FloatArray, tol: float) -> Proof:
     if len(vanished):
         name = problem.row_name(int(vanished[0]))
         return Proof(y, 0.0, f"products of {name} vanish in float64: its row of A is not zero")
-    # The largest y at 1, or above by what small entries of A lack: so that products with them do not vanish.
-    given, data = y, problem.csr.data if problem.matrix is not None else problem.jacobian.data
-    lack = max(0, min(1000, *(-_exponent(x) for x in (data, problem.b))))
-    y = np.ldexp(y, lack - _exponent(y))
+    given, y = y, y / _power(y)
     gain, most = float(problem.b @ y), float(np.abs(problem.b) @ np.abs(y))
     if not gain > 0.0:
         return Proof(y, 0.0, f"b.y = {gain:.2e} is not positive")
@@ -199,25 +197,18 @@ def _product(a: Any, y: FloatArray) -> FloatArray:
     out, size = a.T @ y, abs(a).T @ np.abs(y)
     cancels = np.flatnonzero((size > 0.0) & ~(np.abs(out) > SURE * (len(y) + 2.0) * UNIT * size))
     columns = a[:, cancels].tocsc()
-    start, filled = columns.indptr[:-1], np.diff(columns.indptr)
-    halves, power = [], []
+    halves = []
     for x in (columns.data, y[columns.indices]):
-        part, exponent = np.frexp(x)
-        high = np.ldexp(np.round(np.ldexp(part, 26)), -26)
-        halves.append((high, part - high))
-        power.append(exponent)
-    total = power[0] + power[1]
-    top = np.maximum.reduceat(total, start) if len(start) else total
-    down = total - np.repeat(top, filled)
-    terms = np.array([np.ldexp(p * q, down) for p, q in product(*halves)]).T.ravel().tolist()
-    sums = [math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())]
-    out[cancels] = np.ldexp(np.array(sums, float), top)
+        high = SPLIT * x - (SPLIT * x - x)  # of 26 bits, as the rest (Veltkamp)
+        halves.append((high, x - high))
+    terms = np.array([p * q for p, q in product(*halves)]).T.ravel().tolist()
+    out[cancels] = [math.fsum(terms[4 * at : 4 * end]) for at, end in pairwise(columns.indptr.tolist())]
     return out
 
 
-def _exponent(x: FloatArray) -> int:
-    """Of the power of two above the largest of |x|; 0 for none."""
-    return math.frexp(float(np.abs(x).max(initial=0.0)))[1]
+def _power(x: FloatArray) -> float:
+    """The power of two below the largest of |x|, not all 0: what divides exactly."""
+    return float(2.0 ** np.floor(np.log2(np.abs(x).max())))
 
 
 def _rims(problem: Problem, x: FloatArray) -> tuple[Any, FloatArray, FloatArray]:
@@ -302,7 +293,7 @@ def _polished(problem: Problem, y: FloatArray) -> Iterator[FloatArray]:
             return
         system = (a[:, near].toarray() / length[rows][:, None] * weight[near]).T
         y[rows] -= np.linalg.lstsq(system, z[near], rcond=1e-9)[0] / length[rows]
-    unit = np.ldexp(1.0, _exponent(y) - 26)
+    unit = 2.0**-25 * _power(y)
     yield np.rint(y / unit) * unit
     yield y
 

@@ -235,7 +235,7 @@ def reference(problem: Problem) -> tuple[float, float]:
     """E0 [sqrt J] and V0 [m/s]; computed once per problem."""
     data = problem.metric
     if data.start_energy < 0.0:
-        start = measure.begin(data, len(data.empty) > 0 and len(problem.vanished_rows) > 0)
+        start = measure.begin(data)
         problem.__dict__.setdefault("_start", start)
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)

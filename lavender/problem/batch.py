@@ -11,7 +11,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_not_negative, places, precision_of
+from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_sizes, places, precision_of
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
@@ -280,7 +280,7 @@ class Batch(Sequence[Problem]):
             return c
         of, rows = slice(block, block + k), slice(row, row + m)
         rub = c.mu[of] if mu is None else mu
-        check_not_negative("mu", rub)
+        check_sizes("mu", rub, "-")
         return Cones(
             ptr=c.ptr[block : block + k + 1] - c.ptr[block], kind=c.kind[of], lower=c.lower[rows],
             upper=c.upper[rows], mu=rub, patch_radius=c.patch_radius[of], rolling=c.rolling[of],

@@ -29,14 +29,16 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
+    check_inside,
     check_not_nan,
-    check_not_negative,
+    check_sizes,
     equal,
     shape_of,
     whole_number,
 )
 from lavender.base.errors import InputError, UnknownName
 from lavender_ext.core import blocks as kernels
+from lavender_ext.core.checks import LEAST, MOST
 
 __all__ = [
     "CONTACT",
@@ -61,6 +63,7 @@ SHAPES = ("disk", "box")
 LEAST_SHARE = 2.0**-60
 
 
+REACH = "mu patch_radius (of boxes and ellipses mu_2)"
 # Of each kind of contact: least and most rows, what it is called, and what it may have.
 SIZES = {
     CONTACT: (1, 3, "a contact", "a normal and up to two tangents are known, and one spin row of CONTACT_SPIN"),
@@ -182,6 +185,8 @@ class Cones:
         check_not_nan("lower", lower)
         check_not_nan("upper", upper)
         contact_rows = np.repeat(kind != ROW, size)
+        for name, bound in (("lower", lower), ("upper", upper)):
+            check_inside(name, np.where(contact_rows | np.isinf(bound), 0.0, bound), "N s")
         bad = np.flatnonzero(~contact_rows & ~((lower <= upper) & (lower < np.inf) & (upper > -np.inf)))
         if len(bad):
             i = bad[0]
@@ -196,8 +201,8 @@ class Cones:
             normal = ptr[:-1][kind != ROW]
             lower[normal] = 0.0
             lower.flags.writeable = upper.flags.writeable = False
-        mu = _not_negative("mu", self.mu, k)
-        radius = _not_negative("patch_radius", self.patch_radius, k, "m")
+        mu = _sizes("mu", self.mu, k)
+        radius = _sizes("patch_radius", self.patch_radius, k, "m")
         wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
         bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & wide)
         if len(bad):
@@ -205,10 +210,8 @@ class Cones:
                 f"block {bad[0]} is an ellipse with mu_2 / mu_1 = {radius[bad[0]]:g} in the place of the patch radius; "
                 "1e-18 to 1e18 is needed"
             )
-        with np.errstate(over="ignore"):
-            second = np.where(np.isin(kind, (CONTACT_BOX, CONTACT_ELLIPSE)), mu * radius, 0.0)
-        as_array("mu_2", second, (k,))
-        rolling = _not_negative("rolling", self.rolling, k, "m")
+        check_sizes(REACH, np.where(kind == ROW, 0.0, mu * radius), "m")
+        rolling = _sizes("rolling", self.rolling, k, "m")
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
@@ -293,16 +296,18 @@ class Cones:
             sides = 0 if ratio is None else CONTACT_ELLIPSE
         given = 1 if type(mu) is float or np.ndim(mu) == 0 else len(mu)
         k = given if count is None else whole_number("count", count)
-        if type(mu) is not float or not 0.0 <= mu < np.inf:
-            mu = _not_negative("mu", mu, k)
+        if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
+            mu = _sizes("mu", mu, k)
         if patch_radius is not None:
-            patch_radius = _not_negative("patch_radius", patch_radius, k, "m")
+            patch_radius = _sizes("patch_radius", patch_radius, k, "m")
         if rolling is not None:
-            rolling = _not_negative("rolling", rolling, k, "m")
+            rolling = _sizes("rolling", rolling, k, "m")
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
         made = kernels.contacts(k, tangents, mu, patch_radius, rolling, sides)
         if made is None:
+            if patch_radius is not None:
+                check_sizes(REACH, np.broadcast_to(mu, (k,)) * patch_radius, "m")
             raise InputError(f"{k} contacts have more rows than 32-bit numbers count")
         return cls._of(made)
 
@@ -549,9 +554,9 @@ def kinds_of(
     return np.where(contact, kind, ROW).astype(np.int32)
 
 
-def _not_negative(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
-    array = as_array(name, value, (k,), unit=unit)
-    check_not_negative(name, array)
+def _sizes(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
+    array = as_array(name, value, (k,), unit=unit or "-")
+    check_sizes(name, array, unit or "-")
     return array
 
 
@@ -592,7 +597,7 @@ def _fitting(kind: IntArray, size: IntArray) -> IntArray:
 def _pairs(mu: Any) -> FloatArray:
     """mu (k, 2), one for each of two tangents, checked."""
     given = as_array("mu", mu, (None,) * np.ndim(mu))
-    check_not_negative("mu", given.ravel())
+    check_sizes("mu", given, "-")
     if given.ndim != 2 or given.shape[1] != 2:
         raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
     return given
@@ -625,7 +630,7 @@ def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:
-    """Nearest feasible normal and rows, then tangents, spin and rolling onto their bounds times lambda_n; (m,) [N s].
+    """Nearest feasible normal and rows, then each part of a contact onto its reach times lambda_n; (m,) [N s].
 
     This is the feasibility step of a sweep, not the projection onto the friction cone: the normal is
     clipped first and keeps its value.
@@ -633,20 +638,11 @@ def project(cones: Cones, impulse: FloatArray) -> FloatArray:
     if cones.has_ellipse:
         return cones.stretch * project(cones.disks, impulse / cones.stretch)
     out = np.clip(impulse, cones.lower, cones.upper)
-    tangents, turning, rolling = cones.n_together, cones.apart_rows, cones.rolling_rows
-    for i in np.flatnonzero((cones.kind != ROW) & (np.diff(cones.ptr) > 1)):
-        j, nt = cones.ptr[i], tangents[i]
-        bound = cones.mu[i] * out[j]
-        t = out[j + 1 : j + 1 + nt]
-        size = np.hypot.reduce(t) if nt else 0.0
-        if size > bound:
-            t *= bound / size
-        if turning[i] >= 0:
-            spin = bound * cones.patch_radius[i]
-            out[turning[i]] = np.clip(out[turning[i]], -spin, spin)
-        if rolling[i] >= 0:
-            r, bound = out[rolling[i] : rolling[i] + 2], cones.rolling[i] * out[j]
-            size = np.hypot(*r)
-            if size > bound:
-                r *= bound / size
+    reach = cones.reach
+    for i, rows in cones.parts():
+        bound, size = reach[rows[0]] * out[cones.ptr[i]], np.hypot.reduce(out[rows])
+        if len(rows) == 1:
+            out[rows] = np.clip(out[rows], -bound, bound)
+        elif size > bound:
+            out[rows] *= bound / size
     return out

@@ -13,7 +13,8 @@ from lavender.base.arrays import (
     FloatArray,
     as_array,
     as_csr,
-    check_not_negative,
+    check_finite,
+    check_sizes,
     equal,
     read_only,
     table_of,
@@ -27,6 +28,7 @@ from lavender.problem.derived import Derived, cached_property
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 from lavender_ext.core.blocks import are_joints_then_contacts
+from lavender_ext.core.checks import LEAST, largest
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import general_data
 from lavender_ext.judge import measure
@@ -95,6 +97,7 @@ class ProblemData:
         m, k = self.cones.n_rows, self.cones.n_blocks
         put(self, "derived", Derived())
         put(self, "b", as_array("b", self.b, (m,), unit="m/s", copy=self.copy))
+        _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
@@ -120,7 +123,9 @@ class ProblemData:
             if self.compliance is not None:
                 raise InputError("compliance goes with rows; in a matrix it is already on the diagonal of A")
         if self.guess is not None:
-            put(self, "guess", as_array("guess", self.guess, (m,), unit="N s", copy=self.copy))
+            guess = as_array("guess", self.guess, (m,), finite=False, unit="N s", copy=self.copy)
+            check_finite("guess [N s]", guess)
+            put(self, "guess", guess)
         if self.key is not None:
             key = np.asarray(self.key)
             if (
@@ -183,7 +188,7 @@ class ProblemData:
             put(self, "compliance", read_only(np.zeros(m)))
             return
         put(self, "compliance", as_array("compliance", self.compliance, (m,), unit="1/kg", copy=self.copy))
-        check_not_negative("compliance", self.compliance)
+        check_sizes("compliance", self.compliance, "1/kg")
 
     # -- size and kind --------------------------------------------------------------------------
 
@@ -215,7 +220,9 @@ class ProblemData:
             own = impulse.copy()
             if measure.all_finite(own):
                 return own
-        return as_array(name, impulse, (self.m,), unit="N s").copy()
+        own = as_array(name, impulse, (self.m,), finite=False, unit="N s")
+        check_finite(f"{name} [N s]", own)
+        return own.copy()
 
     # -- names -----------------------------------------------------------------------------------
 
@@ -287,6 +294,15 @@ class ProblemData:
             "given by": repr(self).rpartition(", ")[2].rstrip(">"),
         }
         return table_of(facts, self.name or "Problem")
+
+
+def _check_rhs(b: FloatArray) -> None:
+    top = largest(b)
+    if 0.0 < top < LEAST:
+        raise InputError(
+            f"b [m/s] is {top:g} at most, at [{int(np.argmax(np.abs(b)))}]; its largest must be 0 or at least "
+            f"{LEAST:g}: another unit of length or time brings it nearer to 1"
+        )
 
 
 def check_problem(problem: Any) -> None:

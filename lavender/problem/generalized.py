@@ -31,8 +31,8 @@ from lavender.base.later import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, stacked
+from lavender_ext.core.checks import LEAST, inside
 from lavender_ext.factor.graph import least_degree
-from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Generalized"]
 
@@ -96,7 +96,7 @@ class Generalized:
         made = object.__new__(cls)
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
-            if type(x) is np.ndarray and all_finite(x):
+            if type(x) is np.ndarray and inside(x):
                 x.setflags(write=False)
             else:  # which finds the words
                 as_array(name, x, (None,), copy=False)
@@ -151,8 +151,8 @@ class Generalized:
             at = operator.failed if put["order"] is None else int(put["order"][operator.failed])
             raise InputError(
                 f"M is not positive definite: the pivot of {self.velocity_name(at)} is no more than rounding of its "
-                "diagonal entry, or too small for a reciprocal in float64; a body without mass or inertia needs some "
-                "(MuJoCo: armature), or the velocity must be left out"
+                f"diagonal entry, or less than {LEAST:g} (another unit of mass or length brings it nearer to 1); a "
+                "body without mass or inertia needs some (MuJoCo: armature), or the velocity must be left out"
             )
         put["operator"] = operator
 

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, read_only
-from lavender.base.errors import CapabilityError, TooLarge
+from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem.data import ProblemData
 from lavender.problem.derived import cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
+from lavender_ext.core.checks import MOST, largest
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
 from lavender_ext.core.problem import Data, nothing_done
 from lavender_ext.factor import sparse
@@ -22,11 +23,28 @@ from lavender_ext.judge import measure
 # A matrix counts as positive semidefinite where A + SHIFT D has a Cholesky factor, D = diag(d): entries that were
 # rounded leave negative eigenvalues of about m 2^-53.
 SHIFT = 1e-12
+USUAL = 1e15  # of J and M^-1: sums of their products stay below MOST
 MOST_ENTRIES = 2**31  # of A, from which on 32-bit indices do not reach them
 
 
 class Operators(ProblemData):
     """A, J and what kernels and the judge read, of the problem's data."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.matrix is None and self._is_extreme():
+            self.metric  # noqa: B018 - refused here, and not in a solve
+
+    def _is_extreme(self) -> bool:
+        """Whether A_ii may be beyond MOST: numbers of J and M^-1 so large that A_ii must be formed to know."""
+        if self.compliance is not None and largest(self.compliance) > USUAL:
+            return True
+        if self.generalized is not None:
+            return self.generalized.operator.most > USUAL
+        r = self.rows
+        return r is not None and any(
+            largest(x.reshape(-1)) > USUAL for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)
+        )
 
     @property
     def asymmetry(self) -> float:
@@ -70,7 +88,7 @@ class Operators(ProblemData):
         if self.rows is None:
             return self.csr_data
         r = self.rows
-        return self._data(
+        made = self._data(
             rows=(
                 r.jac,
                 r.joint_body,
@@ -84,6 +102,8 @@ class Operators(ProblemData):
                 self.compliance,
             )
         )
+        self._check_diagonal(made)
+        return made
 
     @once
     def csr_data(self) -> Data:
@@ -105,7 +125,16 @@ class Operators(ProblemData):
             view.prepare()
         except OverflowError as error:
             raise TooLarge(f"the problem is too large: {error}") from None
+        self._check_diagonal(view)
         return view
+
+    def _check_diagonal(self, data: Data) -> None:
+        i = data.outside
+        if i >= 0:
+            raise InputError(
+                f"A_ii = J_i M^-1 J_i^T + compliance of {self.row_name(i)} (row {i}) is {data.d[i]:g} 1/kg; at most "
+                f"{MOST:g} is needed: another unit of mass, or of the row's velocity, brings it nearer to 1"
+            )
 
     def _data(self, **operator: Any) -> Data:
         return Data(self.cones._blocks, self.b, FRICTION_NUMBER[self.friction], **operator)

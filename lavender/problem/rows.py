@@ -11,7 +11,7 @@ from lavender.base.arrays import (
     FloatArray,
     IntArray,
     as_array,
-    check_not_negative,
+    check_sizes,
     equal,
     precision_of,
     read_only,
@@ -25,6 +25,10 @@ from lavender_ext.core import checks
 __all__ = ["Rows"]
 
 EXACT = 1e-9  # above rounding of what was normalised in float64
+UNITS = {
+    "inv_mass": "1/kg", "inv_inertia": "1/(kg m^2)", "v_free": "m/s, rad/s", "jac": "-", "normal": "-", "tangent": "-",
+    "arm_a": "m", "arm_b": "m",
+}  # fmt: skip
 ROUNDED = 1e-5  # above what float32 leaves after some turns, below anything meant otherwise
 
 
@@ -141,7 +145,7 @@ class Rows:
         given = []
         for name, shape in shapes.items():
             x = getattr(self, name)
-            object.__setattr__(self, name, as_array(name, x, shape, copy=self.copy))
+            object.__setattr__(self, name, as_array(name, x, shape, copy=self.copy, unit=UNITS[name]))
             given += [x] if getattr(self, name).size else []
         if precision_of(*given) == "float32":
             object.__setattr__(self, "precision", "float32")
@@ -162,7 +166,8 @@ class Rows:
             raise InputError(
                 f"{name}[{nobody[0]}] = [-1, -1]: both are static, and no impulse moves them; leave it out"
             )
-        check_not_negative("inv_mass", self.inv_mass)
+        check_sizes("inv_mass", self.inv_mass, UNITS["inv_mass"])
+        check_sizes("largest entry of inv_inertia", tensor_size(self.inv_inertia), UNITS["inv_inertia"])
         if self.copy:
             object.__setattr__(self, "inv_inertia", check_inertia("inv_inertia", self.inv_inertia))
         if not checks.are_frames(self.normal, self.tangent):
@@ -267,6 +272,11 @@ class Rows:
     def __reduce__(self) -> tuple[Any, ...]:
         # Arrays stay read-only in copies and pickles.
         return type(self), tuple(f.name != "copy" and getattr(self, f.name) for f in fields(self))
+
+
+def tensor_size(tensors: FloatArray) -> FloatArray:
+    """Largest entry of each tensor (n, 3, 3)."""
+    return np.abs(tensors).max(axis=(1, 2), initial=0.0)
 
 
 def check_inertia(name: str, tensors: FloatArray) -> FloatArray:

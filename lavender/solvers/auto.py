@@ -173,7 +173,7 @@ class Tree:
         what sticks.
         """
         rows = self.problem.rows
-        if rows is None or not rows.n_bodies or self.law != "coulomb" or self.problem.cones.has_rolling:
+        if rows is None or not rows.n_bodies or self.law != "coulomb" or self.problem.cones.has_more_parts:
             return False
         return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
 

@@ -29,7 +29,6 @@ ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, t
 SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
 IDLE = 10  # steps in a row without a smaller error, after which no other is made
 TIGHTEST = 1e-15  # tol of a step
-TINY = 1e-300
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 # Nothing better comes of the same problem; of another centre something may.
 ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
@@ -126,4 +125,5 @@ def solve_qp(
 def _distance(answer: QPSolution) -> float:
     """|v*| over |x|."""
     x, free = answer.x, answer.qp.generalized.v_free
-    return float(np.sqrt(free @ free) / max(np.sqrt(x @ x), TINY))
+    size = np.sqrt(x @ x)
+    return float(np.sqrt(free @ free) / size) if size > 0.0 else 0.0

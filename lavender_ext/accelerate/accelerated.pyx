@@ -14,15 +14,16 @@ order.
 (2) and its safeguards are those of accelerate/mixing.pxd. The first `convex` iterations may sweep under the cone law:
 where contacts stick, its answer is Coulomb's.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.accelerate.accelerated cimport accelerated_room, lay_accelerated, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, clip, n_apart, n_tangents, norm2
+from lavender_ext.core.block cimport clip, length
 from lavender_ext.core.order cimport RANDOM, SYMMETRIC
+from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again, sweep_t
 from lavender_ext.local.gauss_seidel import prepare
@@ -54,33 +55,22 @@ cdef inline void iterate(sweep_data_t* c, double* lam, int32_t first) noexcept n
 
 cdef inline void project_block(const blocks_t* p, int32_t i, double* lam) noexcept nogil:
     """lam of block i into its bounds, normal first."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, nt
+    cdef int32_t j = p.ptr[i], g, k
     cdef double bound, size
-    if p.kind[i] == ROW:
-        for k in range(j, j + n):
+    cdef parts_t q
+    if is_rows(p, i):
+        for k in range(j, p.ptr[i + 1]):
             lam[k] = clip(lam[k], p.lower[k], p.upper[k])
         return
     if lam[j] < 0.0:
         lam[j] = 0.0
-    bound = p.mu[i] * lam[j]
-    nt = n_tangents(p.kind[i], n)
-    if nt > 0:
-        size = norm2(lam[j + 1], lam[j + 2]) if nt >= 2 else fabs(lam[j + 1])
-        for k in range(3, 1 + nt):                      # of a round cone
-            size = norm2(size, lam[j + k])
+    parts_of(p, i, &q)
+    for g in range(q.n):
+        bound = q.reach[g] * lam[j]
+        size = length(lam + j + q.first[g], q.size[g])
         if size > bound:
-            size = bound / size
-            for k in range(1, 1 + nt):
-                lam[j + k] *= size
-    if n_apart(p.kind[i], n) & 1:
-        bound = bound * p.patch_radius[i]
-        lam[j + 1 + nt] = clip(lam[j + 1 + nt], -bound, bound)
-    if p.kind[i] == CONTACT_ROLLING:
-        bound = p.rolling[i] * lam[j]
-        size = norm2(lam[j + n - 2], lam[j + n - 1])
-        if size > bound:
-            lam[j + n - 2] *= bound / size
-            lam[j + n - 1] *= bound / size
+            for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
+                lam[k] *= bound / size
 
 
 cdef inline double energy(const double* d, const double* x, const double* y, int32_t m) noexcept nogil:

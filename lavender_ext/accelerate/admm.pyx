@@ -21,15 +21,14 @@ At 20 iterations, then after every quarter more of them (20 at least), rho is we
 Where sqrt(primal / dual) is outside 1/3 .. 3 the kernel stops and asks for a factorisation with rho times
 that; u then becomes z + y / rho.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
-from lavender_ext.core.block cimport (CONE, CONTACT_ROLLING, ROUND, ROW, blocks_t, clip, ends_apart, n_apart, n_tangents,
-                                      norm2, rolling_section, round_group, round_section, round_share)
-from lavender_ext.core.contact_map cimport section
+from lavender_ext.core.block cimport clip, length, norm2, round_group, round_section, round_share, section
+from lavender_ext.core.parts cimport CONE, blocks_t, is_round, is_rows, parts_of, parts_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.dense cimport dense_cholesky_solve
@@ -120,52 +119,47 @@ cdef inline void project_round(int32_t n, const double* root, double mu, const d
         z[i] = (round_share(a[round_group(i)], r, u[0]) if zone == 0 else (1.0 if zone > 0 else 0.0)) * u[i]
 
 
-cdef inline void parts(const blocks_t* p, const double* root, int32_t i, const double* x, double* a, double* t) noexcept nogil:
-    """a_g and |x_g| of the parts of a contact that each have a bound: tangents, spin or second side of a box, what rolls."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, nt = n_tangents(p.kind[i], n), apart = n_apart(p.kind[i], n), k
-    a[0] = a[1] = a[2] = t[0] = t[1] = t[2] = 0.0
-    if nt > 0:
-        a[0] = p.mu[i] * root[j + 1] / root[j]
-        t[0] = norm2(x[j + 1], x[j + 2]) if nt == 2 else fabs(x[j + 1])
-    if apart & 1:
-        k = j + 1 + nt
-        a[1] = p.mu[i] * p.patch_radius[i] * root[k] / root[j]
-        t[1] = fabs(x[k])
-    if apart & 2:
-        k = j + n - 2
-        a[2] = p.rolling[i] * root[k] / root[j]
-        t[2] = norm2(x[k], x[k + 1])
+cdef inline void scaled_parts(const blocks_t* p, const double* root, int32_t i, const double* x, parts_t* q,
+                              double* t) noexcept nogil:
+    """Parts of contact i with their reach in the scale of x, and |x_g| in t."""
+    cdef int32_t j = p.ptr[i], g
+    parts_of(p, i, q)
+    for g in range(q.n):
+        q.reach[g] = q.reach[g] * root[j + q.first[g]] / root[j]
+        t[g] = length(x + j + q.first[g], q.size[g])
 
 
 cdef inline void project_block(const blocks_t* p, const double* root, int32_t i, const double* u,
                                double* z) noexcept nogil:
     """z = Pi_K(u) of one block, u, z whole scaled vectors; core/block.pxd (7)."""
-    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g, nt
-    cdef bint rolls = p.kind[i] == CONTACT_ROLLING
-    cdef double a[3]
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k, g
+    cdef parts_t q
     cdef double t[3]
-    cdef double bound[3]
-    if p.kind[i] == ROW:
+    cdef double s
+    if is_rows(p, i):
         for k in range(j, end):
             z[k] = clip(u[k], p.lower[k] * root[k], p.upper[k] * root[k])
         return
-    if p.kind[i] == ROUND:
+    if is_round(p, i):
         project_round(end - j, root + j, p.mu[i], u + j, z + j)
         return
-    nt = n_tangents(p.kind[i], end - j)
-    parts(p, root, i, u, a, t)
-    z[j] = rolling_section(a, t, u[j], bound) if rolls else section(a, t, u[j], ends_apart(p.kind[i]), bound)
-    for k in range(j + 1, end):
-        g = 0 if k <= j + nt else 2 if rolls and k >= end - 2 else 1
-        z[k] = bound[g] / t[g] * u[k] if t[g] > bound[g] else u[k]
+    scaled_parts(p, root, i, u, &q, t)
+    z[j] = s = section(q.n, q.reach, t, u[j])
+    for g in range(q.n):
+        for k in range(j + q.first[g], j + q.first[g] + q.size[g]):
+            z[k] = q.reach[g] * s / t[g] * u[k] if t[g] > q.reach[g] * s else u[k]
 
 
 cdef inline double shift(const blocks_t* p, const double* root, int32_t i, const double* y) noexcept nogil:
     # s of the normal of contact i
-    cdef double a[3]
+    cdef parts_t q
     cdef double t[3]
-    parts(p, root, i, y, a, t)
-    return a[0] * t[0] + a[1] * t[1] + a[2] * t[2]
+    cdef double s = 0.0
+    cdef int32_t g
+    scaled_parts(p, root, i, y, &q, t)
+    for g in range(q.n):
+        s += q.reach[g] * t[g]
+    return s
 
 
 cdef inline double imbalance(const admm_t* c, double* primal, double* dual) noexcept nogil:
@@ -241,7 +235,7 @@ cdef public double lav_admm(admm_t* c, const factor_t* f, double* lam, int32_t* 
             c.x[i] = c.c[i] + rho * c.z[i] - c.y[i]
         if p.law != CONE and c.shifted:
             for i in range(p.n_blocks):
-                if p.kind[i] != ROW:
+                if not is_rows(p, i):
                     c.x[p.ptr[i]] -= shift(p, c.root, i, c.y)
         solve_shifted(f, m, c.x, c.work)
         c.done += 1.0
@@ -281,7 +275,7 @@ cdef public void lav_admm_start(admm_t* c, const double* lam, const double* w) n
         c.u[i] = c.y[i]
     if p.law != CONE:
         for i in range(p.n_blocks):
-            if p.kind[i] != ROW:
+            if not is_rows(p, i):
                 c.u[p.ptr[i]] -= shift(p, c.root, i, c.y)
     for i in range(p.n_rows):
         c.u[i] = c.root[i] * lam[i] + c.u[i] / c.rho

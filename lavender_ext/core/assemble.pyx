@@ -9,8 +9,9 @@ from libc.stdint cimport INT32_MAX, int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport by_columns
+from lavender_ext.core.door cimport is_number
+from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
 
@@ -40,7 +41,7 @@ cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac
                 jac[k] = r.jac[k]
         else:
             c = i - r.n_joints
-            contact_jacobian(r, c, n_directions(p.kind[i], end - j), n_turns(p.kind[i], end - j), jac + 12 * j)
+            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac + 12 * j)
         for k in range(j, end):
             minv_times(jac + 12 * k, r.inv_mass, r.inv_inertia, a, b, minv_jac + 12 * k)
 
@@ -261,26 +262,26 @@ def dense_to_csr(const double[:, ::1] a):
 
 cdef int32_t count_rows(Py_ssize_t lines, Py_ssize_t across, const int32_t* ptr, const int32_t* idx, const double* val,
                         bint columns, int32_t* count) noexcept nogil:
-    # count[row] += its nonzeros; False where the matrix has no ascending indices in range, or numbers that are not finite.
+    # count[row] += its nonzeros; False where the matrix has no ascending indices in range, or numbers that the door excludes.
     cdef Py_ssize_t i
     cdef int32_t p
-    cdef double s = 0.0                                 # stays 0, or becomes NaN
     for i in range(lines):
         if ptr[i + 1] < ptr[i]:
             return False
         for p in range(ptr[i], ptr[i + 1]):
             if not 0 <= idx[p] < across or p > ptr[i] and idx[p] <= idx[p - 1]:
                 return False
-            s += 0.0 * val[p]
+            if not is_number(val[p]):
+                return False
             count[idx[p] if columns else i] += val[p] != 0.0
-    return s == 0.0
+    return True
 
 
 def stacked(int32_t n, parts):
     """Rows of n columns of several matrices, one under another, as (indptr, indices, data) without entries that are zero.
 
     A part is (indptr, indices, data, whether these are of columns, a sign that it is multiplied with, its rows). None where a
-    part is not int32 and float64 in canonical form, and finite: who checks at length finds the words.
+    part is not int32 and float64 in canonical form, and inside the door: who checks at length finds the words.
     """
     cdef const int32_t[::1] ptr, idx
     cdef const double[::1] val

@@ -1,20 +1,14 @@
 """The arithmetic of one block: the update of a sweep and the error of the judge.
 
-A block is one or more bounded rows (ROW), or a contact: a normal row, then 0, 1 or 2 tangent rows
-(CONTACT), then one spin row (CONTACT_SPIN); or a normal and two tangents, each bounded by itself (CONTACT_BOX, in
-(1) to (7) a contact of one tangent and, in the place of spin, the other: r is then mu_2 / mu_1); or a normal, two
-tangents, perhaps a spin row, and two rows that roll (CONTACT_ROLLING); or a contact of three to five tangents in one
-cone (ROUND: two that slide, one that spins, two that roll, scaled to one mu; law CONE only). With w = A lam - b [m/s]
-and d = diag(A) [1/kg]:
+A block is bounded rows, or a normal and its parts g, each with |lam_g| <= a_g lam_n (core/parts.pxd); a round cone has
+one bound over all rows behind its normal (law CONE only). With w = A lam - b [m/s] and d = diag(A) [1/kg]:
 
     update   row      lam  <- clip(lam - w / d, lower, upper)                                  (1)
              normal   lam_n <- max(0, lam_n - w_n / d_n)                                       (2)
-             tangents lam_t <- radial projection on mu lam_n of lam_t - w_t / lambda_max(A_tt)  (3)
-             spin     lam_s <- clip(lam_s - w_s / d_s, -mu r lam_n, mu r lam_n)                (4)
-             rolling  as (3), on mu_r lam_n
+             part     lam_g <- radial projection on a_g lam_n of lam_g - w_g / lambda_max(A_gg) (3)
     error    row      e = lam - clip(lam - w / d, lower, upper), w / d where free              (5)
-             coulomb  (5) for the normal; e_t = lam_t - Pi_disk(mu lam_n+)(lam_t - w_t / d_t),
-                      e_s, e_r likewise on mu r lam_n+, mu_r lam_n+, lam_n+ = max(0, lam_n)     (6)
+             coulomb  (5) for the normal; e_g = lam_g - Pi_disk(a_g lam_n+)(lam_g - w_g / d_g),
+                      lam_n+ = max(0, lam_n)                                                   (6)
              cone     e = lam - Pi(lam - w / d) in the metric of d                             (7)
 
 Every function here is inline, allocates nothing, calls sqrt at most, and serves the sweeps, the
@@ -23,35 +17,7 @@ judge, the engine and the WebAssembly build alike.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-
-cdef enum:
-    ROW = 0
-    CONTACT = 1
-    CONTACT_SPIN = 2
-    ROUND = 3
-    CONTACT_BOX = 4
-    CONTACT_ROLLING = 5
-
-cdef enum:
-    COULOMB = 0
-    CONE = 1
-
-
-cdef struct blocks_t:
-    int32_t n_blocks            # k
-    int32_t n_rows              # m
-    int32_t law                 # COULOMB | CONE
-    const int32_t* ptr          # (k + 1) first row of each block; ptr[0] = 0, increasing
-    const int32_t* kind         # (k) ROW | CONTACT | CONTACT_SPIN | ROUND | CONTACT_BOX | CONTACT_ROLLING
-    const double* lower         # (m) N s, read on ROW blocks
-    const double* upper         # (m) N s, read on ROW blocks
-    const double* mu            # (k) -, >= 0
-    const double* patch_radius  # (k) m, of CONTACT_BOX mu_2 / mu_1 [-]; >= 0
-    const double* b             # (m) m/s
-    const double* d             # (m) 1/kg, > 0, equal on the two tangents of a contact, and on the two that roll
-    const double* nu            # (m) 1/kg, > 0: velocity error = sqrt(nu d) |e|
-    const double* step          # (m) kg: 1/d, on tangents 1/lambda_max(A_tt), likewise on the two that roll
-    const double* rolling       # (k) m, >= 0: mu_r, read on CONTACT_ROLLING alone
+from lavender_ext.core.parts cimport CONE, PARTS, blocks_t, disk_of, is_disk, is_round, is_rows, parts_of, parts_t
 
 
 cdef inline double clip(double x, double low, double high) noexcept nogil:
@@ -60,69 +26,16 @@ cdef inline double clip(double x, double low, double high) noexcept nogil:
 
 
 cdef inline double norm2(double x, double y) noexcept nogil:
-    # sqrt(x^2 + y^2) without overflow or underflow; the plain formula where it is safe.
-    cdef double s = x * x + y * y
-    cdef double big, small
-    if 1e-280 < s < 1e280:
-        return sqrt(s)
-    x = fabs(x)
-    y = fabs(y)
-    big = x if x > y else y
-    small = y if x > y else x
-    if not big > 0.0:
-        return x + y                                    # 0, or NaN
-    if big > 1.7976931348623157e308:
-        return big
-    small = small / big
-    return big * sqrt(1.0 + small * small)
+    return sqrt(x * x + y * y)
 
 
-cdef inline double mu_r(const blocks_t* p, int32_t i) noexcept nogil:
-    return p.rolling[i] if p.kind[i] == CONTACT_ROLLING else 0.0
-
-
-cdef inline bint has_friction(const blocks_t* p) noexcept nogil:
-    """A block whose bounds depend on its own normal: else both laws are the same."""
+cdef inline double length(const double* x, int32_t n) noexcept nogil:
+    """|x|, n numbers."""
     cdef int32_t i
-    for i in range(p.n_blocks):
-        if p.kind[i] != ROW and p.ptr[i + 1] - p.ptr[i] > 1 and (p.mu[i] > 0.0 or mu_r(p, i) > 0.0):
-            return True
-    return False
-
-
-cdef inline int32_t ends_apart(int32_t kind) noexcept nogil:
-    """Has the last row of a contact a bound of its own, mu r lam_n: the spin, the second side of a box?"""
-    return kind == CONTACT_SPIN or kind == CONTACT_BOX
-
-
-cdef inline int32_t n_tangents(int32_t kind, int32_t size) noexcept nogil:
-    # that mu lam_n bounds together: CONTACT and ROUND are odd; rows with a bound of their own are left out
-    return 2 if kind == CONTACT_ROLLING else size - 2 + (kind & 1)
-
-
-cdef inline int32_t n_directions(int32_t kind, int32_t size) noexcept nogil:
-    """Tangent rows, as directions in space."""
-    return size - 1 - n_turns(kind, size)
-
-
-cdef inline int32_t n_apart(int32_t kind, int32_t size) noexcept nogil:
-    """Rows behind those that mu lam_n bounds together, as bits: 1 on mu r lam_n (`ends_apart`), 2 for two on mu_r lam_n."""
-    return size - 3 if kind == CONTACT_ROLLING else ends_apart(kind)
-
-
-cdef inline int32_t n_turns(int32_t kind, int32_t size) noexcept nogil:
-    """Rows of a contact behind its tangents, as bits and as their number: 1 spins, 2 roll, 3 is one that spins and two."""
-    return 1 if kind == CONTACT_SPIN else size - 3 if kind == CONTACT_ROLLING else 0
-
-
-cdef inline int32_t roll_at(int32_t kind, int32_t size) noexcept nogil:
-    # Offset of the two rows that roll; -2 without them.
-    return size - 2 if kind == CONTACT_ROLLING or kind == ROUND and size == 6 else -2
-
-
-cdef inline bint is_pair(int32_t nt, int32_t roll, int32_t offset) noexcept nogil:
-    # Do the rows at this offset in a contact and behind it count by their norm? The two that slide, the two that roll.
-    return offset == 1 and nt >= 2 or offset == roll
+    cdef double s = 0.0
+    for i in range(n):
+        s += x[i] * x[i]
+    return sqrt(s)
 
 
 cdef inline double relax_row(double lam, double w, double step, double low, double high) noexcept nogil:
@@ -136,8 +49,8 @@ cdef inline double relax_normal(double lam, double w, double step) noexcept nogi
 
 cdef inline void relax_tangents(double* lam, const double* w, double step, double radius,
                                 int32_t n) noexcept nogil:
-    # (3): lam, w of the n tangent rows; one scalar step for both. Squares decide where they are safe, so
-    # that a sticking contact costs no root.
+    # (3): lam, w of the n tangent rows; one scalar step for both. Squares decide, so that a sticking contact
+    # costs no root.
     cdef double x, y, s, r
     if n == 1:
         lam[0] = clip(lam[0] - w[0] * step, -radius, radius)
@@ -145,36 +58,18 @@ cdef inline void relax_tangents(double* lam, const double* w, double step, doubl
     x = lam[0] - w[0] * step
     y = lam[1] - w[1] * step
     s = x * x + y * y
-    if 1e-280 < s < 1e280:
-        if s > radius * radius:
-            r = radius / sqrt(s)
-            x = x * r
-            y = y * r
-    else:
-        r = norm2(x, y)
-        if r > radius:
-            r = radius / r
-            x = x * r
-            y = y * r
+    if s > radius * radius:
+        r = radius / sqrt(s)
+        x = x * r
+        y = y * r
     lam[0] = x
     lam[1] = y
-
-
-cdef inline double quotient(double w, double d) noexcept nogil:
-    # w / d; where it would vanish, the smallest number there is (normal, if w is), so that an error stays one.
-    cdef double x = w / d
-    if fabs(x) < 2.2250738585072014e-308 and w != 0.0:
-        if fabs(w) >= 2.2250738585072014e-308:
-            return -2.2250738585072014e-308 if w < 0.0 else 2.2250738585072014e-308
-        if x == 0.0:
-            return -5e-324 if w < 0.0 else 5e-324
-    return x
 
 
 cdef inline double row_error(double lam, double w, double d, double low, double high) noexcept nogil:
     # (5) as clip(w / d, lam - high, lam - low): lam - clip(lam - w / d) would cost digits where no bound acts,
     # and would not see a bound that is huge beside w / d.
-    return clip(quotient(w, d), lam - high, lam - low)
+    return clip(w / d, lam - high, lam - low)
 
 
 cdef inline void tangent_error(const double* lam, const double* w, double d, double radius,
@@ -183,8 +78,8 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
     if n == 1:
         e[0] = row_error(lam[0], w[0], d, -radius, radius)
     elif n == 2:
-        e[0] = quotient(w[0], d)
-        e[1] = quotient(w[1], d)
+        e[0] = w[0] / d
+        e[1] = w[1] / d
         x = lam[0] - e[0]
         y = lam[1] - e[1]
         r = norm2(x, y)
@@ -194,255 +89,72 @@ cdef inline void tangent_error(const double* lam, const double* w, double d, dou
             e[1] = lam[1] - r * y
 
 
-cdef inline void coulomb_error(const double* lam, const double* w, const double* d, double mu,
-                               double patch_radius, double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
-    # (6): one contact of 1 + nt + turns rows.
-    cdef double normal = lam[0] if lam[0] > 0.0 else 0.0, bound = mu * normal
-    cdef double inf = 1.0 / 0.0
-    cdef int32_t k = 1 + nt + (turns & 1)
+cdef inline void coulomb_error(const double* lam, const double* w, const double* d, const parts_t* q, double* e) noexcept nogil:
+    # (6)
+    cdef double normal = lam[0] if lam[0] > 0.0 else 0.0, inf = 1.0 / 0.0
+    cdef int32_t g, j
     e[0] = row_error(lam[0], w[0], d[0], 0.0, inf)
-    if nt > 0:
-        tangent_error(lam + 1, w + 1, d[1], bound, nt, e + 1)
-    if turns & 1:
-        bound = bound * patch_radius if bound < inf else mu * patch_radius * lam[0]     # inf * 0 would be no bound
-        e[1 + nt] = row_error(lam[1 + nt], w[1 + nt], d[1 + nt], -bound, bound)
-    if turns & 2:
-        tangent_error(lam + k, w + k, d[k], rolling * normal, 2, e + k)
-
-
-cdef inline double opening(double mu, double rt, double rn) noexcept nogil:
-    # mu rt / rn, where the product alone may overflow; at most the largest number.
-    cdef double a = mu * rt / rn
-    if a <= 1.7976931348623157e308:
-        return a
-    a = mu * (rt / rn)
-    return a if a <= 1.7976931348623157e308 else 1.7976931348623157e308
-
-
-cdef inline double closing(double a, double mu, double rt, double rn) noexcept nogil:
-    # 1 / a of `opening`, also where a is beyond the largest number
-    if a < 1.7976931348623157e308:
-        return 1.0 / a
-    return rn / rt / mu if mu >= 1.0 else rn / mu / rt
-
-
-cdef inline void wide_part(double yn, double a, double inverse, double t, double inv, double* s, double* sb) noexcept nogil:
-    # (yn + a t) / (1 + a^2), where a^2 or a t may overflow, and its b-fold: taken where it is the larger
-    cdef double x, y
-    if a > 1e140:
-        x = yn * inverse + t
-        y = x * (inverse / inv if inverse > inv else 1.0)
-        x = x * inverse
-    else:
-        x = (yn + a * t) / (1.0 + a * a)
-        y = x / inv
-    if x > s[0] or y > sb[0]:
-        s[0] = x
-        sb[0] = y
-
-
-cdef inline double wide_cone(double normal, double at, double in_t, double t, double as_, double in_s, double ys,
-                             double* bound_t, double* bound_s) noexcept nogil:
-    """s of (7), a_t s and a_s s where a cone is so wide that a^2 overflows: s b is what keeps its digits, b the wider.
-
-    in_t, in_s: 1 / a_t and 1 / a_s, for a itself may be beyond the largest number.
-    """
-    cdef double inv = in_t if in_t < in_s else in_s                     # 1 / b
-    cdef double p = inv / in_t if in_t > inv else 1.0, q = inv / in_s if in_s > inv else 1.0
-    cdef double sb = 0.0, c = 0.0, x, yn, size = fabs(normal)
-    size = t if t > size else size
-    size = ys if ys > size else size
-    if not 0.0 < size <= 1.7976931348623157e308:
-        size = 1.0
-    yn = normal / size                                  # (7) is homogeneous: s b must not overflow
-    t = t / size
-    ys = ys / size
-    if yn > 0.0:
-        c = yn
-        sb = yn / inv
-    wide_part(yn, at, in_t, t, inv, &c, &sb)
-    wide_part(yn, as_, in_s, ys, inv, &c, &sb)
-    x = (yn * inv + p * t + q * ys) / (inv * inv + p * p + q * q)
-    if x > sb:
-        sb = x
-        c = x * inv
-    bound_t[0] = (p * sb if at > 1e140 else at * c) * size
-    bound_s[0] = (q * sb if as_ > 1e140 else as_ * c) * size
-    return normal if c == yn else c * size
+    for g in range(q.n):
+        j = q.first[g]
+        tangent_error(lam + j, w + j, d[j], q.reach[g] * normal, q.size[g], e + j)
 
 
 cdef inline double weighed(double lam, double w, double d, double r) noexcept nogil:
-    # sqrt(d) (lam - w / d), r = sqrt(d); w / d alone may overflow.
-    cdef double x = quotient(w, d)
-    return r * (lam - x) if fabs(x) <= 1.7976931348623157e308 else r * lam - w / r
+    # sqrt(d) (lam - w / d), r = sqrt(d)
+    return r * (lam - w / d)
 
 
-cdef inline double rolling_section(const double* a, const double* t, double yn, double* bound) noexcept nogil:
-    """s of (7) and a_g s in bound (3) for three parts, |y_g| = t_g <= a_g s each; a_g = 0 where one is not there.
+cdef inline double share(double bound, double size) noexcept nogil:
+    # of what is longer than its bound; dust may have no size
+    return bound / size if size > 0.0 else 0.0
 
-    The largest of the eight candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over subsets, as before, each over the widest
-    part in it. b s with b = max(1, a_g) is what keeps its digits where a cone is wide.
+
+cdef inline double section(const int32_t n, const double* a, const double* t, double yn) noexcept nogil:
+    """s of (7), the normal of the projection on |y_g| <= a_g s of n parts, |y_g| = t_g.
+
+    The largest of the candidates (y_n + sum a_g t_g) / (1 + sum a_g^2) over the subsets of parts: pieces of one convex
+    piecewise quadratic in s.
     """
-    cdef double b = 1.0, s = 0.0, sb = 0.0, up, down, f, most
+    cdef double s = yn if yn > 0.0 else 0.0, up, down
     cdef int32_t g, subset
-    for g in range(3):
-        if a[g] > b:
-            b = a[g]
-    if yn > 0.0:
-        s = yn
-        sb = b * yn
-    for subset in range(1, 8):
-        most = 1.0
-        for g in range(3):
-            if subset >> g & 1 and a[g] > most:
-                most = a[g]
-        up = yn / most
-        down = 1.0 / most / most
-        for g in range(3):
+    for subset in range(1, 1 << n):
+        up = yn
+        down = 1.0
+        for g in range(n):
             if subset >> g & 1:
-                f = a[g] / most
-                up += f * t[g]
-                down += f * f
+                up += a[g] * t[g]
+                down += a[g] * a[g]
         up = up / down
-        if up / most > s or up * (b / most) > sb:
-            s = up / most
-            sb = up * (b / most)
-    for g in range(3):
-        bound[g] = a[g] / b * sb if a[g] > 1e140 else a[g] * s
+        if up > s:
+            s = up
     return s
 
 
-cdef inline void project_rolling(const double* lam, const double* w, const double* d, double mu, double patch_radius,
-                                 double rolling, int32_t turns, double* e) noexcept nogil:
-    # (7) of a normal, two tangents, perhaps spin, and two that roll: parts g of one or two rows, each with one d
-    cdef double t[3]
-    cdef double a[3]
-    cdef double bound[3]
+cdef inline void cone_error(const double* lam, const double* w, const double* d, const parts_t* q, double* e) noexcept nogil:
+    # (7) after y = sqrt(d) (lam - w / d), which makes every part one of `section`
+    cdef double t[PARTS]
+    cdef double a[PARTS]
     cdef double y[6]
-    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), s, r, f
-    cdef int32_t g, i, k = 3 + (turns & 1), j, n
-    t[1] = a[1] = 0.0
-    for g in range(3):
-        if g == 1 and not turns & 1:
-            continue
-        j = 1 if g == 0 else 3 if g == 1 else k
-        n = 1 if g == 1 else 2
+    cdef double rn = sqrt(d[0]), yn = weighed(lam[0], w[0], d[0], rn), total = yn, s, r, f
+    cdef int32_t g, i, j, end
+    for g in range(q.n):
+        j, end = q.first[g], q.first[g] + q.size[g]
         r = sqrt(d[j])
-        a[g] = opening(rolling if g == 2 else mu, r * (patch_radius if g == 1 else 1.0), rn)
-        t[g] = 0.0
-        for i in range(j, j + n):
+        a[g] = q.reach[g] * r / rn
+        for i in range(j, end):
             y[i] = weighed(lam[i], w[i], d[i], r)
-            t[g] = norm2(t[g], y[i])
-    s = rolling_section(a, t, yn, bound)
-    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
-    for g in range(3):
-        if g == 1 and not turns & 1:
-            continue
-        j = 1 if g == 0 else 3 if g == 1 else k
-        n = 1 if g == 1 else 2
-        for i in range(j, j + n):
-            if t[g] > bound[g]:
-                f = t[g] * sqrt(d[i])
-                f = bound[g] / f if 1e-300 < f <= 1.7976931348623157e308 else bound[g] / t[g] / sqrt(d[i])
-                e[i] = lam[i] - f * y[i]
-            else:
-                e[i] = quotient(w[i], d[i])
-    if not (yn == yn and t[0] == t[0] and t[1] == t[1] and t[2] == t[2]):
-        e[0] = yn + t[0] + t[1] + t[2]                  # NaN: comparisons above would hide it
-
-
-cdef inline void project_error(const double* lam, const double* w, const double* d, double mu,
-                               double patch_radius, int32_t nt, int32_t spin, double* e) noexcept nogil:
-    # (7): the projection on {|y_t| <= a_t y_n, |y_s| <= a_s y_n} after y = sqrt(d) (lam - w / d). The
-    # largest of the four candidates for s is the projection's normal part: three pieces of one
-    # convex piecewise quadratic in s.
-    cdef double rn = sqrt(d[0]), rt = 1.0, rs = 1.0, at = 0.0, as_ = 0.0
-    cdef double yn, y0 = 0.0, y1 = 0.0, ys = 0.0, t = 0.0, s, c, f, bound_t, bound_s
-    cdef int32_t i, js = 1 + nt
-    yn = weighed(lam[0], w[0], d[0], rn)
-    if nt > 0:
-        rt = sqrt(d[1])
-        at = opening(mu, rt, rn)
-        y0 = weighed(lam[1], w[1], d[1], rt)
-        if nt == 2:
-            y1 = weighed(lam[2], w[2], d[2], rt)
-        t = norm2(y0, y1)
-    if spin:
-        rs = sqrt(d[js])
-        as_ = mu * patch_radius * rs / rn
-        if not as_ <= 1.7976931348623157e308:
-            as_ = opening(mu * (rs / rn), patch_radius, 1.0)
-        ys = weighed(lam[js], w[js], d[js], rs)
-    if at > 1e140 or as_ > 1e140:
-        s = wide_cone(yn, at, closing(at, mu, rt, rn), t, as_, closing(as_, mu * patch_radius, rs, rn), fabs(ys),
-                      &bound_t, &bound_s)
-    else:
-        s = yn if yn > 0.0 else 0.0
-        c = (yn + at * t) / (1.0 + at * at)
-        if c > s:
-            s = c
-        c = (yn + as_ * fabs(ys)) / (1.0 + as_ * as_)
-        if c > s:
-            s = c
-        c = (yn + at * t + as_ * fabs(ys)) / (1.0 + at * at + as_ * as_)
-        if c > s:
-            s = c
-        bound_t = at * s
-        bound_s = as_ * s
+        t[g] = length(y + j, q.size[g])
+        total += t[g]
+    s = section(q.n, a, t, yn)
     # e = lam - Pi: w / d where the projection moves nothing.
-    e[0] = quotient(w[0], d[0]) if s == yn else lam[0] - s / rn
-    if nt > 0:
-        if t > bound_t:
-            f = t * rt
-            f = bound_t / f if 1e-300 < f <= 1.7976931348623157e308 else bound_t / t / rt
-            e[1] = lam[1] - f * y0
-            if nt == 2:
-                e[2] = lam[2] - f * y1
-        else:
-            for i in range(1, 1 + nt):
-                e[i] = quotient(w[i], d[i])
-    if spin:
-        if ys > bound_s:
-            e[js] = lam[js] - bound_s / rs
-        elif ys < -bound_s:
-            e[js] = lam[js] + bound_s / rs
-        else:
-            e[js] = quotient(w[js], d[js])
-    if not (yn == yn and t == t and ys == ys):
-        e[0] = yn + t + ys                              # NaN: comparisons above would hide it
-
-
-cdef inline void project_parts(const double* lam, const double* w, const double* d, double mu, double patch_radius,
-                               double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
-    if turns & 2:
-        project_rolling(lam, w, d, mu, patch_radius, rolling, turns, e)
-    else:
-        project_error(lam, w, d, mu, patch_radius, nt, turns, e)
-
-
-cdef inline void cone_error(const double* lam, const double* w, const double* d, double mu, double patch_radius,
-                            double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
-    # (7) is homogeneous: where all of lam and w / d would vanish, 2^600 times both, so that their ratios decide, and
-    # 2^-600 times both where some w / sqrt(d) would overflow.
-    cdef double up = 1.0
-    cdef double big[12]
-    cdef int32_t i, n = 1 + nt + turns
-    cdef bint small = True
-    for i in range(n):
-        small = small and fabs(lam[i]) < 1e-290 and fabs(w[i]) < 1e-290 * d[i]
-        if fabs(w[i]) > 1e140 and fabs(w[i]) / sqrt(d[i]) > 1.7976931348623157e308:
-            up = 2.409919865102884e-181                 # 2^-600
-    if small:
-        up = 4.149515568880993e180                      # 2^600
-    if up == 1.0:
-        project_parts(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
-        return
-    for i in range(n):
-        big[i] = up * lam[i]
-        big[6 + i] = up * w[i]
-    project_parts(big, big + 6, d, mu, patch_radius, rolling, nt, turns, e)
-    for i in range(n):
-        e[i] = quotient(e[i], up)
+    e[0] = w[0] / d[0] if s == yn else lam[0] - s / rn
+    for g in range(q.n):
+        j, end = q.first[g], q.first[g] + q.size[g]
+        f = share(a[g] * s, t[g] * sqrt(d[j]))
+        for i in range(j, end):
+            e[i] = lam[i] - f * y[i] if t[g] > a[g] * s else w[i] / d[i]
+    if total != total:
+        e[0] = total                                    # NaN: comparisons above would hide it
 
 
 cdef inline int32_t round_group(int32_t tangent) noexcept nogil:
@@ -525,7 +237,7 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
         a[g] = mu * sqrt(d[i]) / rn
     zone = round_section(t, a, yn, &r, &inside)
     for i in range(1 + nt):
-        e[i] = lam[i] if zone < 0 else quotient(w[i], d[i])
+        e[i] = lam[i] if zone < 0 else w[i] / d[i]
     if zone == 0:
         # lam - Pi as w / d and what the projection adds, where that is the smaller part
         e[0] = (e[0] if yn > 0.0 else lam[0]) - r / rn
@@ -537,27 +249,29 @@ cdef inline void round_error(const double* lam, const double* w, const double* d
         e[0] = yn + inside                              # NaN: comparisons above would hide it
 
 
-cdef inline void contact_error(int32_t law, const double* lam, const double* w, const double* d, double mu,
-                               double patch_radius, double rolling, int32_t nt, int32_t turns, double* e) noexcept nogil:
-    """Error of one contact of 1 + nt + turns rows under its law: where the judge tells laws apart."""
+cdef inline void contact_error(int32_t law, const double* lam, const double* w, const double* d, const parts_t* q,
+                               double* e) noexcept nogil:
+    """Error of one contact of parts q under its law: where the judge tells laws apart."""
     if law == CONE:
-        cone_error(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
+        cone_error(lam, w, d, q, e)
     else:
-        coulomb_error(lam, w, d, mu, patch_radius, rolling, nt, turns, e)
+        coulomb_error(lam, w, d, q, e)
 
 
 cdef inline void block_error(const blocks_t* p, int32_t i, const double* lam, const double* w,
                              double* e) noexcept nogil:
     """Error e of block i [N s]; lam, w, e are whole vectors (m)."""
-    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], nt
-    if kind == ROW:
+    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1]
+    cdef parts_t q
+    if is_rows(p, i):
         while j < end:
             e[j] = row_error(lam[j], w[j], p.d[j], p.lower[j], p.upper[j])
             j += 1
-        return
-    nt = n_tangents(kind, end - j)
-    if kind == ROUND:
-        round_error(lam + j, w + j, p.d + j, p.mu[i], nt, e + j)
+    elif is_disk(p, i):                                 # compiled apart
+        disk_of(p, i, &q)
+        contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)
+    elif is_round(p, i):
+        round_error(lam + j, w + j, p.d + j, p.mu[i], end - j - 1, e + j)
     else:
-        contact_error(p.law, lam + j, w + j, p.d + j, p.mu[i], p.patch_radius[i], mu_r(p, i), nt,
-                      n_apart(kind, end - j), e + j)
+        parts_of(p, i, &q)
+        contact_error(p.law, lam + j, w + j, p.d + j, &q, e + j)

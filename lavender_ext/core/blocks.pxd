@@ -1,7 +1,7 @@
 """Blocks of a problem: plain pointers into arrays that stay alive with the object."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.parts cimport blocks_t
 
 
 cdef class Blocks:
@@ -12,7 +12,7 @@ cdef class Blocks:
     cdef readonly bint has_round                        # some contact has more than two tangents
     cdef readonly bint has_rolling                      # some contact has rows that roll, bounded by themselves
     cdef readonly bint has_ellipse                      # some contact bounds its two tangents by an ellipse
-    cdef readonly bint single_rows                      # every block is one ROW
+    cdef readonly bint single_rows                      # every block is one bounded row
 
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                     const double[::1] upper, const double[::1] mu, const double[::1] radius,

@@ -7,7 +7,8 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
+from lavender_ext.core.door cimport is_number, is_size
+from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
 
 cdef enum:
     CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
@@ -56,8 +57,9 @@ cdef class Blocks:
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
-            if size <= 0 or not 0.0 <= p.mu[i] < INF or not 0.0 <= p.patch_radius[i] < INF \
-                    or not 0.0 <= p.rolling[i] < INF:
+            if size <= 0 or not is_size(p.mu[i]) or not is_size(p.patch_radius[i]) or not is_size(p.rolling[i]):
+                return False
+            if kind != ROW and not is_size(p.mu[i] * p.patch_radius[i]):
                 return False
             if kind == ROUND:
                 self.has_round = True
@@ -66,7 +68,7 @@ cdef class Blocks:
             elif kind == CONTACT_BOX or kind == CONTACT_ELLIPSE:
                 if kind == CONTACT_ELLIPSE:
                     self.has_ellipse = True
-                if size != 3 or not p.mu[i] * p.patch_radius[i] < INF:
+                if size != 3:
                     return False
                 if kind == CONTACT_ELLIPSE and not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
                     return False
@@ -87,7 +89,8 @@ cdef class Blocks:
                 if p.kind[i] != ROW:
                     if p.lower[j] != p.lower[j] or p.upper[j] != p.upper[j]:
                         return False
-                elif not (p.lower[j] <= p.upper[j] and p.lower[j] < INF and p.upper[j] > -INF):
+                elif not (p.lower[j] <= p.upper[j] and (p.lower[j] == -INF or is_number(p.lower[j]))
+                          and (p.upper[j] == INF or is_number(p.upper[j]))):
                     return False
                 elif p.lower[j] != -INF or p.upper[j] != INF:
                     self.is_free = False

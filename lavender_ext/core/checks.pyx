@@ -8,18 +8,20 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
+from lavender_ext.core.door cimport first_outside, first_unsized, least, most
+
+#: The largest and the least size that a number of a problem may have.
+MOST, LEAST = most(), least()
 cdef object ndarray = np.ndarray
 
 
 def plain(value, tuple shape, bint finite, bint copy):
     """`value`, or a copy of it, read-only; None where it is not such an array and the long way finds the words.
 
-    None in `shape` stands for any length; `finite`: NaN and infinities are left to the long way.
+    None in `shape` stands for any length; `finite`: what core/door.pxd (1) excludes is left to the long way.
     """
     cdef Py_buffer view
     cdef Py_ssize_t i, n = 1
-    cdef const double* x
-    cdef double s = 0.0                                 # stays 0, or becomes NaN
     cdef bint fits
     if type(value) is not ndarray or not value.flags.c_contiguous:
         return None
@@ -36,16 +38,23 @@ def plain(value, tuple shape, bint finite, bint copy):
                 fits = False
                 break
     if fits and finite:
-        x = <const double*>view.buf
-        for i in range(n):
-            s += 0.0 * x[i]
-        fits = s == 0.0
+        fits = first_outside(<const double*>view.buf, n) < 0
     PyBuffer_Release(&view)
     if not fits:
         return None
     made = value.copy() if copy else value
     made.setflags(write=False)
     return made
+
+
+def inside(const double[::1] x):
+    """Whether every number is at most MOST in size, none NaN: (1) of core/door.pxd."""
+    return x.shape[0] == 0 or first_outside(&x[0], x.shape[0]) < 0
+
+
+def unsized(const double[::1] x):
+    """The first number that is neither 0 nor from LEAST to MOST, or -1: (2) of core/door.pxd."""
+    return first_unsized(&x[0], x.shape[0]) if x.shape[0] else -1
 
 
 def largest(const double[::1] x):
@@ -124,7 +133,7 @@ def are_definite(const double[:, :, ::1] tensor):
         if size == 0.0:
             continue
         a = 1.0 / size
-        if not (size >= 1e-300 and a > 0.0 and skew <= 5e-10 * size):
+        if not (size >= LEAST and skew <= 5e-10 * size):
             return False
         p = tensor[i, 0, 0] * a
         if not p > 1e-6:

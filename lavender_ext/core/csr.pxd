@@ -30,15 +30,6 @@ cdef inline double csr_dot(const csr_t* a, int32_t i, const double* x) noexcept 
     return (s0 + s1) + (s2 + s3)
 
 
-cdef inline double csr_abs_dot(const csr_t* a, int32_t i, const double* x) noexcept nogil:
-    # sum_j |A_ij| |x_j|
-    cdef int32_t p, end = a.indptr[i + 1]
-    cdef double s = 0.0
-    for p in range(a.indptr[i], end):
-        s += fabs(a.data[p]) * fabs(x[a.indices[p]])
-    return s
-
-
 cdef inline double csr_dot_size(const csr_t* a, int32_t i, const double* x, double* size) noexcept nogil:
     # csr_dot, to the bit, and sum_j |A_ij x_j| into size.
     cdef int32_t p = a.indptr[i], end = a.indptr[i + 1]

@@ -12,6 +12,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcpy
 
+from lavender_ext.core.door cimport least
+
 
 cdef enum:
     PANEL_ROWS = 16             # most rows of a panel, unless one block has more
@@ -104,7 +106,7 @@ cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* 
 cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
                                 const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
                                 double* inv_pivot) noexcept nogil:
-    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or has no reciprocal.
+    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or below the door's least.
 
     Two rows of a chain, whose columns are the same but for the upper one's own place, are eliminated together: with the
     bits of one after the other, and half of what is read and written.
@@ -175,10 +177,10 @@ cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* m
 
 cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k) noexcept nogil:
     # inv_pivot holds M_kk before, 1 / D_k afterwards.
-    if not pivot[k] > 8.8817841970012523e-16 * inv_pivot[k]:
+    if not (pivot[k] > 8.8817841970012523e-16 * inv_pivot[k] and pivot[k] >= least()):
         return False
     inv_pivot[k] = 1.0 / pivot[k]
-    return inv_pivot[k] <= 1.7976931348623157e308
+    return True
 
 
 cdef inline void take_row(const int32_t* lptr, const int32_t* lidx, double* lval, int32_t j, int32_t first,

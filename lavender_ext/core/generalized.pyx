@@ -5,6 +5,7 @@ from libc.string cimport memcmp
 
 import numpy as np
 
+from lavender_ext.core.door cimport largest
 from lavender_ext.core.generalized cimport jac_push, jac_row, tree_factor, tree_pattern, tree_solve
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
@@ -117,6 +118,13 @@ cdef class Operator:
         return least
 
     @property
+    def most(self):
+        """The largest of |J_ij|, |L_ij| and 1 / D_i."""
+        cdef double x = largest(self.g.jval, self.g.jptr[self.g.m]), y = largest(self.g.lval, self.g.lptr[self.g.n])
+        cdef double z = largest(self.g.inv_pivot, self.g.n)
+        return max(x, y, z)
+
+    @property
     def work(self):
         """Multiply-adds of the factor: of a row with c entries left of the diagonal c (c + 1) / 2."""
         cdef int32_t i, c
@@ -174,7 +182,7 @@ cdef class Operator:
             out[i] = jac_row(&self.g, i, &x[0]) if self.g.n else 0.0
 
     def bias(self, const double[::1] v, const double[::1] target):
-        """b = target - J v (m,), a new array; what overflows is left to whoever reads it."""
+        """b = target - J v (m,), a new array; what leaves the door's range is left to whoever reads it."""
         cdef int32_t i
         made = new(self.g.m)
         cdef double[::1] out = made

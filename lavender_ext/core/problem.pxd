@@ -1,9 +1,9 @@
 """What the kernels know of a problem: plain pointers into arrays that a `Data` keeps alive."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 
@@ -41,7 +41,7 @@ cdef class Data:
     cdef generalized_t general  # where is_general
     cdef readonly bint factored, is_general
     cdef readonly bint ready            # d, nu, step and Y are known
-    cdef readonly bint single_rows      # every block is one ROW
+    cdef readonly bint single_rows      # every block is one bounded row
     cdef readonly object empty
     cdef object _numbers, _d, _nu, _step
     cdef made_t made            # where is_general and ready

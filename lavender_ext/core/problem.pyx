@@ -1,7 +1,7 @@
 """A problem's derived numbers: diagonal d, velocity weight nu, sweep step, coupling of a contact's rows.
 
-    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row: the mean of the positive
-              d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
+    d_i     = A_ii; where A_ii <= 1e-10 max_j |A_ij| that maximum; an empty row, its largest below 1e-60: the mean of the
+              others' d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
               the two that roll                                                                   (1)
     nu_i    = d_i; on a row that spins or rolls d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
     step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive;
@@ -16,11 +16,11 @@ cimport cython
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONE, CONTACT_BOX, CONTACT_ROLLING, COULOMB, ROUND, ROW, blocks_t, is_pair,
-                                      n_directions, n_tangents, n_turns, roll_at)
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.door cimport first_outside, least
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, groups_of, is_box, n_directions, n_turns, parts_of, parts_t
 from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
                                      rows_t, rows_times)
 from lavender_ext.core.view cimport view_t
@@ -36,8 +36,10 @@ LAWS = {"coulomb": COULOMB, "cone": CONE}
 cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
                                      int32_t* empty) noexcept nogil:
     """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
-    cdef int32_t i, j, q, nt, kind, n_empty = 0, n_positive = 0
-    cdef double diag, big, total = 0.0, mean, x, e, roll
+    cdef int32_t i, j, q, g, n_empty = 0, n_positive = 0
+    cdef double diag, big, total = 0.0, mean, x
+    cdef double most[3]
+    cdef parts_t part
     for i in range(p.n_rows):
         diag = 0.0
         big = 0.0
@@ -48,7 +50,9 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             if a.indices[q] == i:
                 diag += a.data[q]
         d[i] = diag if diag > 1e-10 * big else big
-        empty[i] = big == 0.0
+        empty[i] = big < least()
+        if empty[i]:
+            d[i] = 0.0
         n_empty += empty[i]
         step[i] = big                                   # held for (3) below
         if d[i] > 0.0:
@@ -60,50 +64,45 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             d[i] = mean
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        kind = p.kind[i]
-        nt = 0 if kind == ROW else n_tangents(kind, p.ptr[i + 1] - j)
-        q = p.ptr[i + 1] - j
-        pair_means(kind, q, d + j)
-        e = roll = 0.0
-        if nt > 0 and kind != ROUND:
-            e = csr_largest(a, j + 1, nt, d, step)
-        if kind == CONTACT_ROLLING:
-            roll = csr_largest(a, j + q - 2, 2, d, step)
-        block_steps(p, i, nt, e, roll, d, step)
+        pair_means(p, i, d)
+        parts_of(p, i, &part)
+        for g in range(part.n):
+            if part.size[g] == 2:
+                most[g] = csr_largest(a, j + part.first[g], d, step)
+        block_steps(p, i, &part, most, d, step)
     return n_empty
 
 
-cdef inline double csr_largest(const csr_t* a, int32_t j, int32_t n, const double* d, const double* big) noexcept nogil:
-    # lambda_max of (3) on the n rows from j on, with the largest entry of each row in `big`
-    cdef double most = big[j], e = csr_entry(a, j, j), off
-    if n == 2:
-        if big[j + 1] > most:
-            most = big[j + 1]
-        off = 0.5 * (csr_entry(a, j, j + 1) + csr_entry(a, j + 1, j))
-        e = largest_eigenvalue(e, off, csr_entry(a, j + 1, j + 1))
+cdef inline double csr_largest(const csr_t* a, int32_t j, const double* d, const double* big) noexcept nogil:
+    # lambda_max of (3) on rows j and j + 1, with the largest entry of each row in `big`
+    cdef double most = big[j] if big[j] > big[j + 1] else big[j + 1], e
+    e = largest_eigenvalue(csr_entry(a, j, j), 0.5 * (csr_entry(a, j, j + 1) + csr_entry(a, j + 1, j)),
+                           csr_entry(a, j + 1, j + 1))
     return e if e > 1e-10 * most else d[j]
 
 
-cdef inline void block_steps(const blocks_t* p, int32_t i, int32_t nt, double e, double roll, const double* d,
+cdef inline void block_steps(const blocks_t* p, int32_t i, const parts_t* part, const double* most, const double* d,
                              double* step) noexcept nogil:
-    # (3) of block i: e, roll are lambda_max of its nt tangents and of the two rows that roll, d where not positive
-    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], k
-    for k in range(j, end):
+    # (3) of block i: `most` is lambda_max of its parts of two rows, d where not positive
+    cdef int32_t j = p.ptr[i], g, k
+    for k in range(j, p.ptr[i + 1]):
         step[k] = reciprocal(d[k])
-    if nt > 0 and p.kind[i] != ROUND:                   # which no sweep relaxes
-        for k in range(j + 1, j + 1 + nt):
-            step[k] = reciprocal(e if e > 0.0 else d[j + 1])
-    if p.kind[i] == CONTACT_ROLLING:
-        step[end - 2] = step[end - 1] = reciprocal(roll if roll > 0.0 else d[end - 2])
+    for g in range(part.n):
+        if part.size[g] == 2:                           # no sweep relaxes a round cone
+            k = j + part.first[g]
+            step[k] = step[k + 1] = reciprocal(most[g] if most[g] > 0.0 else d[k])
 
 
-cdef inline void pair_means(int32_t kind, int32_t size, double* d) noexcept nogil:
-    # One d for the two tangents that slide, one for the two that roll; d at the normal.
-    cdef int32_t t, nt = 0 if kind == ROW else n_tangents(kind, size), roll = roll_at(kind, size)
-    for t in range(1, size - 1):
-        if is_pair(nt, roll, t):
-            d[t] = 0.5 * (d[t] + d[t + 1])
-            d[t + 1] = d[t]
+cdef inline void pair_means(const blocks_t* p, int32_t i, double* d) noexcept nogil:
+    # One d for the two rows of a part.
+    cdef parts_t group
+    cdef int32_t g, k
+    groups_of(p, i, &group)
+    for g in range(group.n):
+        if group.size[g] == 2:
+            k = p.ptr[i] + group.first[g]
+            d[k] = 0.5 * (d[k] + d[k + 1])
+            d[k + 1] = d[k]
 
 
 cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
@@ -124,9 +123,11 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* swing) noexcept nogil:
     """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
-    cdef int32_t i, j, q, c, nt, end, n_empty = 0, n_positive = 0, a, b
-    cdef double total = 0.0, mean, e, roll
+    cdef int32_t i, j, q, g, c, nt, n_empty = 0, n_positive = 0, a, b
+    cdef double total = 0.0, mean
     cdef double off[2]
+    cdef double most[3]
+    cdef parts_t part
     for i in range(r.n_joints):
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
@@ -137,41 +138,39 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        end = p.ptr[i + 1]
-        nt = n_directions(p.kind[i], end - j)
+        nt = n_directions(p, i)
         contact_diagonal(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c, nt,
-                         n_turns(p.kind[i], end - j), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
+                         n_turns(p, i), r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
                          r.inv_inertia, d + j, off,
                          coupling + 5 * c, swing + 6 * (j - p.ptr[r.n_joints]))
-        for q in range(end - j):
-            d[j + q] += r.compliance[j + q]
-            step[j + q] = 0.0
-        if p.kind[i] == CONTACT_BOX:                    # each tangent has a step of its own, and feels the one before
+        for q in range(j, p.ptr[i + 1]):
+            d[q] += r.compliance[q]
+            step[q] = 0.0
+        if is_box(p, i):                                # each tangent has a step of its own, and feels the one before
             coupling[5 * c + 2] = off[0]
-        elif nt > 0:
-            step[j + 1] = largest_eigenvalue(d[j + 1], off[0], d[j + 2]) if nt == 2 else d[j + 1]
-        if p.kind[i] == CONTACT_ROLLING:
-            step[end - 2] = largest_eigenvalue(d[end - 2], off[1], d[end - 1])
+        parts_of(p, i, &part)
+        for g in range(part.n):
+            if part.size[g] == 2:
+                q = j + part.first[g]
+                step[q] = largest_eigenvalue(d[q], off[part.first[g] > nt], d[q + 1])
     for j in range(p.n_rows):
-        empty[j] = d[j] == 0.0                          # what overflowed is not empty
+        empty[j] = fabs(d[j]) < least()
+        if empty[j]:
+            d[j] = 0.0
         n_empty += empty[j]
         if d[j] > 0.0:
             n_positive += 1
             total += d[j] / p.n_rows
     mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
     for j in range(p.n_rows):
-        if d[j] != d[j]:
-            d[j] = 1.0 / 0.0                            # its products overflow: nothing measures it
         if not d[j] > 0.0:
             d[j] = mean
     for i in range(p.n_blocks):
-        j = p.ptr[i]
-        end = p.ptr[i + 1]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], end - j)
-        pair_means(p.kind[i], end - j, d + j)
-        e = step[j + 1] if nt > 0 else 0.0
-        roll = step[end - 2] if p.kind[i] == CONTACT_ROLLING else 0.0
-        block_steps(p, i, nt, e, roll, d, step)
+        pair_means(p, i, d)
+        parts_of(p, i, &part)
+        for g in range(part.n):
+            most[g] = step[p.ptr[i] + part.first[g]]
+        block_steps(p, i, &part, most, d, step)
     block_weights(p, d, nu)
     joint_weights(p, r, nu)
     return n_empty
@@ -180,8 +179,10 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
 cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
                                          int32_t* empty, int32_t* place, double* y) noexcept nogil:
     """Y, d, nu and step of a problem in generalised coordinates; place (n) is scratch. Returns how many rows are empty."""
-    cdef int32_t i, j, k, b, nc, nt, n_empty = 0, n_positive = 0
-    cdef double total = 0.0, mean, e, roll
+    cdef int32_t i, j, b, nc, part_, n_empty = 0, n_positive = 0
+    cdef double total = 0.0, mean
+    cdef double most[3]
+    cdef parts_t part
     cdef const double* row
     for b in range(g.n_panels):
         panel_whiten(g, b, place, y + g.pval[b])
@@ -189,8 +190,8 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         row = y + g.pval[b]
         for i in range(g.prow[b], g.prow[b + 1]):
             d[i] = dot(row, row, nc) + g.compliance[i]
-            empty[i] = not d[i] > 0.0
-            if d[i] > 0.0:
+            empty[i] = d[i] < least()
+            if not empty[i]:
                 n_positive += 1
                 total += d[i] / p.n_rows
             else:
@@ -206,19 +207,15 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         j = p.ptr[i]
         while g.prow[b + 1] <= j:
             b += 1
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        e = d[j + 1] if nt > 0 else 0.0
-        roll = 0.0
         nc = g.pcol[b + 1] - g.pcol[b]
-        if nt == 2:
-            row = y + g.pval[b] + (j + 1 - g.prow[b]) * nc
-            e = largest_eigenvalue(d[j + 1], dot(row, row + nc, nc), d[j + 2])
-        if p.kind[i] == CONTACT_ROLLING:
-            k = p.ptr[i + 1] - 2
-            row = y + g.pval[b] + (k - g.prow[b]) * nc
-            roll = largest_eigenvalue(d[k], dot(row, row + nc, nc), d[k + 1])
-        pair_means(p.kind[i], p.ptr[i + 1] - j, d + j)
-        block_steps(p, i, nt, e, roll, d, step)
+        parts_of(p, i, &part)
+        for part_ in range(part.n):
+            if part.size[part_] == 2:
+                j = p.ptr[i] + part.first[part_]
+                row = y + g.pval[b] + (j - g.prow[b]) * nc
+                most[part_] = largest_eigenvalue(d[j], dot(row, row + nc, nc), d[j + 1])
+        pair_means(p, i, d)
+        block_steps(p, i, &part, most, d, step)
     block_weights(p, d, nu)
     return n_empty
 
@@ -459,7 +456,7 @@ cdef class Data:
     def weigh_as(self, Data other, bint joints=False):
         """Take nu of the same problem given by rows: in A alone nothing tells an angular row from a linear one.
 
-        joints: only of the ROW blocks before the first contact, of a problem whose contacts are others.
+        joints: only of the bounded rows before the first contact, of a problem whose contacts are others.
         """
         cdef int32_t rows = self.blocks.ptr[other.rows.n_joints] if joints else self.blocks.n_rows
         memcpy(<double*>self.blocks.nu, other.blocks.nu, rows * sizeof(double))
@@ -478,6 +475,11 @@ cdef class Data:
         if self._step is None:
             self._step = _read_only(self.part(2))
         return self._step
+
+    @property
+    def outside(self):
+        """The first row whose d is beyond what core/door.pxd allows, or -1."""
+        return first_outside(self.blocks.d, self.blocks.n_rows)
 
     @property
     def n_rows(self):

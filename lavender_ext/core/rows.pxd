@@ -6,7 +6,7 @@ never written. Relative velocity at a contact, from body a to body b,
     u = (v_b + omega_b x arm_b) - (v_a + omega_a x arm_a)                                      (1)
     w_n = n.u,  w_t = t.u with t2 = n x t1,  w_s = n.(omega_b - omega_a),  w_r = t.(omega_b - omega_a)  (2)
 
-and an impulse P [N s] with spin s [N m s] along n (rolling: along t) changes
+and an impulse P [N s] with spin s [N m s] along n (of one that rolls along t) changes
 
     v_b += P / m_b,  omega_b += I_b^-1 (arm_b x P + s n),  and the opposite on a.              (3)
 
@@ -16,12 +16,11 @@ through these couplings, and writes both bodies once, omega by the stored I^-1 (
 
     w_t after the normal's step = t.u + A_tn (change of lam_n), and so on.                     (4)
 """
-from libc.float cimport DBL_MAX
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, n_directions, n_turns, relax_normal,
-                                      relax_row, relax_tangents)
+from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
+from lavender_ext.core.parts cimport blocks_t, is_box, is_disk, n_directions, n_turns, parts_of, parts_t
 
 
 cdef struct rows_t:
@@ -158,9 +157,12 @@ cdef inline void swing_body(double* v, double inv_mass, const double* swing, con
 cdef inline void relax_contact(const double* normal, const double* tangent, const double* arm_a,
                                const double* arm_b, const double* coupling, const double* swing,
                                const double* compliance, const double* rhs, const double* step, double mu,
-                               double patch_radius, int32_t nt, int32_t spin, bint box, int32_t a, int32_t b,
+                               double second, int32_t nt, int32_t spin, bint box, int32_t a, int32_t b,
                                const double* inv_mass, double* lam, double* v) noexcept nogil:
-    """One contact: normal, tangents together (of a box one after the other), spin; all pointers are at its first entry."""
+    """One contact: normal, tangents together (of a box one after the other), spin; all pointers are at its first entry.
+
+    mu, second: reach of its tangents, and of what spins or of the second side of a box.
+    """
     cdef double u[3]
     cdef double omega[3]
     cdef double t2[3]
@@ -186,7 +188,7 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
             lam[1] = relax_row(lam[1], w[0], step[1], -(mu * y), mu * y)
             # What the first moved comes last, so that all else need not wait for it.
             lam[2] = relax_row(old[1] - w[1] * step[2], lam[1] - old[0], coupling[2] * step[2],
-                               -(mu * patch_radius * y), mu * patch_radius * y)
+                               -(second * y), second * y)
         else:
             relax_tangents(lam + 1, w, step[1], mu * y, nt)
         d0 = lam[1] - old[0]
@@ -199,7 +201,7 @@ cdef inline void relax_contact(const double* normal, const double* tangent, cons
     if spin:
         w[0] = (dot3(normal, omega) + (compliance[js] * lam[js] - rhs[js])
                 + coupling[2] * dn + coupling[3] * d0 + coupling[4] * d1)
-        y = relax_row(lam[js], w[0], step[js], -(mu * patch_radius * y), mu * patch_radius * y)
+        y = relax_row(lam[js], w[0], step[js], -(second * y), second * y)
         ds = y - lam[js]
         lam[js] = y
     if a >= 0:
@@ -214,7 +216,7 @@ cdef inline void turn_body(double* v, const double* swing, double d0, double d1,
         v[3 + k] += sign * (d0 * swing[k] + d1 * swing[6 + k])
 
 
-cdef inline void relax_rolling(const double* normal, const double* tangent, const double* swing, const double* compliance,
+cdef inline void relax_rolls(const double* normal, const double* tangent, const double* swing, const double* compliance,
                                const double* rhs, const double* step, double radius, int32_t a, int32_t b, double* lam,
                                double* v) noexcept nogil:
     """The two rows that roll, after `relax_contact`, on the v of now; all pointers are at the first of them."""
@@ -237,37 +239,35 @@ cdef inline void relax_rolling(const double* normal, const double* tangent, cons
 
 cdef inline void relax_contact_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
                                      double* v) noexcept nogil:
-    # The two common kinds with their sizes as constants: a compiler then leaves out the rows that are not
-    # there.
-    cdef int32_t c = i - r.n_joints, j = p.ptr[i], kind = p.kind[i], nt = n_directions(kind, p.ptr[i + 1] - j), k
+    # The common kinds with their sizes as constants: a compiler then leaves out the rows that are not there.
+    cdef int32_t c = i - r.n_joints, j = p.ptr[i], n = p.ptr[i + 1] - j, a = r.contact_body[2 * c]
+    cdef int32_t b = r.contact_body[2 * c + 1], nt, turns
+    cdef const double* normal = r.normal + 3 * c
+    cdef const double* tangent = r.tangent + 3 * c
+    cdef const double* coupling = r.coupling + 5 * c
     cdef const double* swing = r.swing + 6 * (j - p.ptr[r.n_joints])
-    if kind == CONTACT_ROLLING:
-        k = p.ptr[i + 1] - j - 2
-        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
-                      p.patch_radius[i],
-                      2, k > 3, False, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
-        relax_rolling(r.normal + 3 * c, r.tangent + 3 * c, swing + 6 * k, r.compliance + j + k, p.b + j + k,
-                      p.step + j + k, p.rolling[i] * lam[j], r.contact_body[2 * c], r.contact_body[2 * c + 1],
-                      lam + j + k, v)
-    elif kind == CONTACT_SPIN or nt == 1:
-        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i],
-                      p.patch_radius[i],
-                      nt, kind == CONTACT_SPIN, False, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass,
-                      lam + j, v)
-    elif kind == CONTACT_BOX:
-        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], p.patch_radius[i], 2, 0,
-                      True, r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
-    elif nt == 2:
-        relax_contact(r.normal + 3 * c, r.tangent + 3 * c, r.arm_a + 3 * c, r.arm_b + 3 * c,
-                      r.coupling + 5 * c, swing, r.compliance + j, p.b + j, p.step + j, p.mu[i], 0.0, 2, 0, False,
-                      r.contact_body[2 * c], r.contact_body[2 * c + 1], r.inv_mass, lam + j, v)
-    else:
-        relax_contact(r.normal + 3 * c, NULL, r.arm_a + 3 * c, r.arm_b + 3 * c, NULL, swing, r.compliance + j,
-                      p.b + j, p.step + j, 0.0, 0.0, 0, 0, False, r.contact_body[2 * c], r.contact_body[2 * c + 1],
-                      r.inv_mass, lam + j, v)
+    cdef parts_t q
+    if is_disk(p, i):
+        relax_contact(normal, tangent, r.arm_a + 3 * c, r.arm_b + 3 * c, coupling, swing, r.compliance + j, p.b + j,
+                      p.step + j, p.mu[i], 0.0, 2, 0, False, a, b, r.inv_mass, lam + j, v)
+        return
+    if n == 1:
+        relax_contact(normal, NULL, r.arm_a + 3 * c, r.arm_b + 3 * c, NULL, swing, r.compliance + j, p.b + j,
+                      p.step + j, 0.0, 0.0, 0, 0, False, a, b, r.inv_mass, lam + j, v)
+        return
+    parts_of(p, i, &q)
+    if is_box(p, i):
+        relax_contact(normal, tangent, r.arm_a + 3 * c, r.arm_b + 3 * c, coupling, swing, r.compliance + j, p.b + j,
+                      p.step + j, q.reach[0], q.reach[1], 2, 0, True, a, b, r.inv_mass, lam + j, v)
+        return
+    nt = n_directions(p, i)
+    turns = n_turns(p, i)
+    relax_contact(normal, tangent, r.arm_a + 3 * c, r.arm_b + 3 * c, coupling, swing, r.compliance + j, p.b + j,
+                  p.step + j, q.reach[0], q.reach[1 if nt else 0] if turns & 1 else 0.0, nt, turns & 1, False, a, b,
+                  r.inv_mass, lam + j, v)
+    if turns & 2:
+        relax_rolls(normal, tangent, swing + 6 * (n - 2), r.compliance + j + n - 2, p.b + j + n - 2, p.step + j + n - 2,
+                      q.reach[q.n - 1] * lam[j], a, b, lam + j + n - 2, v)
 
 
 cdef inline void relax_rows_block(const blocks_t* p, const rows_t* r, int32_t i, double* lam,
@@ -302,15 +302,13 @@ cdef inline void contact_slack(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 cdef inline void rows_times(const blocks_t* p, const rows_t* r, const double* v, double* out) noexcept nogil:
     # J v (m) of all rows; v (n, 6).
-    cdef int32_t i, j, c, n
+    cdef int32_t i, j, c
     for i in range(r.n_joints):
         for j in range(p.ptr[i], p.ptr[i + 1]):
             out[j] = joint_velocity(r.jac + 12 * j, v, r.joint_body[2 * i], r.joint_body[2 * i + 1])
     for c in range(r.n_contacts):
         i = r.n_joints + c
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        contact_slack(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), v, out + j)
+        contact_slack(r, c, n_directions(p, i), n_turns(p, i), v, out + p.ptr[i])
 
 
 cdef inline void contact_jacobian(const rows_t* r, int32_t c, int32_t nt, int32_t turns,
@@ -383,7 +381,7 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
 
     And swing (1 + nt + turns, 6): I_a^-1 (arm_a x axis), I_b^-1 (arm_b x axis) of each row, 0 where static.
 
-    With l = arm x axis (for spin l = n, for rolling l = t), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
+    With l = arm x axis (for spin l = n, for one that rolls l = t), A_pq = (sum 1/m) p.q + sum l_p . I^-1 l_q over both bodies.
     """
     cdef double axis[12]        # n, t1, t2
     cdef double l[9]
@@ -451,8 +449,8 @@ cdef inline void contact_diagonal(const double* normal, const double* tangent, c
 
 
 cdef inline double reciprocal(double x) noexcept nogil:
-    # 1/x kept finite where x is denormal.
-    return 1.0 / x if x * DBL_MAX > 1.0 else DBL_MAX
+    # 1 / d; 0 of a row that nothing moves
+    return 1.0 / x if x > 0.0 else 0.0
 
 
 cdef inline double largest_eigenvalue(double a, double b, double c) noexcept nogil:

@@ -1,7 +1,7 @@
 """Where a solve begins."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.parts cimport blocks_t
 
 
 cdef inline bint is_nothing(const blocks_t* p, const double* lam) noexcept nogil:

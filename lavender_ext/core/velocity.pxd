@@ -5,7 +5,7 @@
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
+from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.rows cimport cross, dot3, rows_t
 
 
@@ -92,8 +92,8 @@ cdef inline void rows_wrench(const blocks_t* p, const rows_t* r, const double* l
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_wrench(r, c, nt, turns, lam + j, f)
         elif nt == 2:

@@ -1,7 +1,7 @@
 """A problem as kernels read it: its blocks, and one of A, bodies, J and M."""
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 
 

@@ -6,7 +6,7 @@
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t, n_turns
+from lavender_ext.core.parts cimport blocks_t, n_turns
 from lavender_ext.core.rows cimport rows_t
 
 
@@ -17,7 +17,7 @@ cdef inline void block_weights(const blocks_t* p, const double* d, double* nu) n
         nu[j] = d[j]
     for i in range(p.n_blocks):
         end = p.ptr[i + 1]
-        for j in range(end - n_turns(p.kind[i], end - p.ptr[i]), end):
+        for j in range(end - n_turns(p, i), end):
             nu[j] = d[p.ptr[i]]
 
 

@@ -14,8 +14,8 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.block cimport ROW, blocks_t
 from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
+from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
@@ -158,7 +158,7 @@ cdef class Linear:
             return
         for i in range(k):
             n = self.b.ptr[i + 1] - self.b.ptr[i]
-            size += n if self.b.kind[i] == ROW else n * n
+            size += n if is_rows(&self.b, i) else n * n
         self.room = room_for((5 * <Py_ssize_t>m + 2 * size) * sizeof(double) + (m + k + 1) * sizeof(int32_t) + m)
         at = <double*>self.room.at
         self.w, self.e = at, at + m

@@ -18,10 +18,11 @@ y from its bound; of an open contact y_n below 0, under the cone law y_n + sum a
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdint cimport int8_t, int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, ROW, blocks_t, n_tangents
-from lavender_ext.core.contact_map cimport contact_map, length
+from lavender_ext.core.block cimport length
+from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, parts_of, parts_t
 
 
 cdef enum:                      # the case of a row
@@ -39,7 +40,7 @@ cdef struct natural_t:          # of all blocks
     double* f                   # (m) F
     double* margin              # (m) N s
     int8_t* case_               # (m)
-    const int32_t* at           # (k + 1) first value of each block in p and edge: its diagonal for ROW, else square
+    const int32_t* at           # (k + 1) first value of each block in p and edge: its diagonal for bounded rows, else square
     double* p                   # P
     double* edge                # dPi/de, e_g the reach of part g in its first column
 
@@ -67,8 +68,7 @@ cdef inline void natural_row(double lam, double w, double low, double high, doub
 
 cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam, const double* w,
                                  const natural_t* out) noexcept nogil:
-    cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, rolls = b.kind[i] == CONTACT_ROLLING
-    cdef int32_t nt = n_tangents(b.kind[i], n), spin = n - 1 - nt - 2 * rolls, k, g, first, size
+    cdef int32_t j = b.ptr[i], n = b.ptr[i + 1] - j, k, g, first, size
     cdef double* root = out.root + j
     cdef double* margin = out.margin + j
     cdef double* p = out.p + out.at[i]
@@ -76,17 +76,19 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     cdef double y[6]
     cdef double to[6]
     cdef double ray[6]
-    cdef double a[3]
+    cdef parts_t q
     cdef double t, s, gone, norm = 1.0, over
+    parts_of(b, i, &q)
+    root[0] = sqrt(b.d[j])
+    for g in range(q.n):
+        for k in range(q.first[g], q.first[g] + q.size[g]):
+            root[k] = sqrt(b.d[j + q.first[g]])
+        q.reach[g] = q.reach[g] * root[q.first[g]] / root[0]
     for k in range(n):
-        root[k] = sqrt(b.d[j + (1 if 0 < k <= nt else k)])
         y[k] = root[k] * lam[j + k] - w[j + k] / root[k]
         ray[k] = 0.0
         margin[k] = INFINITY
-    a[0] = b.mu[i] * root[1] / root[0] if nt else 0.0
-    a[1] = b.mu[i] * b.patch_radius[i] * root[1 + nt] / root[0] if spin else 0.0
-    a[2] = b.rolling[i] * root[n - 2] / root[0] if rolls else 0.0
-    contact_map(b.law, nt, spin, rolls, a, y, to, p)
+    contact_map(b.law, &q, y, to, p)
     for k in range(n):
         out.f[j + k] = w[j + k] / root[k] if to[k] == y[k] else root[k] * lam[j + k] - to[k]
         out.case_[j + k] = OPEN
@@ -97,38 +99,32 @@ cdef inline void natural_contact(const blocks_t* b, int32_t i, const double* lam
     ray[0] = 1.0
     if s > 0.0:
         out.case_[j] = CLOSED
-    for g in range(3):
-        first = 1 if g == 0 else 1 + nt if g == 1 else n - 2
-        size = nt if g == 0 else spin if g == 1 else 2 * rolls
-        if size == 0:
-            continue
+    for g in range(q.n):
+        first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        gone -= a[g] * t
+        gone -= q.reach[g] * t
         if not s > 0.0:
             continue
-        over = t - a[g] * s
+        over = t - q.reach[g] * s
         for k in range(first, first + size):
-            out.case_[j + k] = STICKS if over <= 0.0 and a[g] > 0.0 else SLIDES
+            out.case_[j + k] = STICKS if over <= 0.0 and q.reach[g] > 0.0 else SLIDES
             if over > 0.0:
-                ray[k] = a[g] * y[k] / t
+                ray[k] = q.reach[g] * y[k] / t
                 edge[k * n + first] = s * y[k] / t
-        if a[g] > 0.0:
+        if q.reach[g] > 0.0:
             margin[first] = fabs(over) / root[first]
         if over > 0.0:
-            norm += a[g] * a[g]
+            norm += q.reach[g] * q.reach[g]
     if s > 0.0:
         margin[0] = s / root[0]
     else:
         margin[0] = (gone if b.law == CONE else -y[0]) / root[0]
-    for g in range(3):
-        first = 1 if g == 0 else 1 + nt if g == 1 else n - 2
-        size = nt if g == 0 else spin if g == 1 else 2 * rolls
-        if size == 0 or not s > 0.0:
-            continue
+    for g in range(q.n if s > 0.0 else 0):
+        first, size = q.first[g], q.size[g]
         t = length(y + first, size)
-        if b.law == CONE and t > a[g] * s:
+        if b.law == CONE and t > q.reach[g] * s:
             for k in range(n):
-                edge[k * n + first] += ray[k] * (t - 2.0 * a[g] * s) / norm
+                edge[k * n + first] += ray[k] * (t - 2.0 * q.reach[g] * s) / norm
         for k in range(n):                              # of a_g = e_g root_g / root_n
             edge[k * n + first] *= root[first] / root[0]
 
@@ -141,8 +137,8 @@ cdef inline void natural_all(const blocks_t* b, const double* lam, const double*
     for i in range(b.n_blocks):
         j = b.ptr[i]
         n = b.ptr[i + 1] - j
-        at[i + 1] = at[i] + (n if b.kind[i] == ROW else n * n)
-        if b.kind[i] != ROW:
+        at[i + 1] = at[i] + (n if is_rows(b, i) else n * n)
+        if not is_rows(b, i):
             natural_contact(b, i, lam, w, out)
             continue
         for k in range(n):
@@ -175,7 +171,7 @@ cdef inline void block_times(const natural_t* x, const blocks_t* b, const double
         n = b.ptr[i + 1] - j
         a = values + x.at[i]
         for k in range(n):
-            if b.kind[i] == ROW:
+            if is_rows(b, i):
                 out[j + k] = a[k] * v[j + k]
                 continue
             s = 0.0
@@ -245,7 +241,7 @@ cdef inline void system_rows(const natural_t* x, const blocks_t* b, int32_t coun
             if place[j + k] < 0:
                 continue
             row = g + <ssize_t>place[j + k] * count
-            if b.kind[i] == ROW:
+            if is_rows(b, i):
                 from_ = h + <ssize_t>place[j + k] * count
                 for c in range(count):
                     row[c] = from_[c]

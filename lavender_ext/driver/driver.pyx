@@ -42,7 +42,7 @@ cdef inline double* begin(const view_t* v, const options_t* o, room_t* r) noexce
     aim(n, &v.p, v.a, v.r, v.g)
     n.tol, n.budget = o.tol, o.budget
     lay_judge(n, r.real + sizeof(state_t) // sizeof(double) + 1)
-    judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, False, begun)
+    judge_nothing(v, n.lam, n.problem.w, n.problem.error, n.problem.x, begun)
     n.problem.e0, n.problem.v0 = begun[0], begun[1]
     return r.real + begun_room(v)
 

@@ -47,7 +47,7 @@ cpdef enum:
     H_SOLVED = 17           # 1: the arrays hold the last substep's problem and its impulses
     H_STEPPER = 18          # what happens between collision and integration, see below
     H_RELAXING = 19         # sweeps without bias after the others, of SOFT_STEP
-    H_FRICTION_SHAPE = 20   # 1: each tangent is bounded by itself, CONTACT_BOX
+    H_FRICTION_SHAPE = 20   # 1: each tangent is bounded by itself, as a box
     N_HEAD = 24
 
 # H_ORDER: how the blocks of a sweep are ordered, joints and contacts each among themselves

@@ -160,7 +160,7 @@ cdef inline void solve_6(double* m, double* g) noexcept nogil:
         s = m[7 * j]
         for k in range(j):
             s -= m[6 * j + k] * m[6 * j + k]
-        m[7 * j] = sqrt(s) if s > 0.0 else 1e300        # what rounding took away moves nothing
+        m[7 * j] = sqrt(s) if s > 0.0 else 1.0 / 0.0        # what rounding took away moves nothing
         for i in range(j + 1, 6):
             s = m[6 * i + j]
             for k in range(j):

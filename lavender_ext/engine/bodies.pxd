@@ -11,9 +11,10 @@ A body whose inertia has a direction drifts by the midpoint rule at constant L [
 so the gyroscopic term costs nothing in angular momentum (kept to rounding) and O(h^2) in energy. Even
 inertia (spheres, cubes) needs (1) alone.
 """
-from libc.math cimport fabs, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.door cimport first_outside
 from lavender_ext.engine.arrays cimport N_BODY, N_DYNAMIC, N_FRAME, S_GRAVITY, S_H, engine_t
 from lavender_ext.engine.vectors cimport copy3, plus3, times3
 
@@ -46,7 +47,6 @@ cdef inline void to_body(const double* r, const double* a, double* out) noexcept
 
 cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
     # (1)
-    cdef int32_t k
     cdef double w = q[0], x = q[1], y = q[2], z = q[3], s, f = 0.5 * h
     cdef double a = f * omega[0], b = f * omega[1], c = f * omega[2]
     q[0] = w - (a * x + b * y + c * z)
@@ -54,13 +54,6 @@ cdef inline void turn(double* q, const double* omega, double h) noexcept nogil:
     q[2] = y + (b * w + c * x - a * z)
     q[3] = z + (c * w + a * y - b * x)
     s = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-    if s > 1.7976931348623157e308:                      # a turn of 1e154 in one step: its squares overflow
-        s = 0.0
-        for k in range(4):
-            s = fabs(q[k]) if fabs(q[k]) > s else s
-        for k in range(4):
-            q[k] /= s                                   # infinity over infinity is told as lost
-        s = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     s = 1.0 / sqrt(s)
     q[0] *= s
     q[1] *= s
@@ -112,16 +105,9 @@ cdef inline void drift_rotation(double* q, double* omega, const double* inertia,
 
 
 cdef inline int32_t is_lost(const engine_t* e, int32_t body) noexcept nogil:
-    # Is its state not finite?
-    cdef double total = 0.0
-    cdef int32_t k
-    for k in range(6):
-        total += e.v[6 * body + k] - e.v[6 * body + k]
-    for k in range(3):
-        total += e.x[3 * body + k] - e.x[3 * body + k]
-    for k in range(4):
-        total += e.q[4 * body + k] - e.q[4 * body + k]
-    return total != 0.0
+    # Has its state left what core/door.pxd (1) allows?
+    return (first_outside(e.v + 6 * body, 6) >= 0 or first_outside(e.x + 3 * body, 3) >= 0
+            or first_outside(e.q + 4 * body, 4) >= 0)
 
 
 cdef inline void start_bodies(engine_t* e) noexcept nogil:

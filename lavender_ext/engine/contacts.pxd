@@ -28,7 +28,7 @@ no key has claimed. A stale or false entry is left alone, or corrected by the sw
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN
+from lavender_ext.core.parts cimport contact_kind
 from lavender_ext.core.rows cimport (contact_diagonal, contact_slack, cross, dot3, largest_eigenvalue,
                                      reciprocal, relative_velocity, rows_t)
 from lavender_ext.engine.arrays cimport (ALTERNATING, AVBD, BOX, CAP_CONTACT, H_CACHED, H_CONTACTS, H_CONTACT_ROWS,
@@ -267,7 +267,7 @@ cdef inline int32_t make_contacts(engine_t* e, const rows_t* r) noexcept nogil:
             make_contact(e, r, c, row, a, b, &m, m.n - 1 - j if last_first else j, tangent, nt, turns)
             block = e.size[N_JOINT] + c
             box = nt > 0 and e.head[H_FRICTION_SHAPE]
-            e.kind[block] = CONTACT_BOX if box else CONTACT_ROLLING if turns & 2 else CONTACT_SPIN if turns else CONTACT
+            e.kind[block] = contact_kind(box, turns & 1, turns & 2, nt)
             e.mu[block] = mu
             e.patch_radius[block] = 1.0 if box else patch if turns & 1 else 0.0
             if e.size[ROWS_PER_CONTACT] > 4:

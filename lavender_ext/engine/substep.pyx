@@ -17,9 +17,10 @@ import numpy as np
 
 from lavender_ext.engine.arrays import views
 
-from lavender_ext.core.block cimport blocks_t, row_error
+from lavender_ext.core.block cimport row_error
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport relax_contact_block, relax_joint, rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.engine.arrays cimport (AT_RANDOM, AVBD, BOTTOM_UP, CAP_CONTACT, CAP_PAIR, COLORED, H_CONTACTS,

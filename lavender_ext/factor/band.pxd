@@ -23,7 +23,7 @@ cdef struct pivots_t:
 cdef inline void no_pivots(pivots_t* out) noexcept nogil:
     out.small = 0
     out.negative = 0
-    out.least = 1.7976931348623157e308
+    out.least = 1.0 / 0.0
     out.first_small = -1
 
 

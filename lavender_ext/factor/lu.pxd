@@ -37,7 +37,7 @@ cdef inline int32_t small_lu(double* a, int32_t* pivot, const int32_t s) noexcep
                 x = a[j * s + k]
                 a[j * s + k] = a[best * s + k]
                 a[best * s + k] = x
-        if not top > 1e-300:
+        if not top > 0.0:
             lost += 1
             a[j * s + j] = 0.0
             x = 0.0

@@ -11,8 +11,8 @@ from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONTACT, ROUND, ROW
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.parts cimport ROW, contact_kind
 
 
 cpdef enum:
@@ -82,7 +82,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                       | (<uint64_t>((geom[2 * of + 1] + 1) & 0xFFFFF) << 20) | (<uint64_t>(nth & 0xFFFF) << 4))
             lower[i] = 0.0
             if code == 5:
-                kind[k] = CONTACT
+                kind[k] = contact_kind(False, False, False, 0)
             elif not 1 < dim[of] <= JOINED:
                 return -1 - i
             elif code == 6:
@@ -100,7 +100,7 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
                 size = dim[of]
                 if i + size > m:
                     return -1 - i
-                kind[k] = ROUND if size > 3 else CONTACT
+                kind[k] = contact_kind(False, False, False, size - 1)
                 mu[k] = friction[5 * of]
                 for j in range(1, size):
                     lower[i + j] = -inf

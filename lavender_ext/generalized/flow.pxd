@@ -13,9 +13,10 @@ theta is equal on all tangents of a disk, which makes (1) a closed form.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, block_error, blocks_t, n_tangents, row_error
+from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
+from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
 
@@ -57,7 +58,7 @@ cdef struct flow_t:
     const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
     const int32_t* lidx         # columns in their island, ascending
     const int32_t* pblock       # (n_panels + 1) first block of each panel
-    const int32_t* vptr         # (k + 1) V of each block: its diagonal for ROW, else square
+    const int32_t* vptr         # (k + 1) V of each block: its diagonal for bounded rows, else square
     int32_t island              # the present one
     int32_t still               # its y is 0
     double* theta               # (m) theta', > 0
@@ -122,21 +123,20 @@ cdef inline int32_t block_end(const flow_t* f, int32_t a) noexcept nogil:
 
 cdef inline void respond_contact(const flow_t* f, int32_t i, double* lam, double* v) noexcept nogil:
     """(1) of contact i: z in lam becomes lambda, with V."""
-    cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l, rolls = f.p.kind[i] == CONTACT_ROLLING
-    cdef int32_t nt = n_tangents(f.p.kind[i], n), spin = n - 1 - nt - 2 * rolls
+    cdef int32_t j = f.p.ptr[i], n = f.p.ptr[i + 1] - j, k, l
     cdef const double* root = f.root + j
     cdef const double* soft = f.soft + j
-    cdef double a[3]
+    cdef parts_t q
     cdef double y[6]
     cdef double out[6]
     cdef double back[6]                                 # theta^-1/2
     for k in range(n):
         back[k] = root[k] * soft[k]
         y[k] = root[k] * lam[k]
-    a[0] = f.p.mu[i] * root[1] * back[0] if nt else 0.0
-    a[1] = f.p.mu[i] * f.p.patch_radius[i] * root[1 + nt] * back[0] if spin else 0.0
-    a[2] = f.p.rolling[i] * root[n - 2] * back[0] if rolls else 0.0
-    contact_map(f.p.law, nt, spin, rolls, a, y, out, v)
+    parts_of(&f.p, i, &q)
+    for k in range(q.n):
+        q.reach[k] = q.reach[k] * root[q.first[k]] * back[0]
+    contact_map(f.p.law, &q, y, out, v)
     for k in range(n):
         lam[k] = lam[k] if out[k] == y[k] else out[k] * back[k]
         for l in range(n):
@@ -149,7 +149,6 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
     cdef int32_t i, j, end, k, at
     # Hoisted: what is stored to might be any of them, for all a compiler knows.
     cdef const int32_t* ptr = f.p.ptr
-    cdef const int32_t* kind = f.p.kind
     cdef const int32_t* vptr = f.vptr
     cdef const double* lower = f.p.lower
     cdef const double* upper = f.p.upper
@@ -161,7 +160,7 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
         j = ptr[i]
         end = ptr[i + 1]
         at = vptr[i]
-        if kind[i] == ROW:
+        if is_rows(&f.p, i):
             at -= j
             for k in range(j, end):
                 z = (rho[k] * center[k] - s[k]) * soft[k]
@@ -235,7 +234,6 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam, 0 unless it `moves`; NaN: not finite."""
     cdef int32_t a, i, k, end, last
     cdef const int32_t* ptr = f.p.ptr
-    cdef const int32_t* kind = f.p.kind
     cdef const double* lower = f.p.lower
     cdef const double* upper = f.p.upper
     cdef const double* d = f.p.d
@@ -253,7 +251,7 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
-            if kind[i] == ROW:
+            if is_rows(&f.p, i):
                 end = ptr[i + 1]
                 for k in range(ptr[i], end):
                     tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)

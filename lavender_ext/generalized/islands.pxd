@@ -5,8 +5,8 @@ Panels that share a column, directly or through others, are an island: its veloc
 from libc.math cimport ceil, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
 
@@ -77,7 +77,7 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
     for i in range(p.n_blocks):
         vptr[i] = at
         size = ptr[i + 1] - ptr[i]
-        at += size if p.kind[i] == ROW else size * size
+        at += size if is_rows(p, i) else size * size
     vptr[p.n_blocks] = at
     for i in range(g.n):
         local[i] = -1

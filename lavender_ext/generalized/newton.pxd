@@ -14,7 +14,7 @@ limit is the problem given. It begins the larger the further steps lead astray: 
 under the cone law, 3e-2 d under Coulomb's.
 
 Coulomb's law has no such function. Newton's method goes on from the convex relaxation's answer with the derivative
-that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = mu |w_t| + mu r |w_s| + mu_r |w_r| (3)
+that lacks symmetry, as long as |G| falls; where it does not, normals are lowered by phi = sum of a_g |w_g| over parts (3)
 and the convex problem is solved again (De Saxce, Feng 1998; Cadoux 2009).
 
 The test of the end is the judge's, on lambda itself: w = Y (Y^T lambda) - b + theta lambda, error e of every block.
@@ -24,9 +24,9 @@ leaps there, along the law that it has settled on, and so does V.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, COULOMB, ROW, blocks_t, n_apart, n_tangents
-from lavender_ext.core.contact_map cimport length
+from lavender_ext.core.block cimport length
 from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
@@ -175,9 +175,9 @@ cdef inline void one_theta(double* theta, int32_t first, int32_t end) noexcept n
         theta[k] = big
 
 
-cdef inline double enough(int32_t kind) noexcept nogil:
+cdef inline double enough(const blocks_t* p, int32_t i) noexcept nogil:
     """Compliance over d with which a block needs no proximal term."""
-    return 1e-6 if kind == ROW else 1e-3
+    return 1e-6 if is_rows(p, i) else 1e-3
 
 
 cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nogil:
@@ -185,7 +185,7 @@ cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nog
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not g.compliance[k] >= enough(p.kind[i]) * p.d[k]:
+            if not g.compliance[k] >= enough(p, i) * p.d[k]:
                 return False
     return True
 
@@ -193,9 +193,10 @@ cdef inline bint is_soft(const blocks_t* p, const generalized_t* g) noexcept nog
 cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept nogil:
     """theta' of (2): rho is `share` d on rows with less than `enough` of their own.
 
-    A disk's tangents get the largest.
+    Rows of one part get the largest.
     """
-    cdef int32_t a, i, j, k, nt, end, last
+    cdef int32_t a, i, j, k, g, end, last
+    cdef parts_t q
     cdef const double* compliance = f.g.compliance
     cdef const double* d = f.p.d
     cdef double* theta = f.theta
@@ -207,7 +208,7 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
         for i in range(block_from(f, a), last):
             j = f.p.ptr[i]
             end = f.p.ptr[i + 1]
-            low = enough(f.p.kind[i])
+            low = enough(&f.p, i)
             if share < low:
                 low = share
             for k in range(j, end):
@@ -215,11 +216,10 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
                 if not x >= low * d[k]:
                     x += share * d[k]
                 theta[k] = x
-            nt = 0 if f.p.kind[i] == ROW else n_tangents(f.p.kind[i], end - j)
-            if nt > 1:
-                one_theta(theta, j + 1, j + 1 + nt)
-            if f.p.kind[i] == CONTACT_ROLLING:
-                one_theta(theta, end - 2, end)
+            parts_of(&f.p, i, &q)
+            for g in range(q.n):
+                if q.size[g] > 1:
+                    one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
@@ -359,12 +359,12 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
 
 cdef inline double slip(const flow_t* f, int32_t i) noexcept nogil:
     """phi of (3) from w of block i, whose normal it leaves out."""
-    cdef int32_t j = f.p.ptr[i], end = f.p.ptr[i + 1], nt = n_tangents(f.p.kind[i], end - j)
-    cdef double out = f.p.mu[i] * length(f.w + j + 1, nt)
-    if n_apart(f.p.kind[i], end - j) & 1:
-        out += f.p.mu[i] * f.p.patch_radius[i] * fabs(f.w[j + 1 + nt])
-    if f.p.kind[i] == CONTACT_ROLLING:
-        out += f.p.rolling[i] * length(f.w + end - 2, 2)
+    cdef int32_t g
+    cdef double out = 0.0
+    cdef parts_t q
+    parts_of(&f.p, i, &q)
+    for g in range(q.n):
+        out += q.reach[g] * length(f.w + f.p.ptr[i] + q.first[g], q.size[g])
     return out
 
 
@@ -375,7 +375,7 @@ cdef inline void lower_normals(const flow_t* f, int32_t island, const double* la
     measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for i in range(block_from(f, a), block_end(f, a)):
-            if f.p.kind[i] != ROW and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
+            if not is_rows(&f.p, i) and f.p.ptr[i + 1] - f.p.ptr[i] > 1:
                 f.phi[f.p.ptr[i]] = slip(f, i)
 
 

@@ -2,8 +2,8 @@
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.block cimport ROW
 from lavender_ext.core.generalized cimport ldl_solve
+from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.generalized.flow cimport block_end, block_from, flow_t, spread
 from lavender_ext.generalized.sparse cimport sparse_factor
@@ -50,7 +50,7 @@ cdef inline int32_t turn_block(const flow_t* f, int32_t i, int32_t row, int32_t 
     cdef const double* v = f.v + f.vptr[i]
     cdef double* out
     cdef bint any_
-    if f.p.kind[i] == ROW:
+    if is_rows(&f.p, i):
         for r in range(size):
             if v[r] != 0.0:
                 scale_row(f.turned + n * nc, y + <ssize_t>(row + r) * nc, v[r], nc)

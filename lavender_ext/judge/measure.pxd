@@ -10,15 +10,16 @@ J v.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport ROW, block_error, blocks_t, n_directions, n_turns
-from lavender_ext.core.csr cimport csr_abs_dot, csr_dot, csr_dot_size, csr_t
+from lavender_ext.core.block cimport block_error
+from lavender_ext.core.csr cimport csr_dot, csr_dot_size, csr_t
 from lavender_ext.core.generalized cimport (generalized_t, jac_push, jac_row, panel_push_size, panel_size,
                                             tree_solve)
+from lavender_ext.core.parts cimport blocks_t, is_rows, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_slack, cross, joint_velocity, rows_t, rows_times
 from lavender_ext.core.velocity cimport add6, rows_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_ends, floor_t, hides, no_floor,
+from lavender_ext.judge.score cimport (add_block_floor, add_floor, are_numbers, floor_from, floor_t, hides, no_floor,
                                        norms_of_rhs, nothing, relative, score_from, score_rows, score_t, tally_block,
                                        tally_t)
 
@@ -32,25 +33,21 @@ cdef inline void csr_slack(const blocks_t* p, const csr_t* a, const double* lam,
         w[i] = csr_dot(a, i, lam) - p.b[i]
 
 
-cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e,
-                           const bint scaled, tally_t* s, floor_t* f) noexcept nogil:
-    """w, e and floor of every block, or, scaled, the floor alone from these."""
+cdef inline void csr_floor(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, tally_t* s,
+                           floor_t* f) noexcept nogil:
+    """w, e and floor of every block."""
     cdef int32_t i, j, k
     cdef double size[6]
     for i in range(p.n_blocks):
         j = p.ptr[i]
         for k in range(j, p.ptr[i + 1]):
-            if scaled:
-                size[0 if p.kind[i] == ROW else k - j] = csr_abs_dot(a, k, lam)
-            else:
-                w[k] = csr_dot_size(a, k, lam, size + (0 if p.kind[i] == ROW else k - j)) - p.b[k]
-            if p.kind[i] == ROW:                        # of any number
-                add_floor(p, k, size[0], scaled, f)
-        if not scaled:
-            block_error(p, i, lam, w, e)
-            tally_block(p, i, e, s)
-        if p.kind[i] != ROW:
-            add_block_floor(p, i, lam, w, e, size, scaled, f)
+            w[k] = csr_dot_size(a, k, lam, size + (0 if is_rows(p, i) else k - j)) - p.b[k]
+            if is_rows(p, i):                           # of any number
+                add_floor(p, k, size[0], f)
+        block_error(p, i, lam, w, e)
+        tally_block(p, i, e, s)
+        if not is_rows(p, i):
+            add_block_floor(p, i, lam, w, e, size, f)
 
 
 cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam, double* w, double* e, bint floor,
@@ -61,11 +58,9 @@ cdef inline void csr_judge(const blocks_t* p, const csr_t* a, const double* lam,
         csr_slack(p, a, lam, w)
         score_rows(p, lam, w, e, out)
         return
-    csr_floor(p, a, lam, w, e, 0, &s, &f)
+    csr_floor(p, a, lam, w, e, &s, &f)
     score_from(p, e, &s, out)
-    if not floor_ends(&f, 0, out):
-        csr_floor(p, a, lam, w, e, 1, &s, &f)
-        floor_ends(&f, 1, out)
+    floor_from(&f, out)
 
 
 # -- the factored form -------------------------------------------------------------------------------
@@ -161,8 +156,8 @@ cdef inline void velocity_size(const blocks_t* p, const rows_t* r, const double*
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
-        nt = n_directions(p.kind[i], p.ptr[i + 1] - j)
-        turns = n_turns(p.kind[i], p.ptr[i + 1] - j)
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_wrench_size(r, c, nt, turns, lam + j, size)
         elif nt == 2:
@@ -241,7 +236,7 @@ cdef inline void contact_sizes(const rows_t* r, int32_t c, int32_t nt, int32_t t
 
 
 cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* lam, const double* w, const double* e,
-                            const double* sizes, const bint scaled, floor_t* f) noexcept nogil:
+                            const double* sizes, floor_t* f) noexcept nogil:
     # (|J| |M^-1| |J|^T |lam| + c |lam|) of every row; sizes of `velocity_size`
     cdef int32_t i, j, k, c, n, nt, turns, a, b
     cdef double size[6]
@@ -249,13 +244,13 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
         a = r.joint_body[2 * i]
         b = r.joint_body[2 * i + 1]
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), scaled, f)
+            add_floor(p, j, r.compliance[j] * fabs(lam[j]) + joint_size(r.jac + 12 * j, sizes, a, b), f)
     for c in range(r.n_contacts):
         i = r.n_joints + c
         j = p.ptr[i]
         n = p.ptr[i + 1] - j
-        nt = n_directions(p.kind[i], n)
-        turns = n_turns(p.kind[i], n)
+        nt = n_directions(p, i)
+        turns = n_turns(p, i)
         if turns or nt == 1:                            # the two common kinds with their sizes as constants
             contact_sizes(r, c, nt, turns, sizes, size)
         elif nt == 2:
@@ -264,7 +259,7 @@ cdef inline void rows_floor(const blocks_t* p, const rows_t* r, const double* la
             contact_sizes(r, c, 0, 0, sizes, size)
         for k in range(n):
             size[k] = r.compliance[j + k] * fabs(lam[j + k]) + size[k]
-        add_block_floor(p, i, lam, w, e, size, scaled, f)
+        add_block_floor(p, i, lam, w, e, size, f)
 
 
 cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* lam, double* w, double* e, double* v,
@@ -277,10 +272,8 @@ cdef inline void rows_judge(const blocks_t* p, const rows_t* r, const double* la
     if not floor:
         return
     velocity_size(p, r, lam, sizes)
-    rows_floor(p, r, lam, w, e, sizes, 0, &f)
-    if not floor_ends(&f, 0, out):
-        rows_floor(p, r, lam, w, e, sizes, 1, &f)
-        floor_ends(&f, 1, out)
+    rows_floor(p, r, lam, w, e, sizes, &f)
+    floor_from(&f, out)
 
 
 # -- generalised coordinates ---------------------------------------------------------------------------
@@ -311,11 +304,8 @@ cdef inline void general_floor(const blocks_t* p, const generalized_t* g, const 
     for i in range(p.n_rows):
         size[i] += g.compliance[i] * fabs(lam[i])
     for i in range(p.n_blocks):
-        add_block_floor(p, i, lam, w, e, size + p.ptr[i], 0, &f)
-    if not floor_ends(&f, 0, out):
-        for i in range(p.n_blocks):
-            add_block_floor(p, i, lam, w, e, size + p.ptr[i], 1, &f)
-        floor_ends(&f, 1, out)
+        add_block_floor(p, i, lam, w, e, size + p.ptr[i], &f)
+    floor_from(&f, out)
 
 
 cdef inline void general_judge(const blocks_t* p, const generalized_t* g, const double* lam, double* w, double* e,
@@ -364,24 +354,22 @@ cdef inline bint do_nothing(const blocks_t* p, double* x, double* w) noexcept no
     return moves
 
 
-cdef inline void reference_of(const blocks_t* p, const score_t* s, bint moves, bint vanished, double* out) noexcept nogil:
+cdef inline void reference_of(const blocks_t* p, const score_t* s, double* out) noexcept nogil:
     """E0 [sqrt J], V0 [m/s] and the relative residual (3) of doing nothing, from its score."""
-    cdef double rhs_energy, rhs_velocity, energy = s.energy, velocity = s.velocity
+    cdef double rhs_energy, rhs_velocity
     norms_of_rhs(p, &rhs_energy, &rhs_velocity)
     # The norms of b: sqrt(sum b^2 / d), max |b| sqrt(nu / d), |b| the pair's norm on tangents.
-    # 2^-48 of them. Doing nothing costs no more energy than b; more is what `quotient` (block.pxd) makes of a vanishing w / d.
-    if energy <= 3.5527136788005009e-15 * rhs_energy or (energy > 2.0 * rhs_energy and not moves):
-        energy, velocity = rhs_energy, rhs_velocity
-    # A size that overflows measures nothing: 0 makes every error beside it infinite.
-    if vanished:
-        energy = velocity = 0.0
-    out[0] = energy if energy < 1.0 / 0.0 else 0.0
-    out[1] = velocity if velocity < 1.0 / 0.0 else 0.0
+    # 2^-48 of them is rounding. Of what is no number, 0 makes every error infinite.
+    if not s.finite:
+        out[0] = out[1] = 0.0
+    elif s.energy <= 3.5527136788005009e-15 * rhs_energy:
+        out[0], out[1] = rhs_energy, rhs_velocity
+    else:
+        out[0], out[1] = s.energy, s.velocity
     out[2] = relative(s.energy, s.velocity, out[0], out[1]) if s.finite else 1.0 / 0.0
 
 
-cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e, double* scratch, bint vanished,
-                               double* out) noexcept nogil:
+cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e, double* scratch, double* out) noexcept nogil:
     """Doing nothing into x (m), and of it (3) of `reference_of`; w, e (m) and scratch as `judge_view`, without floor."""
     cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
     cdef bint moves = do_nothing(&v.p, x, w)
@@ -390,7 +378,7 @@ cdef inline void judge_nothing(const view_t* v, double* x, double* w, double* e,
     else:
         judge_view(v, x, w, e, scratch, False, &s)
         s.finite = s.finite and are_numbers(w, v.p.n_rows)
-    reference_of(&v.p, &s, moves, vanished, out)
+    reference_of(&v.p, &s, out)
 
 
 cdef inline double relative_of(const score_t* s, const double* w, int32_t m, double start_energy,

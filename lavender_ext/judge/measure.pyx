@@ -151,11 +151,8 @@ def score(Data p, const double[::1] lam, const double[::1] w, double[::1] e):
     return s.energy, s.velocity, s.worst, bool(s.finite)
 
 
-def begin(Data p, bint vanished):
-    """Judge doing nothing and keep E0, V0 and its own relative residual with the data: Pi(0) (m,), read-only.
-
-    Both are 0 where `vanished`: d of a row is a stand-in for products that are not zero, and nothing can be measured.
-    """
+def begin(Data p):
+    """Judge doing nothing and keep E0, V0 and its own relative residual with the data: Pi(0) (m,), read-only."""
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef view_t v = p.view()
     cdef double[::1] x
@@ -164,7 +161,7 @@ def begin(Data p, bint vanished):
     cdef double* w = <double*>room.at
     start = np.zeros(m)
     x = start
-    judge_nothing(&v, &x[0] if m else NULL, w, w + m, w + 2 * m, vanished, out)
+    judge_nothing(&v, &x[0] if m else NULL, w, w + m, w + 2 * m, out)
     start.setflags(write=False)
     p.set_start(out[0], out[1])
     p.start_relative = out[2]

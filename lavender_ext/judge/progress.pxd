@@ -13,7 +13,8 @@ to its bound, and falls behind that. In a cycle no row keeps its way, and infeas
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, norm2
+from lavender_ext.core.block cimport norm2
+from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 
 
 cdef enum:
@@ -116,13 +117,14 @@ cdef inline bint meets_disk(const progress_t* s, const double* lam, int32_t now,
 cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const double* lam, int32_t now,
                              double most) noexcept nogil:
     """(2): whether a row does within `most` sweeps."""
-    cdef int32_t i, j, k, nt, end
-    cdef double v, rate, along
+    cdef int32_t i, j, k, g
+    cdef double v, rate
+    cdef parts_t q
     if not now > s.last_at > s.before_at >= 0:
         return False
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        if p.kind[i] == ROW:
+        if is_rows(p, i):
             for k in range(j, p.ptr[i + 1]):
                 v = speed(s, lam, now, k)
                 if meets(lam[k] - p.lower[k], -v, most) or meets(p.upper[k] - lam[k], v, most):
@@ -133,17 +135,10 @@ cdef inline bint meets_bound(const progress_t* s, const blocks_t* p, const doubl
         rate = speed(s, lam, now, j)
         if meets(lam[j], -rate, most):
             return True
-        end = p.ptr[i + 1]
-        nt = n_tangents(p.kind[i], end - j)
-        if meets_disk(s, lam, now, j + 1, j + 1 + nt, p.mu[i], lam[j], rate, most):
-            return True
-        if p.kind[i] == CONTACT_ROLLING and meets_disk(s, lam, now, end - 2, end, p.rolling[i], lam[j], rate, most):
-            return True
-        if n_apart(p.kind[i], end - j) & 1:
-            k = j + 1 + nt
-            v = speed(s, lam, now, k)
-            along = p.mu[i] * p.patch_radius[i]
-            if meets(along * lam[j] - fabs(lam[k]), (v if lam[k] >= 0.0 else -v) - along * rate, most):
+        parts_of(p, i, &q)
+        for g in range(q.n):
+            k = j + q.first[g]
+            if meets_disk(s, lam, now, k, k + q.size[g], q.reach[g], lam[j], rate, most):
                 return True
     return False
 

@@ -10,8 +10,8 @@ squared entry by entry, and u = 2^-24 (the formulas of lavender/judge/residuals.
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.generalized cimport generalized_t, jac_push, jac_row, tree_solve, whitened_push
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.judge.score cimport relative
 
 

@@ -10,8 +10,8 @@ from here.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (ROUND, ROW, block_error, blocks_t, is_pair, n_apart, n_tangents, norm2,
-                                      quotient, roll_at)
+from lavender_ext.core.block cimport block_error
+from lavender_ext.core.parts cimport blocks_t, disk_of, groups_of, is_disk, is_rows, parts_t
 
 
 cdef struct score_t:
@@ -23,22 +23,15 @@ cdef struct score_t:
     int32_t finite              # 0 where e holds a NaN or an infinity
 
 
-cdef struct tally_t:            # plain sums and squares: kept where they can neither have over- nor underflown
-    double energy               # sum (d e) e, for e^2 alone may vanish beside a d of 1e160
+cdef struct tally_t:
+    double energy               # sum (d e) e
     double fast                 # max (d e) (nu e)
     int32_t worst
-
-
-cdef struct sum_t:              # sum of squares as scale^2 * ssq: neither over- nor underflows
-    double scale
-    double ssq
 
 
 cdef struct floor_t:            # of F, what rounding leaves of a slack
     double energy               # sum (F / d) F
     double fast                 # max nu (F / d) F
-    sum_t total                 # sum F^2 / d, scaled: neither over- nor underflows
-    double big                  # max F sqrt(nu / d)
 
 
 cdef inline double unit_roundoff() noexcept nogil:
@@ -68,22 +61,6 @@ cdef inline double relative(double energy, double velocity, double start_energy,
     return x if x > y else y
 
 
-cdef inline void add_square(sum_t* s, double x) noexcept nogil:
-    cdef double r
-    x = fabs(x)
-    if x > s.scale:
-        r = s.scale / x
-        s.ssq = 1.0 + s.ssq * r * r
-        s.scale = x
-    elif x > 0.0:
-        r = x / s.scale
-        s.ssq += r * r
-
-
-cdef inline double root(const sum_t* s) noexcept nogil:
-    return s.scale * sqrt(s.ssq)
-
-
 cdef inline tally_t nothing() noexcept nogil:
     cdef tally_t s
     s.energy = 0.0
@@ -110,85 +87,45 @@ cdef inline void tally_pair(const blocks_t* p, int32_t k, const double* e, tally
         s.worst = k
 
 
-cdef inline void tally_contact(const blocks_t* p, int32_t j, int32_t nt, int32_t turns, const double* e,
-                               tally_t* s) noexcept nogil:
-    # A pair of tangents counts once in the maximum, by its norm.
-    cdef double x, y
-    tally_row(p, j, e[j], s)
-    if nt == 1:
-        tally_row(p, j + 1, e[j + 1], s)
-    elif nt == 2:
-        x = p.d[j + 1] * e[j + 1]
-        y = p.d[j + 1] * e[j + 2]
-        s.energy += x * e[j + 1] + y * e[j + 2]
-        x = x * (p.nu[j + 1] * e[j + 1]) + y * (p.nu[j + 1] * e[j + 2])
-        if x > s.fast:
-            s.fast = x
-            s.worst = j + 1
-    if turns & 1:
-        tally_row(p, j + 1 + nt, e[j + 1 + nt], s)
-    if turns & 2:
-        tally_pair(p, j + 1 + nt + (turns & 1), e, s)
-
-
-cdef inline void tally_round(const blocks_t* p, int32_t j, int32_t nt, const double* e, tally_t* s) noexcept nogil:
-    tally_row(p, j, e[j], s)
-    tally_pair(p, j + 1, e, s)
-    tally_row(p, j + 3, e[j + 3], s)
-    if nt == 4:
-        tally_row(p, j + 4, e[j + 4], s)
-    elif nt == 5:
-        tally_pair(p, j + 4, e, s)
-
-
 cdef inline void tally_block(const blocks_t* p, int32_t i, const double* e, tally_t* s) noexcept nogil:
-    cdef int32_t k, j = p.ptr[i], end = p.ptr[i + 1]
-    if p.kind[i] == ROW:
-        for k in range(j, end):
+    cdef int32_t k, g, j = p.ptr[i]
+    cdef parts_t q
+    if is_rows(p, i):
+        for k in range(j, p.ptr[i + 1]):
             tally_row(p, k, e[k], s)
-    elif p.kind[i] == ROUND:
-        tally_round(p, j, n_tangents(p.kind[i], end - j), e, s)
-    else:
-        tally_contact(p, j, n_tangents(p.kind[i], end - j), n_apart(p.kind[i], end - j), e, s)
+        return
+    tally_row(p, j, e[j], s)
+    if is_disk(p, i):                                   # compiled apart
+        tally_pair(p, j + 1, e, s)
+        return
+    groups_of(p, i, &q)
+    for g in range(q.n):
+        if q.size[g] == 2:
+            tally_pair(p, j + q.first[g], e, s)
+        else:
+            tally_row(p, j + q.first[g], e[j + q.first[g]], s)
 
 
-cdef inline int32_t is_plain(double energy, double fast) noexcept nogil:
-    return 1e-250 < energy < 1e250 and 1e-250 < fast < 1e250
+cdef inline int32_t lost_row(const double* e, int32_t m) noexcept nogil:
+    """The first row whose error is no number, or -1."""
+    cdef int32_t i
+    for i in range(m):
+        if not fabs(e[i]) < 1.0 / 0.0:
+            return i
+    return -1
 
 
 cdef inline void score_from(const blocks_t* p, const double* e, const tally_t* s, score_t* out) noexcept nogil:
     """The two sums over e (m); the floor entries are left alone."""
-    cdef int32_t i, j, k, nt, roll
-    cdef double v, big = -1.0
-    cdef sum_t total = sum_t(0.0, 0.0)
+    out.energy = sqrt(s.energy)
+    out.velocity = sqrt(s.fast) if s.fast > 0.0 else 0.0
     out.worst = s.worst
-    out.finite = 1
-    if is_plain(s.energy, s.fast):
-        out.energy = sqrt(s.energy)
-        out.velocity = sqrt(s.fast)
-        return
-    out.worst = -1
-    for i in range(p.n_blocks):
-        j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
-        for k in range(j, p.ptr[i + 1]):
-            add_square(&total, sqrt(p.d[k]) * e[k])
-            if is_pair(nt, roll, k - j - 1):
-                continue                                # the pair counts once, below
-            v = norm2(e[k], e[k + 1]) if is_pair(nt, roll, k - j) else fabs(e[k])
-            v = sqrt(p.nu[k]) * sqrt(p.d[k]) * v
-            if v > big:
-                big = v
-                out.worst = k
-            elif v != v and out.finite:
-                out.finite = 0
-                out.worst = k
-                big = 1.0 / 0.0
-    if big > 1.7976931348623157e308:
-        out.finite = 0
-    out.energy = root(&total)
-    out.velocity = big if big > 0.0 else 0.0
+    out.finite = out.energy + out.velocity < 1.0 / 0.0
+    if not out.finite:
+        out.velocity = 1.0 / 0.0
+        out.worst = lost_row(e, p.n_rows)
+        if out.worst < 0:
+            out.worst = s.worst
 
 
 cdef inline void score_rows(const blocks_t* p, const double* lam, const double* w, double* e, score_t* out) noexcept nogil:
@@ -202,40 +139,28 @@ cdef inline void score_rows(const blocks_t* p, const double* lam, const double* 
 
 
 cdef inline void norms_of_rhs(const blocks_t* p, double* energy, double* velocity) noexcept nogil:
-    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), the pair's norm on tangents."""
-    cdef int32_t i, j, k, nt, roll
-    cdef double x, t, sum_ = 0.0, fast = 0.0, big = 0.0
-    cdef sum_t total = sum_t(0.0, 0.0)
+    """sqrt(sum b^2 / d) and max |b| sqrt(nu / d), of two rows of a part by their norm."""
+    cdef int32_t i, j, k, g
+    cdef double t, pair, sum_ = 0.0, fast = 0.0
+    cdef parts_t q
     for i in range(p.n_blocks):
         j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
         for k in range(j, p.ptr[i + 1]):
             t = (p.b[k] / p.d[k]) * p.b[k]
             sum_ += t
-            if is_pair(nt, roll, k - j):
-                t += (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
             t = t * p.nu[k]
             if t > fast:
                 fast = t
-    if is_plain(sum_, fast):
-        energy[0] = sqrt(sum_)
-        velocity[0] = sqrt(fast)
-        return
-    for i in range(p.n_blocks):                         # scaled: 1e-200 does not vanish
-        j = p.ptr[i]
-        nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], p.ptr[i + 1] - j)
-        roll = roll_at(p.kind[i], p.ptr[i + 1] - j)
-        for k in range(j, p.ptr[i + 1]):
-            x = p.b[k] / sqrt(p.d[k])
-            add_square(&total, x)
-            if is_pair(nt, roll, k - j):
-                x = norm2(x, p.b[k + 1] / sqrt(p.d[k + 1]))
-            x = fabs(x) * sqrt(p.nu[k])
-            if x > big:
-                big = x
-    energy[0] = root(&total)
-    velocity[0] = big
+        groups_of(p, i, &q)
+        for g in range(q.n):
+            if q.size[g] == 2:
+                k = j + q.first[g]
+                pair = (p.b[k] / p.d[k]) * p.b[k] + (p.b[k + 1] / p.d[k + 1]) * p.b[k + 1]
+                pair = pair * p.nu[k]
+                if pair > fast:
+                    fast = pair
+    energy[0] = sqrt(sum_)
+    velocity[0] = sqrt(fast)
 
 
 cdef inline bint hides(double floor) noexcept nogil:
@@ -254,19 +179,12 @@ cdef inline bint is_at_floor(double relative, double floor) noexcept nogil:
 
 
 cdef inline floor_t no_floor() noexcept nogil:
-    return floor_t(0.0, 0.0, sum_t(0.0, 0.0), 0.0)
+    return floor_t(0.0, 0.0)
 
 
-cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint scaled, floor_t* s) noexcept nogil:
-    """What rounding leaves of row k, size = (|A| |lam|)_k; all rows, and once more, scaled, where `floor_ends` says no."""
-    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t
-    if scaled:
-        add_square(&s.total, f / sqrt(p.d[k]))
-        t = f * (sqrt(p.nu[k]) / sqrt(p.d[k]))
-        if t > s.big:
-            s.big = t
-        return
-    t = f / p.d[k]
+cdef inline void add_floor(const blocks_t* p, int32_t k, double size, floor_t* s) noexcept nogil:
+    """What rounding leaves of row k, size = (|A| |lam|)_k."""
+    cdef double f = unit_roundoff() * (size + fabs(p.b[k])), t = f / p.d[k]
     s.energy += t * f
     t = p.nu[k] * t * f
     if t > s.fast:
@@ -274,27 +192,34 @@ cdef inline void add_floor(const blocks_t* p, int32_t k, double size, const bint
 
 
 cdef inline void add_block_floor(const blocks_t* p, int32_t i, const double* lam, const double* w, const double* e,
-                                 const double* size, const bint scaled, floor_t* s) noexcept nogil:
+                                 const double* size, floor_t* s) noexcept nogil:
     """`add_floor` of a block's rows; size from its first row on, of at least |A_kk| |lam_k|.
 
     Where the norm of two rows is cut to its bound, e = lam - Pi has the rounding of lam itself, (2^-53 |lam_k|) d_k as a
     velocity; d_k, of both rows, may be far above A_kk.
     """
-    cdef int32_t k, j = p.ptr[i], n = p.ptr[i + 1] - j
-    cdef int32_t nt = 0 if p.kind[i] == ROW else n_tangents(p.kind[i], n), roll = roll_at(p.kind[i], n)
+    cdef int32_t k, g, j = p.ptr[i], n = p.ptr[i + 1] - j
+    cdef parts_t q
     cdef double x, own
-    for k in range(n):
-        x = size[k]
-        if (is_pair(nt, roll, k) or is_pair(nt, roll, k - 1)) and e[j + k] != quotient(w[j + k], p.d[j + k]):
-            own = p.d[j + k] * fabs(lam[j + k])
-            x = own if own > x else x
-        add_floor(p, j + k, x, scaled, s)
+    if is_rows(p, i):
+        for k in range(n):
+            add_floor(p, j + k, size[k], s)
+        return
+    add_floor(p, j, size[0], s)
+    if is_disk(p, i):                                   # compiled apart
+        disk_of(p, i, &q)
+    else:
+        groups_of(p, i, &q)
+    for g in range(q.n):
+        for k in range(q.first[g], q.first[g] + q.size[g]):
+            x = size[k]
+            if q.size[g] == 2 and e[j + k] != w[j + k] / p.d[j + k]:
+                own = p.d[j + k] * fabs(lam[j + k])
+                x = own if own > x else x
+            add_floor(p, j + k, x, s)
 
 
-cdef inline bint floor_ends(const floor_t* s, const bint scaled, score_t* out) noexcept nogil:
-    """The floor entries of out; False where plain sums have left the range of squares."""
-    if not scaled and not is_plain(s.energy, s.fast):
-        return False
-    out.floor_energy = root(&s.total) if scaled else sqrt(s.energy)
-    out.floor_velocity = s.big if scaled else sqrt(s.fast)
-    return True
+cdef inline void floor_from(const floor_t* s, score_t* out) noexcept nogil:
+    """The floor entries of out."""
+    out.floor_energy = sqrt(s.energy)
+    out.floor_velocity = sqrt(s.fast)

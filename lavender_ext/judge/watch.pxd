@@ -16,7 +16,7 @@ On the last three the best iterate is put back. A check costs about one sweep.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, relative_of
 from lavender_ext.judge.progress cimport keep, open_progress, progress_t, rests, see

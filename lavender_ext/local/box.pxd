@@ -36,7 +36,7 @@ cdef inline bint slip_box(const double* g, double a, double h0, double h1, doubl
     if not det > 0.0:
         return False
     n = b / det
-    if not 0.0 <= n < 1e300:
+    if not 0.0 <= n < 1.0 / 0.0:
         return False
     x = u * n if s0 != 0.0 else -(r0 + g[11] * (v * n)) / g[10]
     y = v * n if s1 != 0.0 else -(r1 + g[12] * (u * n)) / g[13]

@@ -24,7 +24,7 @@ cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s
                      + W[8] * x1 * x1)
     cdef double l = -(q[0] + q[1] * x0 + q[2] * x1) / n
     cdef double y[3]
-    if not n > 0.0 or not l >= 0.0 or not l < 1e300:
+    if not n > 0.0 or not 0.0 <= l < 1.0 / 0.0:
         return FAILED
     y[0] = l
     y[1] = l * x0
@@ -77,7 +77,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
         lam[0] = -q[0] / W[0]
         lam[1] = 0.0
         lam[2] = 0.0
-        return SLIP if lam[0] < 1e300 else FAILED
+        return SLIP
     # v(beta) = v0 + beta v1 + beta^2 v2, det(W + beta J) = d0 + d1 beta + d2 beta^2 - mu^2 beta^3
     v0[0] = -((W[4] * W[8] - W[5] * W[7]) * q[0] + (W[2] * W[7] - W[1] * W[8]) * q[1]
               + (W[1] * W[5] - W[2] * W[4]) * q[2])
@@ -94,7 +94,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
     d0 = (W[0] * (W[4] * W[8] - W[5] * W[7]) + W[1] * (W[5] * W[6] - W[3] * W[8]) + W[2] * (W[3] * W[7] - W[4] * W[6]))
     d1 = W[0] * (W[4] + W[8]) - W[1] * W[3] - W[2] * W[6] - m2 * (W[4] * W[8] - W[5] * W[7])
     d2 = W[0] - m2 * (W[4] + W[8])
-    if d0 > 0.0 and v0[0] >= 0.0 and norm2(v0[1], v0[2]) <= mu * v0[0] and v0[0] < 1e300 * d0:
+    if d0 > 0.0 and v0[0] >= 0.0 and norm2(v0[1], v0[2]) <= mu * v0[0]:
         for k in range(3):
             v[k] = v0[k] / d0
         if rests(3, W, q, v):
@@ -142,15 +142,13 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
         step = f / df
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
         step = beta - step
-        if not lo < step or (hi >= 0.0 and not step < hi) or not step < 1e300:
+        if not lo < step or (hi >= 0.0 and not step < hi):
             if hi >= 0.0:
                 step = 0.5 * (lo + hi)
                 done = hi - lo <= 1e-15 * hi
             else:
                 step = 4.0 * beta
                 done = 0
-                if step > 1e290:
-                    return FAILED
         beta = step
     if not U > 0.0 or not done:
         return FAILED
@@ -170,7 +168,7 @@ cdef inline int32_t cone2(const double* W, const double* q, double mu, double* l
     det = W[0] * W[3] - W[1] * W[2]
     n = W[1] * q[1] - W[3] * q[0]
     t = W[2] * q[0] - W[0] * q[1]
-    if det > 0.0 and n >= 0.0 and fabs(t) <= mu * n and n < 1e300 * det:
+    if det > 0.0 and n >= 0.0 and fabs(t) <= mu * n:
         y[0] = n / det
         y[1] = t / det
         if rests(2, W, q, y):
@@ -181,7 +179,7 @@ cdef inline int32_t cone2(const double* W, const double* q, double mu, double* l
     for _side in range(2):
         n = W[0] + mu * s * (W[1] + W[2]) + mu * mu * W[3]
         l = -(q[0] + mu * s * q[1])
-        if n > 0.0 and l >= 0.0 and l < 1e300 * n:
+        if n > 0.0 and l >= 0.0:
             l = l / n
             if (s * (W[2] * l + W[3] * mu * s * l + q[1])
                     <= 1e-14 * (fabs(W[2]) * l + fabs(W[3]) * mu * l + fabs(q[1]))):

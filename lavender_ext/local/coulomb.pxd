@@ -167,18 +167,16 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
         # Quadratic convergence: the next point is exact to rounding.
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
         step = beta - step
-        if not lo < step or (hi >= 0.0 and not step < hi) or step > 1e300:
+        if not lo < step or (hi >= 0.0 and not step < hi):
             if hi >= 0.0:
                 step = 0.5 * (lo + hi)
                 done = hi - lo <= 1e-15 * hi
             else:
                 step = 4.0 * beta
                 done = 0
-                if step > 1e290:
-                    return FAILED
         beta = step
     n = U + mu * hu
-    if not n > 0.0 or not a / n < 1e300 or not done:
+    if not n > 0.0 or not a / n < 1.0 / 0.0 or not done:
         return FAILED
     n = a / n
     y[0] = n * U
@@ -245,7 +243,7 @@ cdef inline int32_t coulomb2(const double* W, const double* q, double mu, double
         if det > 0.0:
             n = a / det
             t = mu * n * s
-            if (n < 1e300 and s * (W[2] * n + W[3] * t + q[1])
+            if (n < 1.0 / 0.0 and s * (W[2] * n + W[3] * t + q[1])
                     <= 1e-15 * (fabs(W[2]) * n + fabs(W[3] * t) + fabs(q[1]))):
                 lam[0] = n
                 lam[1] = t

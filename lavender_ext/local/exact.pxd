@@ -1,35 +1,29 @@
 """The problem of one block alone, solved exactly: w = W lam + q with the other blocks held still.
 
-W is the block's own part of A, any 1x1 to 8x8, not necessarily symmetric. A contact without spin is that of
+W is the block's own part of A, any 1x1 to 8x8, not necessarily symmetric. A contact of one part is that of
 local/coulomb.pxd or local/cone.pxd.
 
-Spin: either w_s = 0, and lam_s is eliminated; or lam_s = +-mu r lam_n, and its column (cone: and row) is
-added to the normal's. Three problems without spin; the one whose answer keeps the bound is the answer.
-Rolling: local/rolling.pxd.
+A second part of one row s, its reach a: either w_s = 0, and lam_s is eliminated; or lam_s = +-a lam_n, and its column
+(cone: and row) is added to the normal's. Three problems of one part; the one whose answer keeps the bound is the answer.
+Any other parts: local/parts.pxd.
 
 Several rows: boxed complementarity by principal pivoting.
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, ROUND, clip, cone_error, n_apart, relax_normal, relax_row, relax_tangents,
-                                      round_error)
+from lavender_ext.core.block cimport clip, cone_error, relax_normal, relax_row, relax_tangents, round_error
+from lavender_ext.core.parts cimport CONE, parts_t
 from lavender_ext.local.cone cimport cone2, cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb2, coulomb3, prepare3
+from lavender_ext.local.parts cimport contact_of_parts
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
-cdef inline int32_t contact_without_spin(int32_t law, int32_t nt, const double* W, const double* q, double mu,
-                                         double* lam) noexcept nogil:
+cdef inline int32_t contact_of_one(int32_t law, int32_t nt, const double* W, const double* q, double mu,
+                                   double* lam) noexcept nogil:
+    """lam (1 + nt), of a part of one or two rows; W (1 + nt, 1 + nt)."""
     cdef double g[PREPARED]
-    if nt == 0:
-        if q[0] >= 0.0:
-            lam[0] = 0.0
-            return OPEN
-        if not W[0] > 0.0 or not q[0] < 0.0:
-            return FAILED
-        lam[0] = -q[0] / W[0]
-        return STICK
     if nt == 1:
         return cone2(W, q, mu, lam) if law == CONE else coulomb2(W, q, mu, lam)
     if law == CONE:
@@ -38,13 +32,13 @@ cdef inline int32_t contact_without_spin(int32_t law, int32_t nt, const double* 
     return coulomb3(g, q, mu, 0.0, lam)
 
 
-cdef inline int32_t contact_with_spin(int32_t law, int32_t nt, const double* W, const double* q, double mu,
-                                      double patch_radius, double* lam) noexcept nogil:
-    """lam (2 + nt), spin last; W (2 + nt, 2 + nt)."""
+cdef inline int32_t contact_of_two(int32_t law, int32_t nt, const double* W, const double* q, double mu, double bound,
+                                   double* lam) noexcept nogil:
+    """lam (2 + nt), the second part last, its reach in `bound`; W (2 + nt, 2 + nt)."""
     cdef double w[9]
     cdef double c[3]
     cdef double x[3]
-    cdef double bound = mu * patch_radius, s, ws, y, size
+    cdef double s, ws, y, size
     cdef int32_t n = 1 + nt, m = 2 + nt, i, j, k, trial, found
     # The first guess is what the block did last: sliding at a bound, or held.
     s = 1.0 if lam[n] >= bound * lam[0] else (-1.0 if lam[n] <= -bound * lam[0] else 0.0)
@@ -65,7 +59,7 @@ cdef inline int32_t contact_with_spin(int32_t law, int32_t nt, const double* W, 
             for j in range(n):
                 w[j] += s * bound * W[m * n + j]
             w[0] += bound * bound * W[m * n + n]
-        found = contact_without_spin(law, nt, w, c, mu, x)
+        found = contact_of_one(law, nt, w, c, mu, x)
         if found == FAILED:
             continue
         ws = q[n]
@@ -100,15 +94,24 @@ cdef inline void local_slack(int32_t m, const double* W, const double* q, const 
             w[i] += W[m * i + j] * lam[j]
 
 
-cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, int32_t m, const double* W, const double* q,
-                                 const double* d, const double* step, double mu, double patch_radius,
-                                 double rolling, double* lam) noexcept nogil:
+cdef inline int32_t exact_contact(int32_t law, int32_t m, const double* W, const double* q, const double* d,
+                                  const parts_t* part, double* lam) noexcept nogil:
+    """lam (m) of a contact with parts, the present one before; FAILED where no exact answer is found."""
+    if part.n == 1 and part.size[0] <= 2:
+        return contact_of_one(law, part.size[0], W, q, part.reach[0], lam)
+    if part.n == 2 and part.size[1] == 1:
+        return contact_of_two(law, part.size[0], W, q, part.reach[0], part.reach[1], lam)
+    return contact_of_parts(law, m, W, q, d, part, lam)
+
+
+cdef inline void project_locally(int32_t law, bint round_, int32_t m, const double* W, const double* q, const double* d,
+                                 const double* step, const parts_t* part, double* lam) noexcept nogil:
     """Where no exact answer is found: the update of core/block.pxd (cone: projected gradient) on the block alone."""
-    cdef int32_t turns = n_apart(kind, m), roll = m - 2, _sweep, i
+    cdef int32_t _sweep, i, g
     cdef double w[MAX_ROWS]
     cdef double e[MAX_ROWS]
     cdef double high[MAX_ROWS]
-    cdef double change, bound
+    cdef double change
     for _sweep in range(20):
         change = 0.0
         for i in range(m):
@@ -117,27 +120,20 @@ cdef inline void project_locally(int32_t law, int32_t nt, int32_t kind, int32_t 
             for i in range(m):
                 high[i] = m * d[i]
             local_slack(m, W, q, lam, w)
-            if kind == ROUND:
-                round_error(lam, w, high, mu, nt, e)
+            if round_:
+                round_error(lam, w, high, part.reach[0], m - 1, e)
             else:
-                cone_error(lam, w, high, mu, patch_radius, rolling, nt, turns, e)
+                cone_error(lam, w, high, part, e)
             for i in range(m):
                 lam[i] -= e[i]
                 change += fabs(e[i])
         else:
             local_slack(m, W, q, lam, w)
             lam[0] = relax_normal(lam[0], w[0], step[0])
-            bound = mu * lam[0]
-            if nt > 0:
+            for g in range(part.n):
+                i = part.first[g]
                 local_slack(m, W, q, lam, w)
-                relax_tangents(lam + 1, w + 1, step[1], bound, nt)
-            if turns & 1:
-                i = 1 + nt
-                local_slack(m, W, q, lam, w)
-                lam[i] = relax_row(lam[i], w[i], step[i], -bound * patch_radius, bound * patch_radius)
-            if turns & 2:
-                local_slack(m, W, q, lam, w)
-                relax_tangents(lam + roll, w + roll, step[roll], rolling * lam[0], 2)
+                relax_tangents(lam + i, w + i, step[i], part.reach[g] * lam[0], part.size[g])
             for i in range(m):
                 change += fabs(lam[i] - e[i])
         if not change > 1e-12 * fabs(lam[0]):

@@ -11,39 +11,41 @@ Prepared numbers of block i stand from g[start[i]] on:
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONE, CONTACT, CONTACT_BOX, CONTACT_ROLLING, ROUND, ROW, blocks_t, ends_apart, mu_r,
-                                      n_directions, n_tangents, n_turns, relax_normal, relax_row)
+from lavender_ext.core.block cimport relax_normal, relax_row
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
+from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round, is_rows, n_directions, n_turns,
+                                      parts_of, parts_t)
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
 from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
-from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin, project_locally
-from lavender_ext.local.rolling cimport rolling_contact
+from lavender_ext.local.exact cimport boxed_rows, exact_contact, project_locally
 from lavender_ext.local.round cimport prepare_round, round_contact
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, eliminate
 
 
-cdef inline bint is_plain3(int32_t kind, int32_t n) noexcept nogil:
+cdef inline bint is_plain3(const blocks_t* p, int32_t i) noexcept nogil:
     # a normal and two tangents, in a disk or a box
-    return n == 3 and (kind == CONTACT or kind == CONTACT_BOX)
+    return is_disk(p, i) or is_box(p, i)
 
 
 cdef inline int32_t coulomb_block3(const blocks_t* p, int32_t i, const double* g, const double* w, double* lam) noexcept nogil:
-    if p.kind[i] == CONTACT_BOX:
-        return box3_from(g, w, p.mu[i], p.mu[i] * p.patch_radius[i], lam)
-    return coulomb3_from(g, w, p.mu[i], lam)
+    cdef parts_t q
+    if is_disk(p, i):
+        return coulomb3_from(g, w, p.mu[i], lam)
+    parts_of(p, i, &q)
+    return box3_from(g, w, q.reach[0], q.reach[1], lam)
 
 
 cdef inline int32_t prepared_size(const blocks_t* p, int32_t i) noexcept nogil:
     cdef int32_t n = p.ptr[i + 1] - p.ptr[i]
-    if p.kind[i] == ROW:
+    if is_rows(p, i):
         return n * n + 1 if 1 < n <= MAX_ROWS else 0
-    if is_plain3(p.kind[i], n):
+    if is_plain3(p, i):
         return PREPARED
-    if p.kind[i] == ROUND:
+    if is_round(p, i):
         return n * n + (n - 1) * n
     return n * n
 
@@ -55,16 +57,16 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
     cdef double inf = 1.0 / 0.0
     cdef double a[MAX_ROWS * MAX_ROWS]
     cdef double x[MAX_ROWS]
-    if p.kind[i] != ROW:
-        if is_plain3(p.kind[i], n):
+    if not is_rows(p, i):
+        if is_plain3(p, i):
             prepare3(W, g)
             # A normal whose d falls back has no trustworthy W_nn to divide by.
             if W[0] != p.d[j]:
                 g[9] = 0.0
-                if p.kind[i] == CONTACT_BOX:
+                if is_box(p, i):
                     g[0] = 0.0
             g[15] = one_pattern
-        elif p.kind[i] == ROUND:
+        elif is_round(p, i):
             prepare_round(n, W, g)
             if W[0] != p.d[j]:
                 g[0] = 0.0
@@ -97,11 +99,12 @@ cdef inline void prepare_block(const blocks_t* p, int32_t i, const double* W, in
 cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, const double* w,
                                 double* lam) noexcept nogil:
     """The exact update of block i from its slack w; lam at its first row. 1 where it fell back."""
-    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, kind = p.kind[i], k, t, nt, found = FAILED
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, t, found = FAILED
+    cdef parts_t part
     cdef double q[MAX_ROWS]
     cdef double x[MAX_ROWS]
     cdef double s
-    if kind == ROW:
+    if is_rows(p, i):
         if n == 1:
             lam[0] = relax_row(lam[0], w[0], p.step[j], p.lower[j], p.upper[j])
             return 0
@@ -118,8 +121,7 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
     if n == 1:
         lam[0] = relax_normal(lam[0], w[0], p.step[j])
         return 0
-    nt = n_tangents(kind, n)
-    if is_plain3(kind, n) and p.law != CONE:
+    if is_plain3(p, i) and p.law != CONE:
         if coulomb_block3(p, i, g, w, lam) != FAILED:
             return 0
     # q = w - W lam
@@ -128,18 +130,15 @@ cdef inline int32_t solve_block(const blocks_t* p, int32_t i, const double* g, c
         for t in range(n):
             s -= g[n * k + t] * lam[t]
         q[k] = s
-    if kind == ROUND:
+    parts_of(p, i, &part)
+    if is_round(p, i):
         found = round_contact(n, g, q, p.d + j, p.mu[i], lam)
-    elif kind == CONTACT_ROLLING:
-        found = rolling_contact(p.law, n, g, q, p.d + j, p.mu[i], p.patch_radius[i], p.rolling[i], lam)
-    elif ends_apart(kind):
-        found = contact_with_spin(p.law, nt, g, q, p.mu[i], p.patch_radius[i], lam)
-    elif n < 3:
-        found = contact_without_spin(p.law, nt, g, q, p.mu[i], lam)
+    elif not is_disk(p, i):
+        found = exact_contact(p.law, n, g, q, p.d + j, &part, lam)
     elif p.law == CONE:
         found = cone3(g, q, p.mu[i], lam) if g[9] > 0.0 or q[0] >= 0.0 else FAILED
     if found == FAILED:
-        project_locally(p.law, nt, kind, n, g, q, p.d + j, p.step + j, p.mu[i], p.patch_radius[i], mu_r(p, i), lam)
+        project_locally(p.law, is_round(p, i), n, g, q, p.d + j, p.step + j, &part, lam)
         return 1
     return 0
 
@@ -177,11 +176,11 @@ cdef inline int32_t solve_csr_block(const blocks_t* p, const csr_t* a, int32_t i
                                     double* lam) noexcept nogil:
     cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k
     cdef double w[MAX_ROWS]
-    if n > MAX_ROWS:                                    # ROW: row by row
+    if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
             lam[k] = relax_row(lam[k], csr_dot(a, k, lam) - p.b[k], p.step[k], p.lower[k], p.upper[k])
         return 1
-    if is_plain3(p.kind[i], n) and g[15] != 0.0:
+    if is_plain3(p, i) and g[15] != 0.0:
         csr_dot3(a, j, lam, w)
         w[0] -= p.b[j]
         w[1] -= p.b[j + 1]
@@ -199,7 +198,7 @@ cdef inline int32_t solve_general_block(const blocks_t* p, const generalized_t* 
     cdef double w[MAX_ROWS]
     cdef double old[MAX_ROWS]
     cdef double now
-    if n > MAX_ROWS:                                    # ROW: row by row
+    if n > MAX_ROWS:                                    # bounded rows, one by one
         for k in range(j, j + n):
             now = relax_row(lam[k], whitened_dot(o, b, k, u) + (o.compliance[k] * lam[k] - p.b[k]), p.step[k],
                             p.lower[k], p.upper[k])
@@ -262,7 +261,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     cdef const double* normal
     cdef const double* t1
     w[0] = t2[0] = t2[1] = t2[2] = 0.0
-    if c >= 0 and is_plain3(p.kind[i], n) and p.law != CONE:
+    if c >= 0 and is_plain3(p, i) and p.law != CONE:
         return solve_sliding_contact(p, r, i, g, lam + j, v)
     if c < 0:
         if n > MAX_ROWS:
@@ -279,8 +278,8 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
         return found
     a = r.contact_body[2 * c]
     b = r.contact_body[2 * c + 1]
-    turns = n_turns(p.kind[i], n)
-    nt = n_directions(p.kind[i], n)
+    turns = n_turns(p, i)
+    nt = n_directions(p, i)
     roll = 1 + nt + (turns & 1)
     normal = r.normal + 3 * c
     t1 = r.tangent + 3 * c

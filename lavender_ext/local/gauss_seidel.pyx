@@ -8,12 +8,12 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.parts cimport add_part, blocks_t, n_directions, n_turns, parts_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
-from lavender_ext.local.exact cimport boxed_rows, contact_with_spin, contact_without_spin
+from lavender_ext.local.exact cimport boxed_rows, exact_contact
 from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
                                               solve_rows_block)
@@ -66,7 +66,7 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         n = p.ptr[i + 1] - j
         c = i - r.n_joints
         if c >= 0:
-            contact_jacobian(r, c, n_directions(p.kind[i], n), n_turns(p.kind[i], n), jac)
+            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
             row = jac
         else:
             row = r.jac + 12 * j
@@ -149,13 +149,19 @@ def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, 
 
     Returns (n,) int32: 0 open, 1 stick, 2 slip, -1 no exact answer (lam left alone).
     """
-    cdef Py_ssize_t i, n = W.shape[0]
+    cdef Py_ssize_t i, k, n = W.shape[0]
     cdef int32_t[::1] found = np.empty(n, np.int32)
+    cdef double d[6]
+    cdef parts_t part
     for i in range(n):
+        part.n = 0
+        if tangents:
+            add_part(&part, tangents, mu[i])
         if spin:
-            found[i] = contact_with_spin(law, tangents, &W[i, 0, 0], &q[i, 0], mu[i], patch_radius[i], &lam[i, 0])
-        else:
-            found[i] = contact_without_spin(law, tangents, &W[i, 0, 0], &q[i, 0], mu[i], &lam[i, 0])
+            add_part(&part, 1, mu[i] * patch_radius[i])
+        for k in range(W.shape[1]):
+            d[k] = W[i, k, k]
+        found[i] = exact_contact(law, <int32_t>W.shape[1], &W[i, 0, 0], &q[i, 0], d, &part, &lam[i, 0])
     return np.asarray(found)
 
 

@@ -164,7 +164,7 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
         at_low = at_high
         high = 2.0 * high
         at_high = normal_at(n, g, q, mu, high, z)
-    if not (at_high >= 0.0 and high < 1e300):
+    if not at_high >= 0.0:
         return FAILED
     s = high
     for _turn in range(3 * TURNS):                      # regula falsi with halved ends (Dowell, Jarratt 1971)
@@ -197,7 +197,7 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
         x[1 + j] = 0.0
         for i in range(nt):
             x[1 + j] += turn[i * nt + j] * z[i]
-    # W may lack symmetry, or its products may vanish: the judge's own error has the last word.
+    # W may lack symmetry: the judge's own error has the last word.
     size = 0.0
     wrong = 0.0
     for i in range(n):

@@ -13,7 +13,7 @@ cdef enum:
     FAILED = -1
 
 cdef enum:
-    MAX_ROWS = 8                # of a ROW block that is solved exactly
+    MAX_ROWS = 8                # of a block that is solved exactly
 
 
 cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:

@@ -2,7 +2,6 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONTACT_ROLLING, CONTACT_SPIN as SPIN
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -51,35 +50,13 @@ cdef inline double cone_step(const double* x, const double* dx, int32_t n) noexc
     return c / q
 
 
-cdef enum:
-    PARTS = 3                   # most cones of a contact: tangents, spin, what rolls
+# The cone of part g of element i in its own coordinates: x_0 = a z_n, then the rows of the part.
+cdef inline int32_t cone_size(const elements_t* e, int32_t g) noexcept nogil:
+    return 1 + e.size[g]
 
 
-# One cone of a contact in its own coordinates: x_0 = a z_n, then the tangents (which = 0), the spin (1) or what rolls (2).
-cdef inline int32_t cone_size(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
-    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i]
-    if e.kind[i] == CONTACT_ROLLING:
-        return 3 if which != 1 else 2 if nr == 6 else 0
-    if which == 0:
-        return nr - 1 if e.kind[i] == SPIN else nr
-    return 2 if e.kind[i] == SPIN and which == 1 else 0
-
-
-cdef inline int32_t cone_at(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
-    # its first row after the normal
-    if which == 0:
-        return e.ptr[i] + 1
-    if which == 2:
-        return e.ptr[i + 1] - 2
-    return e.ptr[i] + 3 if e.kind[i] == CONTACT_ROLLING else e.ptr[i + 1] - 1
-
-
-cdef inline double ratio(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
-    return e.at[i] if which == 0 else e.as_[i] if which == 1 else e.ar[i]
-
-
-cdef inline double* kept(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
-    return e.scaling + KEPT * (e.parts * i + which)
+cdef inline double* kept(const elements_t* e, int32_t g) noexcept nogil:
+    return e.scaling + KEPT * g
 
 
 cdef inline double on_normal(double a) noexcept nogil:
@@ -90,51 +67,45 @@ cdef inline double on_tangent(double a) noexcept nogil:
     return 1.0 / a if a < 1.0 else 1.0
 
 
-cdef inline void gather(const elements_t* e, int32_t i, int32_t which, const double* z, double* x) noexcept nogil:
+cdef inline void gather(const elements_t* e, int32_t i, int32_t g, const double* z, double* x) noexcept nogil:
     # x = G z, G = diag(1, 1/a) or diag(a, 1): no entry below 1, so that G never blows a proximal term up
-    cdef int32_t q = cone_at(e, i, which) - 1, k
-    cdef double a = ratio(e, i, which)
+    cdef int32_t q = e.first[g] - 1, k
+    cdef double a = e.reach[g]
     x[0] = on_normal(a) * z[e.ptr[i]]
-    for k in range(1, cone_size(e, i, which)):
+    for k in range(1, cone_size(e, g)):
         x[k] = on_tangent(a) * z[q + k]
 
 
-cdef inline void scatter(const elements_t* e, int32_t i, int32_t which, const double* x, double* z) noexcept nogil:
+cdef inline void scatter(const elements_t* e, int32_t i, int32_t g, const double* x, double* z) noexcept nogil:
     # z += G^T x
-    cdef int32_t q = cone_at(e, i, which) - 1, k
-    cdef double a = ratio(e, i, which)
+    cdef int32_t q = e.first[g] - 1, k
+    cdef double a = e.reach[g]
     z[e.ptr[i]] += on_normal(a) * x[0]
-    for k in range(1, cone_size(e, i, which)):
+    for k in range(1, cone_size(e, g)):
         z[q + k] += on_tangent(a) * x[k]
 
 
-# u1 (m): dual of the lower bound, or of the tangent cone. u2 (m): of the upper bound, or of the spin cone (on the normal
-# and the spin row) and of the rolling cone (on the first tangent's row, which the others leave free, and what rolls).
-cdef inline double* dual_head(const elements_t* e, int32_t i, int32_t which, double* u1, double* u2) noexcept nogil:
-    return u1 + e.ptr[i] if which == 0 else u2 + e.ptr[i] + (which == 2)
+# u1 (m): dual of the lower bound, or of the first part's cone. u2 (m): of the upper bound, or of the other cones, whose
+# first numbers are on the normal and on the row behind it, which the first part leaves free.
+cdef inline double* dual_head(const elements_t* e, int32_t i, int32_t g, double* u1, double* u2) noexcept nogil:
+    return u1 + e.ptr[i] if g == e.part[i] else u2 + e.ptr[i] + (g - e.part[i] - 1)
 
 
-cdef inline void load_dual(const elements_t* e, int32_t i, int32_t which, const double* u1, const double* u2,
+cdef inline void load_dual(const elements_t* e, int32_t i, int32_t g, const double* u1, const double* u2,
                            double* x) noexcept nogil:
-    cdef const double* u = u1 if which == 0 else u2
-    cdef int32_t q = cone_at(e, i, which) - 1, k
-    x[0] = dual_head(e, i, which, <double*>u1, <double*>u2)[0]
-    for k in range(1, cone_size(e, i, which)):
+    cdef const double* u = u1 if g == e.part[i] else u2
+    cdef int32_t q = e.first[g] - 1, k
+    x[0] = dual_head(e, i, g, <double*>u1, <double*>u2)[0]
+    for k in range(1, cone_size(e, g)):
         x[k] = u[q + k]
 
 
-cdef inline void store_dual(const elements_t* e, int32_t i, int32_t which, const double* x, double* u1,
-                            double* u2) noexcept nogil:
-    cdef double* u = u1 if which == 0 else u2
-    cdef int32_t q = cone_at(e, i, which) - 1, k
-    dual_head(e, i, which, u1, u2)[0] = x[0]
-    for k in range(1, cone_size(e, i, which)):
+cdef inline void store_dual(const elements_t* e, int32_t i, int32_t g, const double* x, double* u1, double* u2) noexcept nogil:
+    cdef double* u = u1 if g == e.part[i] else u2
+    cdef int32_t q = e.first[g] - 1, k
+    dual_head(e, i, g, u1, u2)[0] = x[0]
+    for k in range(1, cone_size(e, g)):
         u[q + k] = x[k]
-
-
-cdef inline bint has_cone(const elements_t* e, int32_t i, int32_t which) noexcept nogil:
-    # a contact without tangents is a plain normal: its cone is the half-line, a = 1
-    return cone_size(e, i, which) > (1 if which > 0 or e.kind[i] == SPIN else 0)
 
 
 cdef inline void nt_scaling(const double* s, const double* u, int32_t n, double* w, double* eta) noexcept nogil:
@@ -190,19 +161,19 @@ cdef inline void cone_divide(const double* v, const double* c, int32_t n, double
 
 
 cdef inline bint is_low(const elements_t* e, int32_t j) noexcept nogil:
-    return e.lower[j] > -1.7976931348623157e308
+    return e.lower[j] > -1.0 / 0.0
 
 
 cdef inline bint is_high(const elements_t* e, int32_t j) noexcept nogil:
-    return e.upper[j] < 1.7976931348623157e308
+    return e.upper[j] < 1.0 / 0.0
 
 
-cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t which, const double* hz, double* c) noexcept nogil:
+cdef inline void slack_dual(const elements_t* e, int32_t i, int32_t g, const double* hz, double* c) noexcept nogil:
     # u with G^T u = H z - g where the contact has one cone
-    cdef int32_t j = e.ptr[i], q = cone_at(e, i, which) - 1, k
-    cdef double a = ratio(e, i, which)
+    cdef int32_t j = e.ptr[i], q = e.first[g] - 1, k
+    cdef double a = e.reach[g]
     c[0] = (hz[j] - e.g[j]) / on_normal(a)
-    for k in range(1, cone_size(e, i, which)):
+    for k in range(1, cone_size(e, g)):
         c[k] = (hz[q + k] - e.g[q + k]) / on_tangent(a)
 
 
@@ -252,28 +223,28 @@ cdef inline double row_limit(double x, double dx, double best) noexcept nogil:
 
 # Steps of a cone are taken in the scaled coordinates, where T^-1 s = T u = v: with y = T^-1 G dz, T du = -v - y for
 # the affine step and -(v \\ c) - y for the combined one. T maps the cone onto itself, so lengths are the same.
-cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t which, const double* da, const int32_t n,
+cdef inline void cone_affine(const elements_t* e, int32_t i, int32_t g, const double* da, const int32_t n,
                              double* y, double* back) noexcept nogil:
     # y = T^-1 G dz_a, back = T du_a
-    cdef const double *w = kept(e, i, which)
+    cdef const double *w = kept(e, g)
     cdef double x[4]
     cdef int32_t k
-    gather(e, i, which, da, x)
+    gather(e, i, g, da, x)
     scale_back(w, n, x, y)
     for k in range(n):
         back[k] = -w[KEPT_V + k] - y[k]
 
 
-cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, const double* da, double sigma_mu,
+cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t g, const double* da, double sigma_mu,
                                const int32_t n, double* rhs) noexcept nogil:
     # v \\ c of (4) into the cone's store; rhs = T^-1 (v \\ c)
-    cdef double *w = kept(e, i, which)
+    cdef double *w = kept(e, g)
     cdef const double *v = w + KEPT_V
     cdef double x[4]
     cdef double y[4]
     cdef double back[4]
     cdef int32_t k
-    cone_affine(e, i, which, da, n, y, back)
+    cone_affine(e, i, g, da, n, y, back)
     x[0] = -sigma_mu
     for k in range(n):
         x[0] += v[k] * v[k] + y[k] * back[k]
@@ -283,15 +254,15 @@ cdef inline void cone_combined(const elements_t* e, int32_t i, int32_t which, co
     scale_back(w, n, w + KEPT_C, rhs)
 
 
-cdef inline double cone_length(const elements_t* e, int32_t i, int32_t which, const double* dz, double best,
+cdef inline double cone_length(const elements_t* e, int32_t i, int32_t g, const double* dz, double best,
                                const int32_t n, double* du) noexcept nogil:
     # the combined step's length, at most `best`; du
-    cdef const double *w = kept(e, i, which)
+    cdef const double *w = kept(e, g)
     cdef double x[4]
     cdef double y[4]
     cdef double a
     cdef int32_t k
-    gather(e, i, which, dz, x)
+    gather(e, i, g, dz, x)
     scale_back(w, n, x, y)
     a = cone_step(w + KEPT_V, y, n)
     best = a if a < best else best

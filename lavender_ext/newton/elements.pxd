@@ -4,9 +4,9 @@ With d = diag(A): z = D^1/2 lambda [sqrt J], g = D^-1/2 b, s = H z - g,
 
     H = D^-1/2 A D^-1/2 = K K^T + diag(theta),   K = D^-1/2 J M^-1/2                              (1)
 
-An element is a bounded row, or a contact (normal, tangents, spin, rolling) whose cones in z are |z_t| <= a_t z_n,
-|z_s| <= a_s z_n and |z_r| <= a_r z_n. Interior point and natural map both ask for (H + W) dz = r with one small W for
-each element; in the velocity form, with V = (theta + W)^-1 per element,
+An element is a bounded row, or a contact of a normal and parts g whose cones in z are |z_g| <= a_g z_n. Interior point
+and natural map both ask for (H + W) dz = r with one small W for each element; in the velocity form, with
+V = (theta + W)^-1 per element,
 
     N = I + K^T V K,   N dy = K^T V r,   dz = V (r - K dy)                                        (2)
 
@@ -16,13 +16,15 @@ Nothing here squares J twice, and rows that depend on each other cost nothing.
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.parts cimport parts_t
+
 
 cdef struct elements_t:
     int32_t n                   # elements
     int32_t m                   # rows
     int32_t s                   # columns of a body in the panel
     const int32_t* ptr          # (n + 1) first row
-    const int32_t* kind         # (n) ROW (one row each) | CONTACT | SPIN | CONTACT_ROLLING
+    const int32_t* part         # (n + 1) first part; an element without parts is a bounded row
     const int32_t* wptr         # (n + 1) first entry of the element's small square matrices
     const int32_t* node         # (n, 2) block columns, the first the larger, -1 where static
     const int32_t* slot         # (n, 3) blocks of N: first-first, second-second, first-second
@@ -31,13 +33,25 @@ cdef struct elements_t:
     const double* panel         # (m, 2 s) K
     const double* theta         # (m)
     const double* g             # (m)
-    const double* lower         # (m) scaled, read on ROW
+    const double* lower         # (m) scaled, read on bounded rows
     const double* upper         # (m)
-    const double* at            # (n) a_t
-    const double* as_           # (n) a_s
-    double* scaling             # (n, parts, KEPT) of the element's cones, once ipm_scale has run
-    int32_t parts               # cones that an element may have: 2, with rolling 3
-    const double* ar            # (n) a_r, read on CONTACT_ROLLING
+    const int32_t* first        # of each part its first row
+    const int32_t* size         # how many there are, 1 or 2
+    const double* reach         # a_g
+    double* scaling             # (parts, KEPT) of their cones, once ipm_scale has run
+
+
+cdef inline bint is_row(const elements_t* e, int32_t i) noexcept nogil:
+    """A bounded row."""
+    return e.part[i] == e.part[i + 1]
+
+
+cdef inline void element_parts(const elements_t* e, int32_t i, parts_t* q) noexcept nogil:
+    """The parts of element i, its reach in the metric of d."""
+    cdef int32_t g, at = e.part[i]
+    q.n = e.part[i + 1] - at
+    for g in range(q.n):
+        q.first[g], q.size[g], q.reach[g] = e.first[at + g] - e.ptr[i], e.size[at + g], e.reach[at + g]
 
 
 cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
@@ -62,7 +76,7 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
                 inv[k * n + j] = inv[best * n + j]
                 inv[best * n + j] = x
         x = a[k * n + k]
-        x = 1.0 / x if fabs(x) > 1e-300 else 0.0
+        x = 1.0 / x if fabs(x) > 0.0 else 0.0
         for j in range(n):
             a[k * n + j] *= x
             inv[k * n + j] *= x

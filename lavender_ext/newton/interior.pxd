@@ -9,11 +9,10 @@ u dual to G z, G z and u inside every cone, W = G^T T^-2 G with T u = T^-1 G z =
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport ROW
-from lavender_ext.newton.cones cimport (KEPT_V, PARTS, cone_affine, cone_at, cone_combined, cone_gap, cone_length,
-                                        cone_parts, cone_size, cone_step, dual_head, gather, has_cone, is_high, is_low,
-                                        kept, load_dual, on_normal, ratio, row_limit, scatter, slack_dual, store_dual)
-from lavender_ext.newton.elements cimport elements_t, invert_small
+from lavender_ext.newton.cones cimport (KEPT_V, cone_affine, cone_combined, cone_gap, cone_length, cone_parts, cone_size,
+                                        cone_step, dual_head, gather, is_high, is_low, kept, load_dual, on_normal,
+                                        row_limit, scatter, slack_dual, store_dual)
+from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 
 
 cdef inline double ipm_start(const elements_t* e, const double* hz, double dual, double* z, double* u1,
@@ -23,8 +22,8 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
     Vandenberghe 2010, section 7.3: both are shifted along the cones' axes, by one amount each; u's beyond the
     worst violation is `dual` times z's, because most rows carry load in the end.
     """
-    cdef int32_t i, j, which, n
-    cdef double worst_z = -1e300, worst_u = -1e300, size = 0.0, x, degree = 0.0, width
+    cdef int32_t i, j, g, n
+    cdef double worst_z = -1.0 / 0.0, worst_u = -1.0 / 0.0, size = 0.0, x, degree = 0.0, width
     cdef double c[4]
     for j in range(e.m):
         size += z[j] * z[j] + (hz[j] - e.g[j]) * (hz[j] - e.g[j])
@@ -33,7 +32,7 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
         size = 1.0
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             u1[j] = 0.0
             u2[j] = 0.0
             if is_low(e, j) and is_high(e, j):
@@ -60,23 +59,21 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
                 worst_u = -u2[j] if -u2[j] > worst_u else worst_u
                 degree += 1.0
             continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            n = cone_size(e, i, which)
-            gather(e, i, which, z, c)
-            x = -cone_gap(c, n) / on_normal(ratio(e, i, which))
+        for g in range(e.part[i], e.part[i + 1]):
+            n = cone_size(e, g)
+            gather(e, i, g, z, c)
+            x = -cone_gap(c, n) / on_normal(e.reach[g])
             worst_z = x if x > worst_z else worst_z
-            slack_dual(e, i, which, hz, c)
+            slack_dual(e, i, g, hz, c)
             x = -cone_gap(c, n)
             worst_u = x if x > worst_u else worst_u
-            store_dual(e, i, which, c, u1, u2)
+            store_dual(e, i, g, c, u1, u2)
             degree += 1.0
     worst_z = worst_z + size if worst_z > -1e-8 * size else 0.0
     worst_u = worst_u + dual * size if worst_u > -1e-8 * size else 0.0
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             if is_low(e, j) and not is_high(e, j):
                 z[j] += worst_z
                 u1[j] += worst_u
@@ -85,9 +82,8 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
                 u2[j] += worst_u
             continue
         z[j] += worst_z
-        for which in range(PARTS):
-            if has_cone(e, i, which):
-                dual_head(e, i, which, u1, u2)[0] += worst_u
+        for g in range(e.part[i], e.part[i + 1]):
+            dual_head(e, i, g, u1, u2)[0] += worst_u
     return degree
 
 
@@ -97,7 +93,7 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
 
     bt may be NULL.
     """
-    cdef int32_t i, j, k, l, n, nr, q, t, which, first
+    cdef int32_t i, j, k, l, n, nr, q, t, g, first
     cdef bint more
     cdef double x, y, r, total = 0.0
     cdef double s[4]
@@ -111,7 +107,7 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             x = e.theta[j] + delta
             if is_low(e, j):
                 x += u1[j] / (z[j] - e.lower[j])
@@ -131,21 +127,19 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
         x = 0.0
         more = False
         a[0] = 1.0
-        for which in range(PARTS):
-            n = cone_size(e, i, which)
-            if n <= 1:
-                continue
+        for g in range(e.part[i], e.part[i + 1]):
+            n = cone_size(e, g)
             # Cones share the normal: their parallel sum there, each of the others follows it.
-            gather(e, i, which, z, s)
-            load_dual(e, i, which, u1, u2, u)
-            y = total if which == 0 else 0.0
+            gather(e, i, g, z, s)
+            load_dual(e, i, g, u1, u2, u)
+            y = 0.0 if more else total
             for k in range(n):
                 y += s[k] * u[k]
-            total = y if which == 0 else total + y
-            y = cone_parts(s, u, n, ratio(e, i, which), delta, kept(e, i, which), h, c, root)
+            total = total + y if more else y
+            y = cone_parts(s, u, n, e.reach[g], delta, kept(e, g), h, c, root)
             x = x * (y / (x + y)) if more else y
             more = True
-            first = cone_at(e, i, which) - j
+            first = e.first[g] - j
             for k in range(n - 1):
                 a[first + k] = h[k]
                 for l in range(n - 1):
@@ -180,14 +174,14 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
 cdef inline double ipm_affine(const elements_t* e, const double* z, const double* u1, const double* u2,
                                   const double* dz, double* gap) noexcept nogil:
     """Largest step (at most 1) of the affine direction, and the gap G z . u after it."""
-    cdef int32_t i, j, k, which, n
+    cdef int32_t i, j, k, g, n
     cdef double best = 1.0, a, b, x, t00 = 0.0, t01 = 0.0, t11 = 0.0
     cdef double y[4]
     cdef double back[4]
     cdef const double *v
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             if is_low(e, j):
                 a = z[j] - e.lower[j]
                 x = -u1[j] - u1[j] / a * dz[j]
@@ -205,17 +199,15 @@ cdef inline double ipm_affine(const elements_t* e, const double* z, const double
                 t01 += a * x - u2[j] * dz[j]
                 t11 -= x * dz[j]
             continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            n = cone_size(e, i, which)
-            v = kept(e, i, which) + KEPT_V
+        for g in range(e.part[i], e.part[i + 1]):
+            n = cone_size(e, g)
+            v = kept(e, g) + KEPT_V
             if n == 3:
-                cone_affine(e, i, which, dz, 3, y, back)
+                cone_affine(e, i, g, dz, 3, y, back)
                 a = cone_step(v, y, 3)
                 b = cone_step(v, back, 3)
             else:
-                cone_affine(e, i, which, dz, n, y, back)
+                cone_affine(e, i, g, dz, n, y, back)
                 a = cone_step(v, y, n)
                 b = cone_step(v, back, n)
             best = a if a < best else best
@@ -231,7 +223,7 @@ cdef inline double ipm_affine(const elements_t* e, const double* z, const double
 cdef inline void ipm_rhs(const elements_t* e, const double* z, const double* u1, const double* u2, const double* hz,
                              const double* da, double sigma_mu, double* rhs) noexcept nogil:
     """Right-hand side of (4)."""
-    cdef int32_t i, j, k, which, n
+    cdef int32_t i, j, k, g, n
     cdef double a, x
     cdef double u[4]
     cdef double t[4]
@@ -239,7 +231,7 @@ cdef inline void ipm_rhs(const elements_t* e, const double* z, const double* u1,
         for j in range(e.ptr[i], e.ptr[i + 1]):
             rhs[j] = -(hz[j] - e.g[j])
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             # -(H z - g - u1 + u2) - c1/s1 + c2/s2, c = s u + ds du - sigma mu: the u cancel
             if is_low(e, j):
                 a = z[j] - e.lower[j]
@@ -250,30 +242,28 @@ cdef inline void ipm_rhs(const elements_t* e, const double* z, const double* u1,
                 x = -u2[j] + u2[j] / a * da[j]
                 rhs[j] += (-da[j] * x - sigma_mu) / a
             continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            n = cone_size(e, i, which)
-            load_dual(e, i, which, u1, u2, u)
+        for g in range(e.part[i], e.part[i + 1]):
+            n = cone_size(e, g)
+            load_dual(e, i, g, u1, u2, u)
             if n == 3:
-                cone_combined(e, i, which, da, sigma_mu, 3, t)
+                cone_combined(e, i, g, da, sigma_mu, 3, t)
             else:
-                cone_combined(e, i, which, da, sigma_mu, n, t)
+                cone_combined(e, i, g, da, sigma_mu, n, t)
             for k in range(n):
                 t[k] = u[k] - t[k]
-            scatter(e, i, which, t, rhs)
+            scatter(e, i, g, t, rhs)
 
 
 cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double* u2, const double* dz,
                                   const double* da, double sigma_mu, double damping, double* du1, double* du2) noexcept nogil:
     """Takes the combined step of the last `ipm_rhs` in place; returns its length. du1, du2 (m) are scratch."""
-    cdef int32_t i, j, k, which, n
+    cdef int32_t i, j, k, g, n
     cdef double best = 1.0 / damping, a, x
     cdef double du[4]
     cdef double u[4]
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             if is_low(e, j):
                 a = z[j] - e.lower[j]
                 x = -u1[j] - u1[j] / a * da[j]
@@ -289,32 +279,28 @@ cdef inline double ipm_update(const elements_t* e, double* z, double* u1, double
                 best = row_limit(u2[j], x, best)
                 du2[j] = x
             continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            n = cone_size(e, i, which)
+        for g in range(e.part[i], e.part[i + 1]):
+            n = cone_size(e, g)
             if n == 3:
-                best = cone_length(e, i, which, dz, best, 3, du)
+                best = cone_length(e, i, g, dz, best, 3, du)
             else:
-                best = cone_length(e, i, which, dz, best, n, du)
-            store_dual(e, i, which, du, du1, du2)
+                best = cone_length(e, i, g, dz, best, n, du)
+            store_dual(e, i, g, du, du1, du2)
     best = best * damping
     for j in range(e.m):
         z[j] += best * dz[j]
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             if is_low(e, j):
                 u1[j] += best * du1[j]
             if is_high(e, j):
                 u2[j] += best * du2[j]
             continue
-        for which in range(PARTS):
-            if not has_cone(e, i, which):
-                continue
-            load_dual(e, i, which, u1, u2, du)
-            load_dual(e, i, which, du1, du2, u)
-            for k in range(cone_size(e, i, which)):
+        for g in range(e.part[i], e.part[i + 1]):
+            load_dual(e, i, g, u1, u2, du)
+            load_dual(e, i, g, du1, du2, u)
+            for k in range(cone_size(e, g)):
                 du[k] += best * u[k]
-            store_dual(e, i, which, du, u1, u2)
+            store_dual(e, i, g, du, u1, u2)
     return best

@@ -11,22 +11,22 @@ LU.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport CONE, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROW
+from lavender_ext.core.block cimport length
 from lavender_ext.core.contact_map cimport contact_map
-from lavender_ext.newton.elements cimport elements_t, invert_small
+from lavender_ext.core.parts cimport CONE, parts_t
+from lavender_ext.newton.elements cimport element_parts, elements_t, invert_small, is_row
 
 
 cdef inline void natural_contact(const elements_t* e, int32_t i, int32_t law, const double* z, const double* s, double* f,
                                  double* p) noexcept nogil:
     """F (nr) and P (nr, nr) of one contact, Pi in the metric of d."""
-    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], k, rolls = e.kind[i] == CONTACT_ROLLING
-    cdef int32_t spin = nr == 6 if rolls else e.kind[i] == SPIN
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], k
     cdef double y[6]
-    cdef double a[3]
-    a[0], a[1], a[2] = e.at[i], e.as_[i], e.ar[i] if rolls else 0.0
+    cdef parts_t q
+    element_parts(e, i, &q)
     for k in range(nr):
         y[k] = z[k] - s[k]
-    contact_map(law, nr - 1 - spin - 2 * rolls, spin, rolls, a, y, f, p)
+    contact_map(law, &q, y, f, p)
     for k in range(nr):
         f[k] = s[k] if f[k] == y[k] else z[k] - f[k]
 
@@ -45,7 +45,7 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             y = z[j] - s[j]
             piece = 1
             if y < e.lower[j]:
@@ -89,15 +89,15 @@ cdef inline double natural(const elements_t* e, const double* z, const double* s
 
 cdef inline void convex_error(const elements_t* e, const double* z, const double* hz, const double* speed,
                                   double* energy, double* velocity) noexcept nogil:
-    """|F| of the convex natural map, and the largest speed |f|, by norm where a contact has two tangents."""
-    cdef int32_t i, j, k, nr
+    """|F| of the convex natural map, and the largest speed |f|, of a part by its norm."""
+    cdef int32_t i, j, k, g, nr
     cdef double total = 0.0, worst = 0.0, x
     cdef double s[6]
     cdef double f[6]
     cdef double p[36]
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             x = hz[j] - e.g[j]
             if z[j] - x < e.lower[j]:
                 x = z[j] - e.lower[j]
@@ -113,11 +113,10 @@ cdef inline void convex_error(const elements_t* e, const double* z, const double
         natural_contact(e, i, CONE, z + j, s, f, p)
         for k in range(nr):
             total += f[k] * f[k]
-            x = fabs(f[k]) * speed[j + k]
-            if k == 1 and nr - (e.kind[i] == SPIN) == 3:
-                x = sqrt(f[1] * f[1] + f[2] * f[2]) * speed[j + 1]
-            if e.kind[i] == CONTACT_ROLLING and (k == 1 or k == nr - 2):
-                x = sqrt(f[k] * f[k] + f[k + 1] * f[k + 1]) * speed[j + k]
+        x = fabs(f[0]) * speed[j]
+        worst = x if x > worst else worst
+        for g in range(e.part[i], e.part[i + 1]):
+            x = length(f + e.first[g] - j, e.size[g]) * speed[e.first[g]]
             worst = x if x > worst else worst
     energy[0] = sqrt(total)
     velocity[0] = worst

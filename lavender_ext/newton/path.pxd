@@ -29,9 +29,9 @@ from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport COULOMB, ROW
-from lavender_ext.newton.cones cimport PARTS, cone_at, cone_size, is_high, is_low, ratio
-from lavender_ext.newton.elements cimport elements_t, invert_small
+from lavender_ext.core.parts cimport COULOMB
+from lavender_ext.newton.cones cimport is_high, is_low
+from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
 from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
 from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, solve_natural, system_factor, system_sign, system_times)
@@ -39,10 +39,12 @@ from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, solve_natural, 
 
 cdef inline double exponential(double x) noexcept nogil:
     """e^x to 1e-15 by a sum, with the same bits on every machine: those of the C library differ."""
-    cdef double k = floor(x * 1.4426950408889634 + 0.5), r, term = 1.0, total = 1.0
+    cdef double k, r, term = 1.0, total = 1.0
     cdef int i, _i, n
-    if not -700.0 < x < 700.0:
-        return 0.0 if x < 0.0 else 1e304
+    if x < -700.0:
+        return 0.0
+    x = x if x < 700.0 else 700.0
+    k = floor(x * 1.4426950408889634 + 0.5)
     n = <int>k
     r = x - k * 0.6931471803691238 - k * 1.9082149292705877e-10  # ln 2 in two parts
     for i in range(1, 16):
@@ -151,19 +153,17 @@ cdef inline double smooth_row(const elements_t* e, int32_t j, double z, double s
 cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z, const double* s, double tau, double wide,
                                 double* f, double* p, double* rest, double* ft) noexcept nogil:
     """(1) of one contact, P (nr, nr), I - P without cancellation, and dF / d log tau."""
-    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, which
+    cdef int32_t nr = e.ptr[i + 1] - e.ptr[i], first, n, k, l, g
     cdef double y = z[0] - s[0], normal = plus(y, tau), dn = slope(y, tau), a, r, q, d, root, more, m, fr, across, along, x, own
     memset(p, 0, nr * nr * sizeof(double))
     memset(rest, 0, nr * nr * sizeof(double))
     f[0] = s[0] - plus(-y, tau) if y > 0.0 else z[0] - normal
     p[0], rest[0], ft[0] = dn, slope(-y, tau), -rise(y, tau)
-    for which in range(PARTS):
-        n = cone_size(e, i, which) - 1
-        if n < 1:
-            continue
-        first = cone_at(e, i, which) - e.ptr[i]
-        a = ratio(e, i, which)
-        r, q = a * normal, 1e-300
+    for g in range(e.part[i], e.part[i + 1]):
+        n = e.size[g]
+        first = e.first[g] - e.ptr[i]
+        a = e.reach[g]
+        r, q = a * normal, 0.0
         for k in range(first, first + n):
             q += (z[k] - s[k]) * (z[k] - s[k])
         q = sqrt(q)
@@ -181,7 +181,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
             rest[k * nr] = -p[k * nr]
             ft[k] = -x * (fr * a * rise(y, tau) - r * rise(d, wide) / (m * m))
             for l in range(first, first + n):
-                own = x * (z[l] - s[l]) / (q * q)
+                own = x * (z[l] - s[l]) / (q * q) if q > 0.0 else 0.0
                 rest[k * nr + l] = (across if k == l else 0.0) + (along - across) * own
                 p[k * nr + l] = (1.0 if k == l else 0.0) - rest[k * nr + l]
 
@@ -203,7 +203,7 @@ cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) 
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             n.f[j] = smooth_row(e, j, z[j], n.rest[j], tau, p, rest, ft)
         else:
             smooth_contact(e, i, z + j, n.rest + j, tau, n.path.wide * tau, n.f + j, p, rest, ft)
@@ -241,7 +241,7 @@ cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, d
     if which == LOG_TAU:
         return dl
     j = e.ptr[i]
-    if e.kind[i] == ROW:
+    if is_row(e, i):
         x = n.t1[j] - e.lower[j] if part == 0 else e.upper[j] - n.t1[j]
         dx = dy[j] if part == 0 else -dy[j]
     elif part == 0:
@@ -249,18 +249,17 @@ cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, d
     else:
         y = n.t1[j]
         normal, root = plus(y, tau), sqrt(y * y + 4.0 * tau * tau)
-        size = cone_size(e, i, part - 1) - 1
-        first = cone_at(e, i, part - 1)
-        a = ratio(e, i, part - 1)
+        part += e.part[i] - 1
+        size, first, a = e.size[part], e.first[part], e.reach[part]
         wide = n.path.wide * tau
-        r, q = a * normal, 1e-300
+        r, q = a * normal, 0.0
         along = square = 0.0
         for k in range(first, first + size):
             q += n.t1[k] * n.t1[k]
             along += n.t1[k] * dy[k]
             square += dy[k] * dy[k]
         q = sqrt(q)
-        along /= q
+        along = along / q if q > 0.0 else 0.0
         x = r - q
         dx = a * (normal * dy[j] + 2.0 * tau * tau * dl) / root - along
         square -= along * along
@@ -278,10 +277,10 @@ cdef inline double fastest(const newton_t* n, const double* dy, double dl, doubl
     turned[0] = 0.0
     for i in range(e.n):
         for part in range(OF_ONE):
-            if e.kind[i] == ROW:
+            if is_row(e, i):
                 if not (part == 0 and is_low(e, e.ptr[i]) or part == 1 and is_high(e, e.ptr[i])):
                     continue
-            elif part > 0 and cone_size(e, i, part - 1) < 2:
+            elif part > e.part[i + 1] - e.part[i]:
                 continue
             x = fabs(rate_of(n, OF_ONE * i + FIRST + part, dy, dl, tau, &turn))
             turned[0] = turned[0] if turn <= turned[0] else turn

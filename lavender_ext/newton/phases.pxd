@@ -18,10 +18,10 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport CONE, ROW
+from lavender_ext.core.parts cimport CONE
 from lavender_ext.judge.score cimport relative
-from lavender_ext.newton.cones cimport PARTS, cone_gap, cone_size, gather, has_cone, is_high, is_low
-from lavender_ext.newton.elements cimport elements_t
+from lavender_ext.newton.cones cimport cone_gap, cone_size, gather, is_high, is_low
+from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.natural_map cimport z_end
 from lavender_ext.newton.run cimport (APPROACH, EXCHANGES, INNER, INTERIOR, N_AUGMENTED, N_AUGMENTED_DE_SAXCE,
                                       N_AUGMENTED_INTERIOR, N_DE_SAXCE, N_EXCHANGES, N_INTERIOR, N_ROUNDS, POLISH,
@@ -178,15 +178,14 @@ cdef inline void go_exchange(newton_t* n) noexcept nogil:
 
 cdef inline bint ends(const elements_t* e, int32_t i, const double* y) noexcept nogil:
     """Whether y cannot go on for ever on element i."""
-    cdef int32_t which
+    cdef int32_t g
     cdef double x[4]
-    if e.kind[i] == ROW:
+    if is_row(e, i):
         return (y[e.ptr[i]] < 0.0 and is_low(e, e.ptr[i])) or (y[e.ptr[i]] > 0.0 and is_high(e, e.ptr[i]))
-    for which in range(PARTS):
-        if has_cone(e, i, which):
-            gather(e, i, which, y, x)
-            if cone_gap(x, cone_size(e, i, which)) < 0.0:
-                return True
+    for g in range(e.part[i], e.part[i + 1]):
+        gather(e, i, g, y, x)
+        if cone_gap(x, cone_size(e, g)) < 0.0:
+            return True
     return False
 
 
@@ -217,7 +216,7 @@ cdef inline void ask_interior(newton_t* n) noexcept nogil:
     for i in range(e.n):
         j = e.ptr[i]
         if (not fabs(n.ip.z[j]) > fabs(n.ip.u1[j]) or s.v[e.wptr[i]] * 0.0 != 0.0
-                or (e.kind[i] == ROW and is_low(e, j) and is_high(e, j))):
+                or (is_row(e, i) and is_low(e, j) and is_high(e, j))):
             rest_on(n, i)
     while resting and left and not spent(n):
         left -= 1

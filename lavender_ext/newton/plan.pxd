@@ -12,10 +12,11 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport CONE, COULOMB, ROW
+from lavender_ext.core.parts cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
+from lavender_ext.newton.elements cimport is_row
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
@@ -263,7 +264,7 @@ cdef inline void go_relaxed(newton_t* n) noexcept nogil:
 cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
     cdef int32_t i
     for i in range(n.s.e.n):
-        if n.s.e.kind[i] == ROW and not is_low(n.s.e, n.s.e.ptr[i]) and not is_high(n.s.e, n.s.e.ptr[i]):
+        if is_row(n.s.e, i) and not is_low(n.s.e, n.s.e.ptr[i]) and not is_high(n.s.e, n.s.e.ptr[i]):
             return True
     return False
 

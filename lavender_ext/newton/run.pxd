@@ -6,9 +6,9 @@ at a time, so that whoever asked can look at a clock in between.
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t

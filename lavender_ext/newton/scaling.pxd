@@ -2,21 +2,20 @@
 
     z = D^1/2 lambda,   H = D^-1/2 A D^-1/2,   g = D^-1/2 (b - A fixed)
 
-An element is a bounded row, or a contact with the tangents, the spin and the rolling that move. Rows of equal bounds,
-tangents without friction and empty rows of A stay where they are. Whole numbers come first (`find_elements`), since the
+An element is a bounded row, or a contact with the parts that move. Rows of equal bounds,
+parts without friction and empty rows of A stay where they are. Whole numbers come first (`find_elements`), since the
 room of a factor over bodies depends on them, then the numbers (`scale_elements`).
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport (CONTACT, CONTACT_ROLLING, CONTACT_SPIN as SPIN, ROUND, ROW, blocks_t, n_apart,
-                                      n_tangents)
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.parts cimport blocks_t, is_round, is_rows, parts_of, parts_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.newton.cones cimport KEPT, PARTS
+from lavender_ext.newton.cones cimport KEPT
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -35,34 +34,31 @@ cdef inline bint is_known(const blocks_t* p) noexcept nogil:
     """No round cones of more than two tangents."""
     cdef int32_t i
     for i in range(p.n_blocks):
-        if p.kind[i] == ROUND:
+        if is_round(p, i):
             return False
     return True
 
 
 cdef inline bint is_row(const blocks_t* p, int32_t i) noexcept nogil:
-    return p.kind[i] == ROW or p.ptr[i + 1] - p.ptr[i] == 1
+    return is_rows(p, i) or p.ptr[i + 1] - p.ptr[i] == 1
 
 
 cdef inline double low_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
-    return p.lower[j] if p.kind[i] == ROW else 0.0
+    return p.lower[j] if is_rows(p, i) else 0.0
 
 
 cdef inline double high_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
-    return p.upper[j] if p.kind[i] == ROW else 1.0 / 0.0
-
-
-cdef inline int32_t apart_of(const blocks_t* p, int32_t i) noexcept nogil:
-    """The row of contact i whose bound is mu r lam_n, -1 where there is none."""
-    cdef int32_t size = p.ptr[i + 1] - p.ptr[i]
-    return p.ptr[i] + 1 + n_tangents(p.kind[i], size) if n_apart(p.kind[i], size) & 1 else -1
+    return p.upper[j] if is_rows(p, i) else 1.0 / 0.0
 
 
 cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept nogil:
     """Largest impulse of row j of contact i, behind its normal, over lam_n."""
-    if p.kind[i] == CONTACT_ROLLING and j >= p.ptr[i + 1] - 2:
-        return p.rolling[i]
-    return p.mu[i] * p.patch_radius[i] if j == apart_of(p, i) else p.mu[i]
+    cdef parts_t q
+    cdef int32_t g = 0
+    parts_of(p, i, &q)
+    while g + 1 < q.n and j - p.ptr[i] >= q.first[g + 1]:
+        g += 1
+    return q.reach[g]
 
 
 cdef inline bint is_empty(const blocks_t* p, const csr_t* a, const rows_t* r, int32_t i, int32_t j) noexcept nogil:
@@ -106,11 +102,11 @@ cdef inline bint stays(const blocks_t* p, const csr_t* a, const rows_t* r, int32
 
 
 cdef inline int64_t scaled_index(int64_t m) noexcept nogil:
-    return 5 * m + 2
+    return 7 * m + 3
 
 
 cdef inline int64_t scaled_real(int64_t m) noexcept nogil:
-    return (10 + PARTS * KEPT) * m
+    return (8 + KEPT) * m
 
 
 cdef inline void lay_elements(scaled_t* s, int64_t m, int32_t* index) noexcept nogil:
@@ -118,8 +114,10 @@ cdef inline void lay_elements(scaled_t* s, int64_t m, int32_t* index) noexcept n
     s.keep = index
     s.block = index + m
     s.e.ptr = index + 2 * m
-    s.e.kind = index + 3 * m + 1
-    s.e.wptr = index + 4 * m + 1
+    s.e.wptr = index + 3 * m + 1
+    s.e.part = index + 4 * m + 2
+    s.e.first = index + 5 * m + 3
+    s.e.size = index + 6 * m + 3
     s.e.node = s.e.slot = s.e.group = NULL              # of bodies
     s.e.n_groups = 0
     s.e.panel = NULL
@@ -130,38 +128,43 @@ cdef inline void lay_numbers(scaled_t* s, int64_t m, double* real) noexcept nogi
     """Places in real (`scaled_real`)."""
     s.fixed, s.scale, s.speed = real, real + m, real + 2 * m
     s.e.theta, s.e.g, s.e.lower, s.e.upper = real + 3 * m, real + 4 * m, real + 5 * m, real + 6 * m
-    s.e.at, s.e.as_, s.e.ar = real + 7 * m, real + 8 * m, real + 9 * m
-    s.e.scaling = real + 10 * m
+    s.e.reach = real + 7 * m
+    s.e.scaling = real + 8 * m
 
 
 cdef inline void find_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r) noexcept nogil:
     """Which rows move, and how they stand together, of A or of bodies; in the places of `lay_elements`."""
-    cdef int32_t i, j, q, n = 0, m = 0, first, last
+    cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal
     cdef int32_t* ptr = <int32_t*>s.e.ptr
-    cdef int32_t* kind = <int32_t*>s.e.kind
+    cdef int32_t* part = <int32_t*>s.e.part
+    cdef int32_t* first = <int32_t*>s.e.first
+    cdef int32_t* size = <int32_t*>s.e.size
     cdef int32_t* wptr = <int32_t*>s.e.wptr
     cdef double x
-    s.e.parts = 2
+    cdef parts_t own
+    part[0] = 0
     for i in range(p.n_blocks):
-        first = m
+        normal = m
         for j in range(p.ptr[i], p.ptr[i + 1]):
             if stays(p, a, r, i, j, &x):
                 continue
             s.keep[m] = j
             m += 1
-            if is_row(p, i) or m == first + 1:
+            if is_row(p, i) or m == normal + 1:
                 ptr[n] = m - 1
-                kind[n] = ROW
                 s.block[n] = i
                 n += 1
-        if m > first + 1 and not is_row(p, i):
-            last = s.keep[m - 1]
-            kind[n - 1] = CONTACT
-            if last == apart_of(p, i):
-                kind[n - 1] = SPIN
-            elif p.kind[i] == CONTACT_ROLLING and m - first >= 5:
-                kind[n - 1] = CONTACT_ROLLING           # without tangents that move what rolls takes their place
-                s.e.parts = PARTS
+                part[n] = parts
+        if is_row(p, i):
+            continue
+        parts_of(p, i, &own)
+        normal += 1
+        for g in range(own.n):
+            if own.reach[g] > 0.0:
+                first[parts], size[parts] = normal, own.size[g]
+                normal += own.size[g]
+                parts += 1
+        part[n] = parts
     ptr[n] = m
     wptr[0] = 0
     for i in range(n):
@@ -194,12 +197,9 @@ cdef inline bint hold(scaled_t* s, const blocks_t* p, const csr_t* a, const rows
 cdef inline void scale_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, double* w,
                                 double* v) noexcept nogil:
     """Their numbers, in the places of `lay_numbers`; w (rows) and, over bodies, v (6 n) are scratch."""
-    cdef int32_t i, j, q, h, size
+    cdef int32_t i, j, q, h, g
     cdef double x
     cdef bint pushed = hold(s, p, a, r)
-    cdef double* at = <double*>s.e.at
-    cdef double* spin = <double*>s.e.as_
-    cdef double* roll = <double*>s.e.ar
     if pushed and a == NULL:
         rows_velocity(p, r, s.fixed, v)
         rows_slack(p, r, s.fixed, v, w)
@@ -219,15 +219,8 @@ cdef inline void scale_elements(scaled_t* s, const blocks_t* p, const csr_t* a, 
                     x += a.data[h] * s.fixed[a.indices[h]]
             (<double*>s.e.g)[q] = (p.b[j] - x) * s.scale[q]
     for i in range(s.e.n):
-        at[i] = spin[i] = roll[i] = 0.0
-        q = s.e.ptr[i]
-        size = s.e.ptr[i + 1] - q
-        if s.e.kind[i] != ROW:
-            at[i] = opening(s, p, i, q + 1)
-        if s.e.kind[i] == SPIN or (s.e.kind[i] == CONTACT_ROLLING and size == 6):
-            spin[i] = opening(s, p, i, q + size - 1 if s.e.kind[i] == SPIN else q + 3)
-        if s.e.kind[i] == CONTACT_ROLLING:
-            roll[i] = opening(s, p, i, q + size - 2)
+        for g in range(s.e.part[i], s.e.part[i + 1]):
+            (<double*>s.e.reach)[g] = opening(s, p, i, s.e.first[g])
 
 
 cdef inline bint dense_matrix(const scaled_t* s, const csr_t* a, int32_t rows, int32_t* place, double* h) noexcept nogil:

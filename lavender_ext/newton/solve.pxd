@@ -23,6 +23,6 @@ cdef class Solve:
     cdef Data data
     cdef list held
     cdef object others, raised, real, index
-    cdef readonly object keep, block, ptr, kind, wptr, fixed, scale, theta, g, lower, upper, a_t, a_s
+    cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach
     cdef readonly object v, einv, p, pair, bt           # small matrices of every element
     cdef readonly int m

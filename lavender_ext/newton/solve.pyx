@@ -7,8 +7,8 @@ import numpy as np
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.block cimport COULOMB
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.factor.blocks cimport sparse_t
@@ -133,8 +133,8 @@ cdef class Solve:
     """A problem as Newton's method has it, and what factors it by one of `over_...`; `start`, then `step` after `step`.
 
     Fixed rows (equal bounds, mu = 0 tangents, empty rows) are taken out: keep (m,) are the rows that move, block (n,) that
-    of each element, fixed (rows,) the impulse of the others; scale (m,) is D^-1/2; ptr, kind, wptr, lower, upper, theta, g,
-    a_t and a_s are those of `elements_t`, v, einv, p, pair and bt its small matrices.
+    of each element, fixed (rows,) the impulse of the others; scale (m,) is D^-1/2; ptr, part, wptr, lower, upper, theta, g,
+    reach are those of `elements_t`, v, einv, p, pair and bt its small matrices.
 
     Parameters
     ----------
@@ -173,11 +173,11 @@ cdef class Solve:
         k = n.sc.e.n
         self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)
         self.ptr = part(self.index, n.sc.e.ptr, k + 1)
-        self.kind, self.wptr = part(self.index, n.sc.e.kind, k), part(self.index, n.sc.e.wptr, k + 1)
+        self.wptr, self.part = part(self.index, n.sc.e.wptr, k + 1), part(self.index, n.sc.e.part, k + 1)
         self.fixed, self.scale = part(self.real, n.sc.fixed, rows), part(self.real, n.sc.scale, m)
         self.theta, self.g = part(self.real, n.sc.e.theta, m), part(self.real, n.sc.e.g, m)
         self.lower, self.upper = part(self.real, n.sc.e.lower, m), part(self.real, n.sc.e.upper, m)
-        self.a_t, self.a_s = part(self.real, n.sc.e.at, k), part(self.real, n.sc.e.as_, k)
+        self.reach = part(self.real, n.sc.e.reach, int(self.part[k]))
         self.v, self.einv = part(self.real, n.s.v, n.sc.small), part(self.real, n.s.einv, n.sc.small)
         self.p, self.pair = part(self.real, n.s.p, n.sc.small), part(self.real, n.s.pair, n.sc.small)
         self.bt = part(self.real, n.s.bt, n.sc.small) if n.s.bt != NULL else None
@@ -246,7 +246,7 @@ cdef class Solve:
         cdef const int64_t[::1] spot
         cdef const sparse_t* super_ = NULL
         cdef const int64_t* places = NULL
-        own = np.zeros(a.n * (s + 1) + len(self.kind) + 2, np.int32)
+        own = np.zeros(a.n * (s + 1) + len(self.ptr) + 1, np.int32)
         a.pivot = <int32_t*>address(own)                # what a factor writes belongs to this one alone
         a.next = a.pivot + a.n * s
         a.group = a.next + a.n + 1

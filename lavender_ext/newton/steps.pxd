@@ -1,12 +1,12 @@
 """Interior points of the convex law (Mehrotra 1992) and of Coulomb's, by De Saxce's change of variable, over any system.
 
-    s = H z - g,   u = s + phi(s_t) e_n,   phi = a_t |s_t| + a_s |s_s| + a_r |s_r|    (De Saxce, Feng 1998)   (1)
+    s = H z - g,   u = s + phi(s_t) e_n,   phi = sum over parts of a_p |s_p|          (De Saxce, Feng 1998)   (1)
     z in K,  u in K*,  z . u = 0     on every contact                                                   (2)
 
 With phi frozen, (1) and (2) are the convex problem of the "cone" law with its normals lowered by phi, and
 phi <- phi(s_t) is Cadoux's fixed point (Cadoux 2009; Acary, Cadoux, Lemarechal, Malick 2011): dozens of
 convex problems. Here phi moves with every step of one interior point, and so does its derivative: with
-psi = phi'(s_t) on tangents, spin and rolling, 0 on the normal, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
+psi = phi'(s_t) behind the normal, 0 on it, C = I - e_n psi^T and B = C^-1 = I + e_n psi^T,
 
     du = -q - W dz,    C du = H dz - r_d,    r_d = u - s - phi e_n,                                      (3)
     (H + C W) dz = r_d - C q = r_d - q + (psi . q) e_n,                                                  (4)
@@ -26,9 +26,8 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
-from lavender_ext.core.block cimport ROW
-from lavender_ext.newton.cones cimport PARTS, cone_at, cone_size, has_cone, load_dual, ratio, scatter
-from lavender_ext.newton.elements cimport elements_t
+from lavender_ext.newton.cones cimport load_dual, scatter
+from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_update
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.run cimport newton_t, interior_t, take
@@ -63,32 +62,29 @@ cdef inline void begin_interior(newton_t* n, double delta, double share) noexcep
 
 cdef inline void duals(const elements_t* e, const interior_t* p, double* u) noexcept nogil:
     """G^T u on every row."""
-    cdef int32_t i, j, which
+    cdef int32_t i, j, g
     cdef double x[4]
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             u[j] = p.u1[j] - p.u2[j]
             continue
         memset(u + j, 0, (e.ptr[i + 1] - j) * sizeof(double))
-        for which in range(PARTS):
-            if has_cone(e, i, which):
-                load_dual(e, i, which, p.u1, p.u2, x)
-                scatter(e, i, which, x, u)
+        for g in range(e.part[i], e.part[i + 1]):
+            load_dual(e, i, g, p.u1, p.u2, x)
+            scatter(e, i, g, x, u)
 
 
 cdef inline double slip(const elements_t* e, int32_t i, const double* s, double share, double* psi) noexcept nogil:
     """phi of one contact's s; share of its derivative into psi."""
-    cdef int32_t k, which, first, n
+    cdef int32_t k, g, first, n
     cdef double t, a, phi = 0.0
     psi[0] = 0.0
-    for which in range(PARTS):
-        n = cone_size(e, i, which) - 1
-        if n < 1:
-            continue
-        first = cone_at(e, i, which) - e.ptr[i]
-        a = ratio(e, i, which)
-        if which == 1:                                  # spin, one row
+    for g in range(e.part[i], e.part[i + 1]):
+        n = e.size[g]
+        first = e.first[g] - e.ptr[i]
+        a = e.reach[g]
+        if n == 1:
             phi += a * fabs(s[first])
             psi[first] = share * a * (1.0 if s[first] > 0.0 else -1.0 if s[first] < 0.0 else 0.0)
             continue
@@ -108,7 +104,7 @@ cdef inline void slips(const elements_t* e, const double* u, double share, doubl
     memset(phi, 0, e.m * sizeof(double))
     for i in range(e.n):
         j = e.ptr[i]
-        if e.kind[i] == ROW:
+        if is_row(e, i):
             psi[j] = 0.0
         else:
             phi[j] = slip(e, i, u + j, share, psi + j)

@@ -12,15 +12,15 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
-from lavender_ext.core.block cimport CONE, ROW
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport dot
+from lavender_ext.core.parts cimport CONE
 from lavender_ext.factor.blocks cimport factor_t
 from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
 from lavender_ext.factor.dense cimport PANEL, cholesky_room, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t
+from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t, is_row
 from lavender_ext.newton.natural_map cimport natural
 from lavender_ext.newton.normal_matrix cimport normal_matrix
 from lavender_ext.newton.panel cimport to_bodies, to_rows
@@ -398,7 +398,7 @@ cdef inline void first_weights(system_t* s, double weight, double free_weight) n
             s.v[q + k] = 0.0
             if s.bt != NULL:
                 s.bt[q + k] = 0.0
-        x = free_weight if e.kind[i] == ROW and not is_low(e, j) and not is_high(e, j) else weight
+        x = free_weight if is_row(e, i) and not is_low(e, j) and not is_high(e, j) else weight
         for k in range(nr):
             s.v[q + k * nr + k] = 1.0 / (e.theta[j + k] + x)
             if s.bt != NULL:

@@ -18,8 +18,9 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t, clip
+from lavender_ext.core.block cimport clip
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 from lavender_ext.judge.measure cimport judge_view, judged_from, relative_of, scratch_of

@@ -29,8 +29,8 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.order cimport next_random
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.judge.score cimport is_at_floor
 from lavender_ext.pivot.direct cimport (HALVED, Pivoting, direct_begin, direct_begin_passes, direct_pass, direct_rounds, direct_t,
                                         judge_now)

@@ -20,8 +20,8 @@ from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t

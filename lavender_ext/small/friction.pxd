@@ -8,8 +8,8 @@ from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
-from lavender_ext.core.block cimport CONE, blocks_t
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, ROOM, options_t, lav_room, lav_start, lav_step, room_t, said_t
 from lavender_ext.small.room cimport has_room

@@ -12,15 +12,16 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, has_friction
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
-                                       ROW as AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
+                                       AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
 from lavender_ext.generalized.flow cimport flow_t
 from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
 from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
@@ -89,7 +90,7 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     """E0, V0 and the relative residual of doing nothing; w (3 m + n) is scratch."""
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     cdef ssize_t m = j.p.n_rows
-    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, False, j.begin)
+    judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, j.begin)
 
 
 cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
@@ -102,7 +103,7 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
     cdef int32_t i, k
     for i in range(p.n_blocks):
         for k in range(p.ptr[i], p.ptr[i + 1]):
-            if p.kind[i] != ROW or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
+            if not is_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
                 return False
     return True
 
@@ -168,7 +169,7 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
             for q in range(j.g.jptr[k], j.g.jptr[k + 1]):
                 if j.g.jval[q] != 0.0:
                     return False
-            if p.b[k] == 0.0 or (p.kind[i] != ROW and k > p.ptr[i]):
+            if p.b[k] == 0.0 or (not is_rows(p, i) and k > p.ptr[i]):
                 continue                                # asks nothing: tangents and spin have bounds of mu lambda_n
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
             if fabs(bound) < INFINITY:
@@ -195,7 +196,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     cdef need_t need
     cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
-    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE:
+    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE or first_outside(j.p.d, m) >= 0:
         return
     if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
         return
@@ -347,7 +348,7 @@ cdef class Worlds:
     data : list of Data or None
         Of problems that are objects; None of one that is left to the caller. Starts come with it: (m,) [N s] or None.
     at : (n, PLACES) int64
-        Of arrays, as in `world.pxd`; of objects its columns ROWS and ROW alone.
+        Of arrays, as in `world.pxd`; of objects its columns ROWS and AT_ROW alone.
     arrays : sequence of 6
         J, M, v*, target, compliance, mu (or None), flat float64 or float32.
     strides : (int, int)
@@ -513,7 +514,7 @@ cdef class Worlds:
             return self.empty(i, desk)
         known = j.made.marks != NULL
         code = LEFT
-        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 \
+        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 and first_outside(j.p.d, m) < 0 \
                 and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
             code, x = READY, room.real
             if j.cold:

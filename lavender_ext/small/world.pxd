@@ -3,15 +3,15 @@
 The same numbers as `Generalized` makes of the same arrays: J and the lower triangle of M in compressed rows without
 zeros, M = L^T D L in the order given, b = target - J v*. What `Generalized` would put into another order is left to it.
 """
-from libc.math cimport INFINITY, fabs, sqrt
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
-from lavender_ext.core.block cimport blocks_t
+from lavender_ext.core.door cimport first_outside, first_unsized, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row, tree_factor, tree_pattern
+from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.judge.rounding cimport mass_t
-from lavender_ext.judge.score cimport are_numbers
 from lavender_ext.small.room cimport has_room
 
 
@@ -34,7 +34,7 @@ cdef enum:                      # columns of `at`: how many it has, and where th
     MU = 8                      # and of mu, where it has its own
     BLOCK = 9                   # in the blocks of all worlds,
     CONE_ROW = 10               # in their rows,
-    ROW = 11                    # in the impulses
+    AT_ROW = 11                 # in the impulses
     VELOCITY = 12               # and in the velocities that are the results
     PLACES = 13
 
@@ -199,7 +199,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     g.n, g.m, g.jptr, g.jidx, g.jval = n, m, ptr, idx, x
     a = widened(w, 0, at[JAC], m, n, &row, x + numbers)
     entries = rows_of(a, row, m, n, ptr, idx, x)
-    if not are_numbers(x, entries):
+    if first_outside(x, entries) >= 0:
         return BAD
     ptr, x = idx + whole, x + whole
     idx = ptr + n + 1
@@ -211,7 +211,7 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
         row = w.mass_row
         a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
         entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
-    if entries < 0 or not are_numbers(x, entries):
+    if entries < 0 or first_outside(x, entries) >= 0:
         return BAD
     d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
     if not tree_of(d, n, ptr, idx, g):
@@ -230,15 +230,15 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     widen(w, 3, at[TARGET], m, b)
     widen(w, 4, at[SOFT], m, <double*>g.compliance)
     for j in range(m):
-        if not 0.0 <= g.compliance[j] < INFINITY:
-            return BAD
         b[j] -= jac_row(g, j, d.free)
-    if not are_numbers(d.free, n) or not are_numbers(b, m):
+    if first_unsized(g.compliance, m) >= 0 or first_outside(d.free, n) >= 0 or first_outside(b, m) >= 0:
+        return BAD
+    if 0.0 < largest(b, m) < least():
         return BAD
     lay_blocks(w, at, p, idx + half, x + n + 2 * m)
     p.b = b
     for j in range(k):
-        if not 0.0 <= p.mu[j] < INFINITY:
+        if not is_size(p.mu[j]) or (not is_rows(p, j) and not is_size(p.mu[j] * p.patch_radius[j])):
             return BAD
     return READY
 

@@ -1,8 +1,8 @@
 """Two blocks of one kind at once, one in each lane: the update of core/rows.pxd, operation by operation.
 
-A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; spin;
-rolling), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a block of another
-kind, or of more rows, has the kind ALONE and is updated by it.
+A kind is what a compiler or a branch must know: a contact's rows (a normal; with two tangents in a disk or a box; one that
+spins; two that roll), or a joint's number of rows and which of its bodies move. The scalar update stays the truth; a
+block of another kind, or of more rows, has the kind ALONE and is updated by it.
 
 A record holds what an update reads, in pairs, one entry for each lane:
 
@@ -10,14 +10,15 @@ A record holds what an update reads, in pairs, one entry for each lane:
     impulses    n
     contact     normal 3, arms 3 and 3, inverse masses 2; of each row compliance, b, step, swing 6;
                 with tangents t1 3, t2 3, mu, A_t1n, A_t2n; with spin mu r, A_sn, A_st1, A_st2; of a box mu_2, A_t2t1;
-                with rolling mu_r
+                with two that roll mu_r
     joint       of each row compliance, b, step, lower, upper, J 12, M^-1 J^T 12
 
 Where a block has no partner both lanes hold it, and what the second computes is written where nobody reads.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, blocks_t, relax_tangents
+from lavender_ext.core.block cimport relax_tangents
+from lavender_ext.core.parts cimport blocks_t, is_box, n_directions, parts_of, parts_t
 from lavender_ext.core.rows cimport cross, relax_rows_block, rows_t
 from lavender_ext.sweep.pair cimport (LANES, all_within, any_beyond, at, both, clip_pair, gather, gather_six,
                                       not_below_zero, pair_t, scatter_six)
@@ -86,13 +87,9 @@ cdef inline int32_t kind_of(const blocks_t* p, const rows_t* r, int32_t i) noexc
         if n > MOST_ROWS:
             return ALONE
         return JOINT + 4 * (n - 1) + 2 * (r.joint_body[2 * i] >= 0) + (r.joint_body[2 * i + 1] >= 0)
-    if p.kind[i] == CONTACT_BOX:
+    if is_box(p, i):
         return SQUARE
-    if p.kind[i] == CONTACT and (n == NORMAL or n == DISK) or p.kind[i] == CONTACT_SPIN and n == SPIN:
-        return n
-    if p.kind[i] == CONTACT_ROLLING:
-        return n                                        # ROLL, or ROLL_SPIN
-    return ALONE
+    return n if n == NORMAL or n_directions(p, i) == 2 else ALONE
 
 
 cdef inline int32_t rows_of(int32_t kind) noexcept nogil:
@@ -125,6 +122,7 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     cdef int32_t c = i - r.n_joints, d = j - r.n_joints, e = p.ptr[i], f = p.ptr[j], first = p.ptr[r.n_joints], k
     cdef const int32_t* x = r.contact_body + 2 * c
     cdef const int32_t* y = r.contact_body + 2 * d
+    cdef parts_t part_i, part_j
     cdef double t2[6]
     cdef double m[2]
     put(out + C_NORMAL, 3, r.normal + 3 * c, r.normal + 3 * d)
@@ -147,14 +145,14 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
     cross(r.normal + 3 * c, r.tangent + 3 * c, t2)
     cross(r.normal + 3 * d, r.tangent + 3 * d, t2 + 3)
     put(out + 3, 3, t2, t2 + 3)
-    out[T_MU] = gather(p.mu + i, p.mu + j)
+    parts_of(p, i, &part_i)
+    parts_of(p, j, &part_j)
+    out[T_MU] = gather(part_i.reach, part_j.reach)
     put(out + T_COUPLING, 2, r.coupling + 5 * c, r.coupling + 5 * d)
     out += T_SIZE
-    if n == SPIN or n == ROLL_SPIN or p.kind[i] == CONTACT_BOX:
-        m[0] = p.mu[i] * p.patch_radius[i]
-        m[1] = p.mu[j] * p.patch_radius[j]
-        out[0] = gather(m, m + 1)
-        if p.kind[i] == CONTACT_BOX:
+    if n == SPIN or n == ROLL_SPIN or is_box(p, i):
+        out[0] = gather(part_i.reach + 1, part_j.reach + 1)
+        if is_box(p, i):
             m[0] = r.coupling[5 * c + 2] * p.step[e + 2]
             m[1] = r.coupling[5 * d + 2] * p.step[f + 2]
             out[1] = gather(m, m + 1)
@@ -162,7 +160,7 @@ cdef inline void pack_contact(const blocks_t* p, const rows_t* r, int32_t i, int
         put(out + 1, 3, r.coupling + 5 * c + 2, r.coupling + 5 * d + 2)
         out += S_SIZE
     if n >= ROLL:
-        out[0] = gather(p.rolling + i, p.rolling + j)
+        out[0] = gather(part_i.reach + part_i.n - 1, part_j.reach + part_j.n - 1)
 
 
 cdef inline void pack_joint(const blocks_t* p, const rows_t* r, int32_t i, int32_t j, int32_t n,
@@ -229,7 +227,7 @@ cdef inline void project_tangents(pair_t* x, pair_t radius) noexcept nogil:
 
 
 cdef inline void relax_contact_lanes(const contact_t* c, pair_t* lam, double* v, const int64_t* to) noexcept nogil:
-    """relax_contact of core/rows.pxd for no tangents or two, then relax_rolling; lam (1 + nt + spin + roll), to: where a and
+    """relax_contact of core/rows.pxd for no tangents or two, then relax_rolls; lam (1 + nt + spin + roll), to: where a and
     b are written."""
     cdef int32_t nt = 0 if contact_t is normal_t else 2, spin = 1 if contact_t is spin_t or contact_t is roll_spin_t else 0
     cdef int32_t roll = 2 if contact_t is roll_t or contact_t is roll_spin_t else 0

@@ -56,10 +56,8 @@ cdef extern from *:
                                lavender_select((lavender_pair_bits)(x > high), high, x));
     }
     static inline int lavender_all_within(lavender_pair s, lavender_pair bound) {
-        lavender_pair low = {1e-280, 1e-280}, high = {1e280, 1e280};
-        lavender_pair_bits m = (lavender_pair_bits)(s > low) & (lavender_pair_bits)(s < high)
-                               & ~(lavender_pair_bits)(s > bound);
-        return (m[0] & m[1]) < 0;
+        lavender_pair_bits m = (lavender_pair_bits)(s > bound);
+        return (m[0] | m[1]) == 0;
     }
     static inline int lavender_any_beyond(lavender_pair x, lavender_pair bound) {
         lavender_pair_bits m = (lavender_pair_bits)(x > bound) | (lavender_pair_bits)(x < -bound);
@@ -83,9 +81,7 @@ cdef extern from *:
     static inline lavender_pair lavender_clip(lavender_pair x, lavender_pair low, lavender_pair high) {
         return x < low ? low : x > high ? high : x;
     }
-    static inline int lavender_all_within(lavender_pair s, lavender_pair bound) {
-        return s > 1e-280 && s < 1e280 && !(s > bound);
-    }
+    static inline int lavender_all_within(lavender_pair s, lavender_pair bound) { return !(s > bound); }
     static inline int lavender_any_beyond(lavender_pair x, lavender_pair bound) { return x > bound || x < -bound; }
     #endif
     #endif
@@ -106,5 +102,5 @@ cdef extern from *:
     pair_t not_below_zero "lavender_not_below_zero"(pair_t y) noexcept nogil
     # whether |x| > bound in some lane
     int any_beyond "lavender_any_beyond"(pair_t x, pair_t bound) noexcept nogil
-    # 1 where both lanes of s are in (1e-280, 1e280) and not above those of bound
+    # whether no lane of s is above that of bound
     int all_within "lavender_all_within"(pair_t s, pair_t bound) noexcept nogil

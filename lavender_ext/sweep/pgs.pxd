@@ -2,42 +2,34 @@
 
     w_q   = sum_j A_qj lam_j - b_q                              of this moment                           (1)
     lam_q <- clip(lam_q - w_q / d_q, lower_q, upper_q)          a row; a normal has the bounds 0, inf    (2)
-    lam_t <- the part of lam_t - w_t / step that is within mu lam_n, tangents together; spin, rolling alike (3)
+    lam_g <- the part of lam_g - w_g / step that is within a_g lam_n, for each part g of a contact      (3)
 
 Over J and M the whitened velocities u = Y^T lam are kept: w = Y u + c lam - b, then u += Y^T (change).
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, relax_normal, relax_row,
-                                      relax_tangents)
+from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot, csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_dot, whitened_push
+from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.rows cimport rows_t
 
 
 cdef inline void relax_csr_block(const blocks_t* p, const csr_t* a, int32_t i, double* lam) noexcept nogil:
-    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], nt, q
+    cdef int32_t j = p.ptr[i], g, k, q
     cdef double w[2]
-    cdef double bound
-    if kind == ROW:
-        for q in range(j, end):
+    cdef parts_t part
+    if is_rows(p, i):
+        for q in range(j, p.ptr[i + 1]):
             lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], p.lower[q], p.upper[q])
         return
-    nt = n_tangents(kind, end - j)
     lam[j] = relax_normal(lam[j], csr_dot(a, j, lam) - p.b[j], p.step[j])
-    bound = p.mu[i] * lam[j]
-    if nt > 0:
-        for q in range(nt):
-            w[q] = csr_dot(a, j + 1 + q, lam) - p.b[j + 1 + q]
-        relax_tangents(lam + j + 1, w, p.step[j + 1], bound, nt)
-    if n_apart(kind, end - j) & 1:
-        q = j + 1 + nt
-        bound = p.patch_radius[i] * bound
-        lam[q] = relax_row(lam[q], csr_dot(a, q, lam) - p.b[q], p.step[q], -bound, bound)
-    if kind == CONTACT_ROLLING:
-        for q in range(2):
-            w[q] = csr_dot(a, end - 2 + q, lam) - p.b[end - 2 + q]
-        relax_tangents(lam + end - 2, w, p.step[end - 2], p.rolling[i] * lam[j], 2)
+    parts_of(p, i, &part)
+    for g in range(part.n):
+        k = j + part.first[g]
+        for q in range(part.size[g]):
+            w[q] = csr_dot(a, k + q, lam) - p.b[k + q]
+        relax_tangents(lam + k, w, p.step[k], part.reach[g] * lam[j], part.size[g])
 
 
 cdef inline void take_general(const generalized_t* g, int32_t panel, int32_t q, double now, double* lam,
@@ -67,25 +59,18 @@ cdef inline void relax_general_disk(const blocks_t* p, const generalized_t* g, i
 
 cdef inline void relax_general_block(const blocks_t* p, const generalized_t* g, int32_t i, double* lam,
                                      double* u) noexcept nogil:
-    cdef int32_t j = p.ptr[i], end = p.ptr[i + 1], kind = p.kind[i], b = g.home[i], nt, q
-    cdef double bound, x
-    if kind == ROW:
-        for q in range(j, end):
+    cdef int32_t j = p.ptr[i], b = g.home[i], k, q
+    cdef double x
+    cdef parts_t part
+    if is_rows(p, i):
+        for q in range(j, p.ptr[i + 1]):
             x = general_slack_of(p, g, b, q, lam, u)
             take_general(g, b, q, relax_row(lam[q], x, p.step[q], p.lower[q], p.upper[q]), lam, u)
         return
-    nt = n_tangents(kind, end - j)
     take_general(g, b, j, relax_normal(lam[j], general_slack_of(p, g, b, j, lam, u), p.step[j]), lam, u)
-    bound = p.mu[i] * lam[j]
-    if nt > 0:
-        relax_general_disk(p, g, b, j + 1, nt, bound, lam, u)
-    if n_apart(kind, end - j) & 1:
-        q = j + 1 + nt
-        bound = p.patch_radius[i] * bound
-        x = general_slack_of(p, g, b, q, lam, u)
-        take_general(g, b, q, relax_row(lam[q], x, p.step[q], -bound, bound), lam, u)
-    if kind == CONTACT_ROLLING:
-        relax_general_disk(p, g, b, end - 2, 2, p.rolling[i] * lam[j], lam, u)
+    parts_of(p, i, &part)
+    for k in range(part.n):
+        relax_general_disk(p, g, b, j + part.first[k], part.size[k], part.reach[k] * lam[j], lam, u)
 
 
 cdef void relax_matrix(const blocks_t* p, const csr_t* a, const int32_t* order, int32_t first, int32_t end,

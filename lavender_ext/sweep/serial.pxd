@@ -1,10 +1,10 @@
 """What sweeps of Gauss-Seidel type run over, and one of them: for sweeps alone, and for those that are accelerated."""
 from libc.stdint cimport int32_t, int64_t, uint64_t
 
-from lavender_ext.core.block cimport blocks_t
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport generalized_t, whitened_gather
 from lavender_ext.core.order cimport SYMMETRIC, advance_order
+from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.sweep.packed cimport pack_order, packed_t

@@ -13,9 +13,9 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.block cimport (CONTACT_ROLLING, ROW, blocks_t, n_apart, n_tangents, relax_normal,
-                                      relax_row, relax_tangents)
+from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot
+from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
 from lavender_ext.local.gauss_seidel cimport solve_blocks
@@ -77,30 +77,23 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
     cdef context_t* c = <context_t*>context
     cdef const blocks_t* p = c.blocks
     cdef double* w = c.w
-    cdef int32_t _s, i, j, q, nt, end
-    cdef double bound, omega = c.omega
+    cdef int32_t _s, i, j, g, q
+    cdef double omega = c.omega
+    cdef parts_t part
     for _s in range(n):
         for i in range(p.n_rows):
             w[i] = csr_dot(c.csr, i, lam) - p.b[i]
         for i in range(p.n_blocks):
             j = p.ptr[i]
-            end = p.ptr[i + 1]
-            if p.kind[i] == ROW:
-                for q in range(j, end):
+            if is_rows(p, i):
+                for q in range(j, p.ptr[i + 1]):
                     lam[q] = relax_row(lam[q], w[q], omega * p.step[q], p.lower[q], p.upper[q])
                 continue
-            nt = n_tangents(p.kind[i], end - j)
             lam[j] = relax_normal(lam[j], w[j], omega * p.step[j])
-            bound = p.mu[i] * lam[j]
-            if nt > 0:
-                relax_tangents(lam + j + 1, w + j + 1, omega * p.step[j + 1], bound, nt)
-            if n_apart(p.kind[i], end - j) & 1:
-                q = j + 1 + nt
-                bound = p.patch_radius[i] * bound
-                lam[q] = relax_row(lam[q], w[q], omega * p.step[q], -bound, bound)
-            if p.kind[i] == CONTACT_ROLLING:
-                q = end - 2
-                relax_tangents(lam + q, w + q, omega * p.step[q], p.rolling[i] * lam[j], 2)
+            parts_of(p, i, &part)
+            for g in range(part.n):
+                q = j + part.first[g]
+                relax_tangents(lam + q, w + q, omega * p.step[q], part.reach[g] * lam[j], part.size[g])
 
 
 SWEEPS, SOR, JACOBI = range(3)

@@ -12,13 +12,14 @@ tol) is left to the caller, with lam as it came.
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.core.block cimport COULOMB, ROW, blocks_t, row_error
+from lavender_ext.core.block cimport row_error
+from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
 from lavender_ext.core.rows cimport relax_rows_block, rows_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
 from lavender_ext.judge.measure cimport rows_slack
-from lavender_ext.judge.score cimport is_plain, nothing, relative, score_rows, score_t, tally_row, tally_t
+from lavender_ext.judge.score cimport nothing, relative, score_rows, score_t, tally_row, tally_t
 
 
 cpdef enum:
@@ -63,7 +64,7 @@ cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velo
                 return 0
             least = p.d[j] if p.d[j] < least else least
             rhs += p.b[j] * p.b[j]
-            if p.kind[i] == ROW:
+            if is_rows(p, i):
                 if not p.lower[j] <= 0.0 <= p.upper[j]:
                     return 0
                 e = row_error(0.0, -p.b[j], p.d[j], p.lower[j], p.upper[j])
@@ -75,7 +76,7 @@ cdef inline int32_t start_errors(const blocks_t* p, double* energy, double* velo
     energy[0] = sqrt(s.energy)
     velocity[0] = sqrt(s.fast)
     # below 2^-48 of the norm of b the judge measures by that
-    return is_plain(s.energy, s.fast) and s.energy * least > 1.3e-29 * rhs
+    return s.energy < inf and s.energy * least > 1.3e-29 * rhs
 
 
 cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, double* residual,
@@ -146,7 +147,7 @@ cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last
         last[b] = -1
     for i in range(r.n_joints):
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            if p.lower[j] > -1.7976931348623157e308 or p.upper[j] < 1.7976931348623157e308:
+            if p.lower[j] > -1.0 / 0.0 or p.upper[j] < 1.0 / 0.0:
                 return 0
         if p.ptr[i + 1] - p.ptr[i] > width:
             width = p.ptr[i + 1] - p.ptr[i]

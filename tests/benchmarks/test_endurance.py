@@ -72,7 +72,7 @@ def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path):
         ("ramp", 60),
         ("ramp", 120),
     ]
-    fast = gallery.stay("ramp", 1 / 60, 1.0, gravity=1e307)
+    fast = gallery.stay("ramp", 1 / 60, 1.0, gravity=1e60)
     assert fast.lost == "box 1" and "| box 1 |" in table([fast])
     for words in (["--seconds", "0"], ["no_such_scene"], ["--solvers", "nwton", "ramp"]):
         assert isinstance(CliRunner().invoke(gallery.command, words).exception, lv.LavenderError)

@@ -5,11 +5,11 @@ import json
 import hypothesis.strategies as st
 import numpy as np
 
-LARGEST = 1.7976931348623157e308
+LARGEST = 1e60  # that the door takes
 SPECIAL = (
-    0.0, -0.0, 5e-324, 1e-310, 2.2250738585072014e-308, 1e-300, 1e-160, 1e-154, 1e-150,
+    0.0, -0.0, 5e-324, 1e-300, 1e-61, 1e-60, 1e-59, 1e-30,
     1e-20, 1.0, 1.0 + 2.0**-52, 1e20,
-    1e150, 1e154, 1e160, 1e299, 1e300, LARGEST,
+    1e30, 1e59, LARGEST,
 )  # fmt: skip
 STYLES = ("tame", "tame", "tame", "scales", "whole", "wild", "special")
 MODERATE = st.floats(-4.0, 4.0, allow_subnormal=False)
@@ -27,7 +27,7 @@ def generators():
 
 @st.composite
 def numbers(draw, n, style=None):
-    """n finite numbers (n,): of moderate size, over many scales, whole, of any size, or the edges of float64."""
+    """n numbers (n,): of moderate size, over many scales, whole, of any size inside the door, or its ends and dust."""
     style = style or draw(st.sampled_from(STYLES))
     rng = draw(generators())
     many = n > 40 or draw(st.booleans())
@@ -37,7 +37,7 @@ def numbers(draw, n, style=None):
     elif style == "whole":
         x = np.rint(x)
     elif style == "wild":
-        x = x * 10.0 ** rng.integers(-320, 308, n)
+        x = x * 10.0 ** rng.integers(-60, 60, n)
     elif style == "special":
         x = np.where(x < 0.0, -1.0, 1.0) * rng.choice(SPECIAL, n)
     return np.clip(x, -LARGEST, LARGEST)

@@ -40,7 +40,7 @@ def variants():
     yield "rows, cone law", rows.relaxed("cone")
     yield "dense", random_lcp(3)
     yield "csr", lv.Problem.linear(a, np.linspace(-1.0, 1.0, 9))
-    yield "csr, contacts", lv.Problem.contact(a, np.ones(9), [0.0, 0.5, 1e300], name="contacts")
+    yield "csr, contacts", lv.Problem.contact(a, np.ones(9), [0.0, 0.5, 1e60], name="contacts")
     yield "spin", lv.Problem.contact(np.eye(8), np.ones(8), [0.5, 0.2], patch_radius=[0.1, 0.0])
     jac, mass = np.arange(12.0).reshape(3, 4), np.diag([1.0, 2.0, 3.0, 4.0])
     mass[-1, :-1] = mass[:-1, -1] = 0.5  # fills in as it is given: kept in another order
@@ -54,8 +54,8 @@ def variants():
     yield "empty", lv.Problem.linear(np.zeros((0, 0)), [])
     yield "empty csr", lv.Problem.linear(sp.csr_array((0, 0)), [])
     yield (
-        "denormals",
-        lv.Problem.lcp([[5e-324, -0.0], [0.0, 1e308]], [-5e-324, -0.0], lower=-np.inf, upper=5e-324),
+        "the ends of the door",
+        lv.Problem.lcp([[5e-324, -0.0], [0.0, 1e60]], [-1e-60, -0.0], lower=-np.inf, upper=5e-324),
     )
 
 

@@ -230,7 +230,7 @@ def test_no_rows():
 
 
 @pytest.mark.parametrize("form", ["masses", "rows of J", "matrix"])
-@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 140])
+@pytest.mark.parametrize("spread", [0, 30, 44, 50, 66, 88, 96])  # A_ii up to 1e59, the door is at 1e60
 def test_the_rank_is_that_of_exact_numbers_whatever_the_sizes(form, spread):
     """Powers of two, so that nothing is rounded: the rank of J is the rank of J M^-1 J^T, and of its rows scaled."""
     rng = np.random.default_rng(spread)

@@ -505,7 +505,7 @@ def _redundant(problem: Problem) -> bool:
     if problem.rows is not None and problem.m > 6 * problem.rows.n_bodies:
         return True
     values = _singular_values(problem)
-    return len(values) > 0 and bool(values[-1] <= SINGULAR * max(values[0], 1e-300))
+    return len(values) > 0 and bool(values[-1] <= SINGULAR * values[0])
 
 
 def condition(problem: Problem) -> float | None:

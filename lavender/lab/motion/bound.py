@@ -37,7 +37,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.lab.motion.operator import LEAST, Operator, Size, U
+from lavender.lab.motion.operator import Operator, Size, U
 from lavender.problem import Problem
 from lavender_ext.judge import measure
 
@@ -89,6 +89,6 @@ def _rounding_of_projection(problem: Problem, y: FloatArray, w: FloatArray) -> F
             top = float(size.max(initial=0.0))
             if not np.isfinite(whole).all() and np.isfinite(top):
                 energy = np.bincount(block, d * (size / top) ** 2, minlength=len(count))
-                whole = top * np.sqrt(energy[block] / d) + LEAST
+                whole = top * np.sqrt(energy[block] / d)
         fuzz[together] = (64.0 * U * whole)[together]
     return fuzz

@@ -11,7 +11,6 @@ count as exact as they are stored (`Problem.jacobian`, `Rows.inv_mass`, `Rows.in
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +26,6 @@ U = 2.0**-53
 SHIFT = (
     1e-12  # -, of the largest eigenvalue of an inverse inertia: by what rounding may have made one negative
 )
-SQUARED = 1e-140  # sqrt J: squares of less begin to lose digits, or vanish
-LEAST = 2.0**-1022  # the smallest number of float64 with all its digits
 LARGEST_TREE = 2000  # generalised velocities of one tree, whose M is inverted, dense
 
 
@@ -54,7 +51,7 @@ class Operator:
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         """Energy norm of x, every entry known up to `fuzz` (m,)."""
-        return _in_range(self._size, x, fuzz)
+        return self._size(x, fuzz)
 
     def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         raise NotImplementedError
@@ -158,7 +155,7 @@ class _Bodies(_Factored):
         return v.reshape(-1, 6)
 
     def lengths(self, velocity: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-        return _norms(velocity[:, :3]), _norms(velocity[:, 3:])
+        return np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
 
     def name(self, i: int) -> str:
         return f"body {i}"
@@ -242,31 +239,6 @@ class _Matrix(Operator):
         wrong = float(fuzz @ (self.size_of_a @ fuzz))
         most = np.sqrt(0.5) * (np.sqrt(square + rounding) + np.sqrt(wrong)) * (1.0 + _gamma(len(x) + 64))
         return Size(None, float(np.sqrt(0.5 * square)), float(most))
-
-
-def _in_range(size: Callable[[FloatArray, FloatArray], Size], x: FloatArray, fuzz: FloatArray) -> Size:
-    """A size [sqrt J] whose squares neither overflow nor vanish: of x over a power of two where they would."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = size(x, fuzz)
-        top = max(float(np.abs(x).max(initial=0.0)), float(fuzz.max(initial=0.0)))
-        if top == 0.0 or np.isinf(top) or (found.most < np.inf and found.most > SQUARED):
-            return found
-        scale = 2.0 ** (np.frexp(top)[1] - 1)
-        made = size(x / scale, fuzz / scale + LEAST)  # what vanishes beside the largest is within LEAST
-        kinetic = None if made.kinetic is None else made.kinetic * scale
-        return Size(kinetic, made.energy * scale, made.most * scale)
-
-
-def _norms(v: FloatArray) -> FloatArray:
-    """Length of each row; over its largest entry where the square of that overflows."""
-    with np.errstate(over="ignore"):
-        found: FloatArray = np.linalg.norm(v, axis=1)
-    far = np.flatnonzero(np.isinf(found) & np.isfinite(v).all(axis=1))
-    if len(far):
-        top = np.abs(v[far]).max(axis=1)
-        with np.errstate(over="ignore"):
-            found[far] = top * np.linalg.norm(v[far] / top[:, None], axis=1)
-    return found
 
 
 def _gamma(n: int) -> float:

@@ -13,7 +13,7 @@ Islands (blocks that no body, directly or through others, connects) are looked a
 De Saxce's change of variable makes a Coulomb solution the solution of a convex cone problem whose normal targets
 are raised by s_i = mu_i (|u_t| + r |u_s|), s being a fixed point of s -> lambda(s) -> s (Acary, Cadoux, Lemarechal,
 Malick 2011, ZAMM 91, 155-175). For two values of s, with Z the block of A^-1 on the normals, S = diag(mu) on the
-friction rows (mu r on spin, mu_r on rolling), and any positive diagonal T (one entry a contact),
+friction rows (mu r on spin, mu_r on what rolls), and any positive diagonal T (one entry a contact),
 
     |D lambda|_A^2 <= - D s . D lambda_n <= |D s|_Z |D lambda|_A          the cone is convex, A positive definite
     |T D s|^2 <= c |T S (A D lambda)_t|^2 <= c max eig(T S A_tt S T) |D lambda|_A^2   c parts of a contact

@@ -85,7 +85,7 @@ def arch_thrust(stones: int, lean: float, thick: float) -> tuple[float, float]:
     s, c = math.sin(lean), math.cos(lean)
     d = np.arange(1, stones + 1, dtype=float)
     below, arm = d * (d * s + thick * c) / 2.0, d * c - thick * s
-    most = np.where(arm > 0.0, below / np.maximum(arm, 1e-300), np.inf)
+    most = np.divide(below, arm, out=np.full_like(arm, np.inf), where=arm > 0.0)
     return max(0.0, float(((d * math.tan(lean) - thick) / 2.0).max())), float(most.min())
 
 

@@ -22,7 +22,7 @@ class Axis:
         self.log, self.is_time = log, "[s]" in title
         found = [math.log10(v) if log else v for v in values]
         low, high = (min(found), max(found)) if found else (0.0, 1.0)
-        least = LEAST_DECADES if log else 1e-300
+        least = LEAST_DECADES if log else 0.0
         if high - low < least:
             middle = 0.5 * (low + high)
             low, high = middle - 0.5 * least, middle + 0.5 * least

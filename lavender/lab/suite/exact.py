@@ -21,6 +21,7 @@ from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
+from lavender_ext.core.checks import LEAST
 
 __all__ = ["Wide", "at_rest", "solve_boxed", "solve_linear"]
 
@@ -119,7 +120,7 @@ def solve_boxed(problem: Problem, candidate: FloatArray, margin: float = 1e-6) -
     """
     wide, c = Wide(problem), problem.cones
     lam = np.clip(candidate, c.lower, c.upper)
-    size = max(float(np.abs(lam).max(initial=0.0)), 1e-300)
+    size = float(np.abs(lam).max(initial=0.0))
     inside = (lam - c.lower > margin * size) & (c.upper - lam > margin * size)
     nearest = np.where(lam - c.lower <= c.upper - lam, c.lower, c.upper)
     hi, lo = _solve_rows(problem, wide, inside, np.where(inside, lam, nearest))
@@ -153,7 +154,7 @@ def at_rest(problem: Problem) -> FloatArray:
     normal = c.ptr[:-1]
     weight = np.repeat(np.stack([1.0 / rows.inv_mass, 1.0 / rows.inv_inertia[:, 0, 0]], 1), 3, axis=1)
     momentum = -weight * rows.v_free
-    largest = np.abs(momentum).max(axis=1, initial=1e-300)
+    largest = np.abs(momentum).max(axis=1, initial=LEAST)
     wide = Wide(problem)
     # Two scales of the balance: the largest weight of all (heavy on light), each body's own (light on heavy).
     for scale in (np.full_like(largest, largest.max()), largest):
@@ -247,7 +248,7 @@ def _solvers(a: sp.csc_matrix) -> Iterator[Callable[[FloatArray], FloatArray]]:
     """A factorisation, then inverses on ever smaller ranges of A, for rows that depend on each other."""
     if a.shape[0] <= DENSE_ROWS:
         dense = a.toarray()
-        d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), 1e-300))
+        d = 1.0 / np.sqrt(np.maximum(np.abs(dense.diagonal()), LEAST))
         u, s, vt = np.linalg.svd(dense * d[:, None] * d[None, :])
         for cut in (4e-15, 1e-12):
             keep = s > cut * s[0]

@@ -73,7 +73,7 @@ SET = (
     # Numbers.
     *(f"diagonal(kind={k})" for k in ("zero", "negative", "negligible")),
     *(f"units(kg={k}, m={m}, s={s})" for k, m, s in (("1e12", 1, 1), ("1e-12", 1, 1), (1, "1e6", 1), (1, 1, "1e-6"))),
-    "denormals", *(f"degenerate_lcp(n={n})" for n in (8, 40)), "degenerate_lcp(n=40, asymmetric=1)",
+    "least_speeds", *(f"degenerate_lcp(n={n})" for n in (8, 40)), "degenerate_lcp(n=40, asymmetric=1)",
     *(f"random_spd(n=60, condition={c})" for c in ("100", "1e8", "1e14")),
     "infeasible(kind=squeeze)", "infeasible(kind=joints)",
 )  # fmt: skip
@@ -286,18 +286,18 @@ def units(kg: float = 1e12, m: float = 1.0, s: float = 1.0, n: int = 5) -> Draft
 
 
 @family()
-def denormals(n: int = 8) -> Draft:
-    """A stack whose speeds are denormal numbers: lambda_i = (n - i) 2^-1060, exactly."""
+def least_speeds(n: int = 8) -> Draft:
+    """A stack whose speeds are the least that a problem may have: lambda_i = (n - i) 2^-199, exactly."""
     at_least(1, n=n)
     a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
     a[0, 0] = 1.0
     b = np.zeros(n)
-    b[0] = 2.0**-1060
+    b[0] = 2.0**-199
     problem = Problem.lcp(a, b)
     return Draft(
         problem,
-        "squares underflow to zero, so a careless norm calls anything a solution",
-        lambda: Reference(np.arange(n, 0, -1.0) * 2.0**-1060, "exact"),
+        "no tolerance in units sees them, so a careless norm calls anything a solution",
+        lambda: Reference(np.arange(n, 0, -1.0) * 2.0**-199, "exact"),
     )
 
 
@@ -354,11 +354,11 @@ __all__ = [
     "SET",
     "big_box",
     "degenerate_lcp",
-    "denormals",
     "diagonal",
     "duplicated",
     "four_bar",
     "infeasible",
+    "least_speeds",
     "near_parallel",
     "ring",
     "slab",

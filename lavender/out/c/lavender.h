@@ -51,7 +51,7 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_NULL = -1,        /* a pointer that is needed is null */
   LAV_ERROR_VERSION = -2,     /* size of a struct is not one of this library's: fill it by a lav_default_... function */
   LAV_ERROR_COUNT = -3,       /* a count is negative, too large, or does not fit another */
-  LAV_ERROR_NUMBER = -4,      /* a number is NaN or infinite where it must not be */
+  LAV_ERROR_NUMBER = -4,      /* a number is NaN or infinite where it must not be, or beyond 1e60; or a mass, mu, reach, compliance or the largest |b| is below 1e-60 and not 0: change a unit */
   LAV_ERROR_BOUNDS = -5,      /* lower > upper, or an infinite bound on the wrong side */
   LAV_ERROR_FRICTION = -6,    /* mu or patch_radius is negative, or a contact with mu has no row to feel it */
   LAV_ERROR_BLOCKS = -7,      /* block_ptr or kind describe no blocks: sizes, kinds, or joints behind contacts */

@@ -1,6 +1,6 @@
 /* -- from here on: the functions of lavender.h over the kernels above ------------------------------------------------- */
 
-typedef struct core_block_blocks_t blocks_t;
+typedef struct core_parts_blocks_t blocks_t;
 typedef struct core_csr_csr_t csr_t;
 typedef struct core_rows_rows_t rows_t;
 typedef struct core_generalized_generalized_t general_t;
@@ -131,6 +131,8 @@ static int32_t are_finite(const double *x, int64_t n) {
   return sum == 0.0;
 }
 
+static int32_t is_bound(double x) { return isinf(x) || core_door_is_number(x); }
+
 static int32_t check_counts(const lav_problem *q) {
   const int64_t m = q->n_rows, n = q->n_velocities;
   if (q->size != sizeof *q) return LAV_ERROR_VERSION;
@@ -154,7 +156,7 @@ static int32_t check_options(const lav_options *o) {
   if (o->memory < 1 || o->memory > 16 || o->sweep < LAV_DEFAULT_SWEEP || o->sweep > LAV_BLOCK_SWEEP) return LAV_ERROR_OPTION;
   if (o->convex < 0 || (o->keeps != 0 && o->keeps != 1)) return LAV_ERROR_OPTION;
   if (o->method == LAV_SOR && !(o->omega > 0.0 && o->omega < 2.0)) return LAV_ERROR_OPTION;
-  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && o->omega < 1e300)) return LAV_ERROR_OPTION;
+  if (o->method == LAV_JACOBI && !(o->omega >= 0.0 && core_door_is_number(o->omega))) return LAV_ERROR_OPTION;
   if (o->method == LAV_GAUSS_SEIDEL && o->omega != 1.0) return LAV_ERROR_OPTION;
   return LAV_OK;
 }
@@ -212,7 +214,7 @@ static int32_t takes(const lav_problem *q, const lav_options *o) {
       if (q->kind[i] == LAV_ROUND && q->law != LAV_CONE) return LAV_ERROR_UNSUPPORTED;
     }
   for (i = 0; i < q->n_rows; i++)
-    if ((q->lower && q->lower[i] > -DBL_MAX) || (q->upper && q->upper[i] < DBL_MAX)) free_rows = 0;
+    if ((q->lower && q->lower[i] > -INFINITY) || (q->upper && q->upper[i] < INFINITY)) free_rows = 0;
   if ((o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL) && !free_rows) return LAV_ERROR_UNSUPPORTED;
   if ((o->method == LAV_DIRECT || o->method == LAV_LEMKE) && !rows_alone) return LAV_ERROR_UNSUPPORTED;
   if (q->law == LAV_CONE && !rows_alone) {
@@ -248,14 +250,15 @@ static int32_t check_blocks(const lav_problem *q, where_t *at) {
     if (end - first < least_rows[kind] || (kind != LAV_ROW && end - first > most_rows[kind]))
       return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
     if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (!(mu >= 0.0 && mu <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
-    if (!(radius >= 0.0 && radius <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
-    if (!(rolling >= 0.0 && rolling <= DBL_MAX)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
+    if (!core_door_is_size(mu)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
+    if (!core_door_is_size(radius) || (kind != LAV_ROW && !core_door_is_size(mu * radius))) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
+    if (!core_door_is_size(rolling)) return refuse(at, LAV_ERROR_FRICTION, "rolling", i);
     if (kind == LAV_CONTACT && end - first == 1 && mu > 0.0 && q->form == LAV_BODIES)
       return refuse(at, LAV_ERROR_FRICTION, "mu", i);
     for (j = first; kind == LAV_ROW && j < end; j++) {
       const double low = q->lower ? q->lower[j] : -INFINITY, high = q->upper ? q->upper[j] : INFINITY;
-      if (!(low <= high && low <= DBL_MAX && high >= -DBL_MAX)) return refuse(at, LAV_ERROR_BOUNDS, "lower", j);
+      if (!(low <= high && low < INFINITY && high > -INFINITY)) return refuse(at, LAV_ERROR_BOUNDS, "lower", j);
+      if (!is_bound(low) || !is_bound(high)) return refuse(at, LAV_ERROR_NUMBER, is_bound(low) ? "upper" : "lower", j);
     }
   }
   return LAV_OK;
@@ -289,11 +292,10 @@ static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int
 }
 
 static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, const char *name, where_t *at) {
-  int64_t i = 0;
+  int64_t i;
   if (!x) return is_needed && n > 0 ? refuse(at, LAV_ERROR_NULL, name, 0) : LAV_OK;
-  if (are_finite(x, n)) return LAV_OK;
-  while (fabs(x[i]) <= DBL_MAX) i++;
-  return refuse(at, LAV_ERROR_NUMBER, name, i);
+  i = core_door_first_outside(x, n);
+  return i < 0 ? LAV_OK : refuse(at, LAV_ERROR_NUMBER, name, i);
 }
 
 #define OPTIONAL(name, n) GIVE_BACK(check_numbers(q->name, (n), 0, #name, at))
@@ -342,6 +344,8 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
   NEEDED(arm_b, 3 * c);
   for (i = 0; i < n; i++) {
     if (q->inv_mass[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "inv_mass", i);
+    if (!core_door_is_size(q->inv_mass[i])) return refuse(at, LAV_ERROR_NUMBER, "inv_mass", i);
+    if (!core_door_is_size(core_door_largest(q->inv_inertia + 9 * i, 9))) return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
     if (!is_inertia(q->inv_inertia + 9 * i)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
   }
   GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies, 0, "joint_body", at));
@@ -372,9 +376,12 @@ static int32_t check_problem(const lav_problem *q, where_t *at) {
   OPTIONAL(b, m);
   OPTIONAL(target, m);
   OPTIONAL(compliance, m);
-  OPTIONAL(impulse, m);
-  for (i = 0; q->compliance && i < m; i++)
+  for (i = 0; q->impulse && i < m; i++) /* as large as it likes: the judge measures it */
+    if (!isfinite(q->impulse[i])) return refuse(at, LAV_ERROR_NUMBER, "impulse", i);
+  for (i = 0; q->compliance && i < m; i++) {
     if (q->compliance[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "compliance", i);
+    if (!core_door_is_size(q->compliance[i])) return refuse(at, LAV_ERROR_NUMBER, "compliance", i);
+  }
   if (q->form == LAV_BODIES) return check_bodies(q, at);
   if (q->form == LAV_VELOCITIES) return check_velocities(q, at);
   if (m > 0 && (!q->b || !q->value)) return refuse(at, LAV_ERROR_NULL, q->b ? "value" : "b", 0);

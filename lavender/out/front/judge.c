@@ -113,7 +113,7 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   found.energy = sqrt(x);
   found.kinetic = sqrt(y);
   found.relative = y == 0.0 ? 0.0 : sqrt(y / own);
-  found.bound = s->p.law == LAV_COULOMB && core_block_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
+  found.bound = s->p.law == LAV_COULOMB && core_parts_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
   for (i = 0; i < n; i++)
     if (fabs(slope[i]) > found.rows || found.row < 0) found.rows = fabs(slope[i]), found.row = i;
   for (i = 0; n > 0 && i < (s->form == LAV_BODIES ? s->n_v / 6 : s->n_v); i++) {

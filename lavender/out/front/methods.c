@@ -126,7 +126,7 @@ static void keep_better(lav_solver *s, const double *begin) {
     now = then;
   }
   if (!(now.relative <= 1.0))
-    judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, 0, nothing);
+    judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, nothing);
 }
 
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {

@@ -306,3 +306,13 @@ static int32_t fill_velocities(lav_solver *s, const lav_problem *q) {
 }
 #endif
 
+/* What follows from the numbers: b, and A_ii of J and M, which core/door.pxd bounds as well. */
+static int32_t check_derived(lav_solver *s, const lav_problem *q) {
+  const int64_t m = q->n_rows;
+  const double top = core_door_largest(s->p.b, m);
+  int64_t i = core_door_first_outside(s->p.b, m);
+  if (i >= 0) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", i);
+  if (!core_door_is_size(top)) return refuse(&s->refused, LAV_ERROR_NUMBER, q->b ? "b" : "target", 0);
+  i = core_door_first_outside(s->p.d, m);
+  return i < 0 ? LAV_OK : refuse(&s->refused, LAV_ERROR_NUMBER, q->form == LAV_BODIES ? "inv_mass" : "value", i);
+}

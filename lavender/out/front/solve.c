@@ -408,13 +408,14 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
   else code = fill_velocities(s, q);
 #endif
   if (code != LAV_OK) return code;
+  GIVE_BACK(check_derived(s, q));
   memset(&s->swept, 0, sizeof s->swept);
   memset(&s->read, 0, sizeof s->read);
   s->read.p = s->p;
   if (q->form == LAV_MATRIX) s->read.a = &s->a;
   else if (q->form == LAV_BODIES) s->read.r = &s->r;
   else s->read.g = general_of(s);
-  judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, 0, s->start);
+  judge_measure_judge_nothing(&s->read, s->impulse, s->watch.w, s->watch.e, s->watch.v, s->start);
   if (q->impulse) COPY(s->impulse, q->impulse, q->n_rows);
   else carry(s);
 #ifndef LAV_SWEEPS_ONLY

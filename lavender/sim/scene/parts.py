@@ -9,8 +9,8 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, as_array, number, shape_of
 from lavender.base.errors import InputError
-from lavender.sim.scene.arithmetic import inverse as inverse_of
 from lavender.sim.scene.arithmetic import norm, sine_cosine, turned_back
+from lavender_ext.core.checks import LEAST, MOST
 
 __all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
 
@@ -156,13 +156,7 @@ def unit(what: str, value: object) -> FloatArray:
 
 
 def normalised(x: FloatArray, least: float = 0.0) -> FloatArray | None:
-    """`x` (n,) at length 1, whatever its scale; None where its length is at most `least`."""
-    scale = float(np.abs(x).max())
-    if not 1e-150 < scale < 1e150:  # its square would leave the range of float64
-        if scale == 0.0 or scale <= least:
-            return None
-        x = x / scale
-        least = 0.0
+    """`x` (n,) at length 1; None where its length is at most `least`."""
     size = norm(x)
     return x / size if size > least else None
 
@@ -175,19 +169,13 @@ def inertia_of(label: str, given: Any, shape: Any, mass: float) -> FloatArray:
         what = f"inertia of {label}, of mass {mass:g} kg and {shape or 'radius 0.1 m'},"
     else:
         x, what = _tensor(label, given), f"inertia of {label}"
-    if not np.isfinite(x).all() or not _has_reciprocal(mass, x):
+    moments = np.linalg.eigvalsh(x) if np.isfinite(x).all() else x
+    if not mass >= LEAST or not np.all((moments >= LEAST) & (moments <= MOST)):
         raise InputError(
-            f"{what} is {np.diag(x).tolist()} kg m^2; it and the mass must have a finite reciprocal: use other "
+            f"{what} is {np.diag(x).tolist()} kg m^2; it and the mass must be from {LEAST:g} to {MOST:g}: use other "
             "units of mass or length"
         )
     return x
-
-
-def _has_reciprocal(mass: float, inertia: FloatArray) -> bool:
-    # the engine works with 1/m and I^-1
-    inverse = inverse_of(inertia)
-    with np.errstate(all="ignore"):
-        return bool(inverse is not None and np.isfinite(np.divide(1.0, mass)) and np.isfinite(inverse).all())
 
 
 def _tensor(label: str, given: Any) -> FloatArray:
@@ -197,10 +185,7 @@ def _tensor(label: str, given: Any) -> FloatArray:
     x = as_array(f"inertia of {label} [kg m^2]", given, shape)
     if x.ndim == 1:
         x = np.diag(x)
-    scale = np.abs(x).max()
-    with np.errstate(over="ignore"):  # NumPy 1.26 warns of 5e-324 / 5e-324
-        uneven = scale > 0.0 and np.abs(x / scale - x.T / scale).max() > 1e-12
-    if uneven:
+    if np.abs(x - x.T).max() > 1e-12 * np.abs(x).max():
         raise InputError(f"inertia of {label} is not symmetric")
     x = 0.5 * x + 0.5 * x.T
     value = np.linalg.eigvalsh(x)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag, number, shape_of, whole_number
+from lavender.base.arrays import FloatArray, check_sizes, flag, number, shape_of, whole_number
 from lavender.base.errors import InputError, UnknownName
 from lavender.problem.cones import check_shape
 from lavender.problem.ordering import ENGINE_ORDERS
@@ -40,7 +40,7 @@ SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned r
 ON_FAILURE = ("use", "keep", "damp", "raise")
 RANGES: dict[str, dict[str, float]] = {  # of plain numbers
     "dt": {"above": 0.0},
-    "friction": {"low": 0.0, "high": 1e100},  # the product of two coefficients of friction is finite
+    "friction": {"low": 0.0},
     "restitution": {"low": 0.0, "high": 1.0},
     **{
         key: {"low": 0.0}
@@ -90,6 +90,8 @@ class Parameters:
         put = object.__setattr__
         for name, allowed in RANGES.items():
             put(self, name, number(name, getattr(self, name), **allowed))
+        for name in ("friction", "patch_radius", "rolling_radius"):
+            check_sizes(name, np.array([getattr(self, name)]))
         gravity: Any = self.gravity
         if shape_of("gravity", gravity) == ():
             gravity = (0.0, 0.0, -number("gravity", gravity))
@@ -383,6 +385,8 @@ class Scene:
             restitution=_given(f"restitution of {label}", restitution, **RANGES["restitution"]),
             patch_radius=_given(f"patch_radius of {label} [m]", patch_radius, low=0.0),
         )
+        for name in ("friction", "patch_radius"):
+            check_sizes(f"{name} of {label}", np.array([getattr(body, name) or 0.0]))
         self.bodies.append(body)
         return number_
 

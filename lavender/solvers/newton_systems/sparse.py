@@ -140,7 +140,7 @@ class SparseRows:
 
 def _graph(sc: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:
     """(indptr, indices) of the elements that A couples, either way, each with itself."""
-    n = len(sc.kind)
+    n = len(sc.ptr) - 1
     of = np.repeat(np.arange(n, dtype=np.int32), np.diff(sc.ptr))
     to, other = element_graph(sc.ptr, of, a.indptr, a.indices)
     graph = sp.csr_array((np.ones(len(other), bool), other, to), shape=(n, n))

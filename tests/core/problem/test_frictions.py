@@ -45,7 +45,7 @@ def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
         touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), tensor]), **TWO)
     with pytest.raises(lv.InputError, match="both are static"):
         touching([[-1, 0], [-1, -1]], **TWO)
-    for fine in (np.zeros((3, 3)), np.diag([1.0, 0.0, 0.0]), 1e-300 * np.eye(3), 1e300 * np.eye(3)):
+    for fine in (np.zeros((3, 3)), np.diag([1.0, 0.0, 0.0]), 1e-60 * np.eye(3), 1e60 * np.eye(3)):
         touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), fine]), **TWO)
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)

@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import warnings
 from dataclasses import fields, replace
 
 import numpy as np
@@ -195,8 +194,8 @@ BAD_PROBLEMS = {
     "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
     "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
     "friction beyond float64": (
-        lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e308),
-        r"mu N \[N s\] must be finite",
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), 10.0).boxed(1e60),
+        r"mu N \[N s\] must be at most 1e\+60",
     ),
 }
 
@@ -223,15 +222,15 @@ BAD_ROWS = {
     "negative mass": ({"inv_mass": -np.ones(5)}, "inv_mass must not be negative"),
     "normal": ({"normal": np.tile([0, 0, 2.0], (8, 1))}, "orthogonal unit vectors"),
     "axes whose product is inf - inf": (
-        {"normal": np.tile([1e200, 1e200, 0], (8, 1)), "tangent": np.tile([1e200, -1e200, 0], (8, 1))},
-        "off by inf",
+        {"normal": np.tile([1e60, 1e60, 0], (8, 1)), "tangent": np.tile([1e60, -1e60, 0], (8, 1))},
+        "off by 1.4e\\+60",
     ),
     "tangent": (
         {"tangent": np.tile([0, 0, 1.0], (8, 1)), "normal": np.tile([0, 0, 1.0], (8, 1))},
         "orthogonal",
     ),
     "arms": ({"arm_a": np.zeros((7, 3))}, r"\(8, 3\) is needed"),
-    "velocity": ({"v_free": np.full((5, 6), NAN)}, "v_free must be finite"),
+    "velocity": ({"v_free": np.full((5, 6), NAN)}, r"v_free \[m/s, rad/s\] must be finite"),
     "jac": ({"jac": np.zeros((1, 12))}, "jac has shape"),
     "fractional body": ({"contact_body": np.full((8, 2), 0.5)}, "whole numbers"),
 }
@@ -263,18 +262,6 @@ def test_history_is_there_where_empty_rows_decide():
     solution = lv.solve(lv.Problem.lcp(np.diag([1.0, 0.0]), [1.0, 1.0]), "pgs", history=True)
     assert solution.status is lv.Status.INFEASIBLE
     assert solution.history.iterations.tolist() == [0]
-
-
-def test_large_finite_numbers_are_finite():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        problem = lv.Problem.lcp(I2, [1.2e308, 1.2e308])
-        assert lv.solve(problem, "pgs").success
-        np.testing.assert_array_equal(lv.solve(problem, "pgs").impulse, problem.b)
-    # |b| itself overflows: nothing to measure against, so nothing is judged solved but an error of 0.
-    problem = lv.Problem.lcp(I2, [1.7e308, 1.7e308])
-    assert lv.residual(problem, problem.b).relative == 0.0
-    assert lv.residual(problem, 0.999 * problem.b).relative == np.inf
 
 
 # -- the registry --------------------------------------------------------------------------------------------

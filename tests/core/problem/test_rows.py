@@ -51,7 +51,7 @@ SPOILT = {
     "an inertia about one axis": ("inv_inertia", (0,), np.diag([1.0, 0.0, 0.0])),
     "an inertia of a point": ("inv_inertia", (0,), np.zeros((3, 3))),
     "an inertia near the edge": ("inv_inertia", (0,), np.diag([1.0, 1.0, -0.9e-9])),
-    "an inertia at the edge of float64": ("inv_inertia", (0,), 1e-310 * np.eye(3)),
+    "an inertia at the edge of the door": ("inv_inertia", (0,), 1e-60 * np.eye(3)),
     "pointers that stand still": ("joint_ptr", (1,), 0),
     "pointers from one on": ("joint_ptr", (0,), 1),
 }
@@ -94,7 +94,7 @@ def test_quick_looks_end_as_the_long_way(what, seed):
         "an inertia about one axis",
         "an inertia of a point",
         "an inertia near the edge",
-        "an inertia at the edge of float64",
+        "an inertia at the edge of the door",
     )
     assert (quick == "taken") == (what in legal + also)
 

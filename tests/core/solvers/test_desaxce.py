@@ -34,12 +34,13 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     rng = np.random.default_rng(seed)
     s, ds = rng.normal(size=sc.m), rng.normal(size=sc.m)
     phi, psi = solve.slip(s)
-    for i in range(len(sc.kind)):
-        j, end, spin = sc.ptr[i], sc.ptr[i + 1], sc.kind[i] == 2
-        expected = 0.0
-        if sc.kind[i] != 0:
-            expected = sc.a_t[i] * np.linalg.norm(s[j + 1 : end - spin])
-            expected += sc.a_s[i] * abs(s[end - 1]) if spin else 0.0
+    for i in range(len(sc.ptr) - 1):
+        j, end = sc.ptr[i], sc.ptr[i + 1]
+        reach = sc.reach[sc.part[i] : sc.part[i + 1]]
+        spin, expected = len(reach) == 2, 0.0
+        if len(reach):
+            expected = reach[0] * np.linalg.norm(s[j + 1 : end - spin])
+            expected += reach[1] * abs(s[end - 1]) if spin else 0.0
         assert phi[j] == pytest.approx(expected, rel=1e-14, abs=1e-300)
         assert psi[j] == 0.0
     step = 1e-6
@@ -47,8 +48,8 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
     # The third derivative of |s_t| grows like 1/|s_t|^2, and spin has a kink: only where nothing is near 0.
     smooth = [
         i
-        for i in range(len(sc.kind))
-        if sc.kind[i] == 0 or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
+        for i in range(len(sc.ptr) - 1)
+        if sc.part[i] == sc.part[i + 1] or np.abs(s[sc.ptr[i] + 1 : sc.ptr[i + 1]]).min(initial=1.0) > 1e-2
     ]
     along = np.add.reduceat(psi * ds, sc.ptr[:-1])
     np.testing.assert_allclose(difference[sc.ptr[:-1]][smooth], along[smooth], rtol=0, atol=1e-6)

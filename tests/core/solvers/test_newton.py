@@ -16,7 +16,7 @@ from worked import python
 
 import lavender as lv
 from benchmarks.piles import DT, Pile
-from lavender.problem.cones import CONTACT_SPIN, ROW
+from lavender.problem.cones import ROW
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
@@ -57,8 +57,9 @@ def test_a_problem_is_scaled_by_its_definition(form, seed):
     for i, at in enumerate(sc.ptr[:-1]):
         rows = sc.keep[at : sc.ptr[i + 1]]
         open_ = reach[rows] * root[rows] / root[rows[0]]
-        assert sc.a_t[i] == pytest.approx(open_[1] if len(rows) > 1 else 0.0, rel=1e-13)
-        assert sc.a_s[i] == pytest.approx(open_[-1] if sc.kind[i] == CONTACT_SPIN else 0.0, rel=1e-13)
+        own = sc.reach[sc.part[i] : sc.part[i + 1]]
+        bounds = open_[1:] if contact[rows[0]] else []
+        assert own == pytest.approx([a for k, a in enumerate(bounds) if k != 1 or len(bounds) < 2], rel=1e-13)
         assert np.all(cones.ptr[sc.block[i]] <= rows) and np.all(rows < cones.ptr[sc.block[i] + 1])
 
 
@@ -177,14 +178,15 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
         # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
         assert solve.advance()[0]
-        row = sc.kind == 0
+        row = np.diff(sc.part) == 0
         whole = solve.point[0]
         z = whole[sc.ptr[:-1]]
         assert np.all(z[row] > sc.lower[sc.ptr[:-1]][row])
         assert np.all(z[row] < sc.upper[sc.ptr[:-1]][row])
         for i in np.flatnonzero(~row):
-            t = whole[sc.ptr[i] + 1 : sc.ptr[i + 1] - (sc.kind[i] == 2)]
-            assert np.linalg.norm(t) <= sc.a_t[i] * z[i] * (1 + 1e-12)
+            parts = sc.part[i + 1] - sc.part[i]
+            t = whole[sc.ptr[i] + 1 : sc.ptr[i + 1] - (parts == 2)]
+            assert np.linalg.norm(t) <= sc.reach[sc.part[i]] * z[i] * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])

@@ -70,7 +70,7 @@ def test_a_function_and_its_name_agree():
         ("pyramid(k=2.5)", lv.InputError, "a whole number"),
         ("pyramid(k=-1)", lv.InputError, "a whole number"),
         ("pyramid(k=0)", lv.InputError, "at least 1"),
-        ("pyramid(k=1e99)", lv.InputError, "a whole number"),
+        ("pyramid(k=1e59)", lv.InputError, "a whole number"),
         ("pyramid(k=abc)", lv.InputError, "a number"),
         ("pyramid(mass_ratio=1e999)", lv.InputError, "a finite number"),
         ("pyramid(mass_ratio=0)", lv.InputError, "above 0"),

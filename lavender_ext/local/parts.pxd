@@ -1,4 +1,4 @@
-"""One contact that resists rolling, with the other blocks held still: in z = sqrt(d) lam, with y = z - (H z - g):
+"""One contact of any parts, with the other blocks held still: in z = sqrt(d) lam, with y = z - (H z - g):
 
     z = Pi(y),   (I - P + P H) dz = -(z - Pi(y)),   P in the derivative of Pi                    (1)
 
@@ -8,6 +8,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.contact_map cimport contact_map
+from lavender_ext.core.parts cimport parts_t
 from lavender_ext.local.small cimport FAILED, MAX_ROWS, OPEN, STICK, eliminate
 
 
@@ -17,7 +18,7 @@ cdef enum:
     SLOW = 4                    # steps that leave more than 0.9: where none leads on, all 40 cost a hundred updates
 
 
-cdef inline double residue(int32_t law, int32_t n, const double* H, const double* g, const double* a, const double* z,
+cdef inline double residue(int32_t law, int32_t n, const double* H, const double* g, const parts_t* part, const double* z,
                            double* out, double* p, double* size) noexcept nogil:
     # |z - Pi(y)|, Pi(y) in out; size: of what is added up
     cdef double y[MAX_ROWS]
@@ -32,15 +33,15 @@ cdef inline double residue(int32_t law, int32_t n, const double* H, const double
             x += fabs(H[n * i + j] * z[j])
         y[i] = z[i] - s
         size[0] = x if x > size[0] else size[0]
-    contact_map(law, 2, n - 5, 1, a, y, out, p)
+    contact_map(law, part, y, out, p)
     for i in range(n):
         total += (z[i] - out[i]) * (z[i] - out[i])
     return sqrt(total)
 
 
-cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, const double* q, const double* d, double mu,
-                                    double patch_radius, double rolling, double* lam) noexcept nogil:
-    """lam (n), n = 5 or 6, from the present one; FAILED, lam left alone, where Newton's method does not end."""
+cdef inline int32_t contact_of_parts(int32_t law, int32_t n, const double* W, const double* q, const double* d,
+                                     const parts_t* part, double* lam) noexcept nogil:
+    """lam (n) from the present one; FAILED, lam left alone, where Newton's method does not end."""
     cdef double H[MAX_ROWS * MAX_ROWS]
     cdef double P[MAX_ROWS * MAX_ROWS]
     cdef double A[MAX_ROWS * MAX_ROWS]
@@ -50,7 +51,7 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
     cdef double to[MAX_ROWS]
     cdef double out[MAX_ROWS]
     cdef double root[MAX_ROWS]
-    cdef double a[3]
+    cdef parts_t a = part[0]                            # with their reach in the metric of d
     cdef double now, next_, size, x
     cdef int32_t i, j, k, _step, _halving, start, slow
     if not W[0] > 0.0:
@@ -61,9 +62,8 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
         g[i] = -q[i] / root[i]
         for j in range(n):
             H[n * i + j] = W[n * i + j] / (root[i] * root[j])
-    a[0] = mu * root[1] / root[0]
-    a[1] = mu * patch_radius * root[3] / root[0] if n == 6 else 0.0
-    a[2] = rolling * root[n - 2] / root[0]
+    for i in range(a.n):
+        a.reach[i] = a.reach[i] * root[a.first[i]] / root[0]
     for start in range(2):                              # from where it is, then from where everything sticks
         for i in range(n):
             z[i] = root[i] * lam[i] if start == 0 else g[i]
@@ -72,7 +72,7 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
                 A[i] = H[i]
             eliminate(n, A, z)
         slow = 0
-        now = residue(law, n, H, g, a, z, out, P, &size)
+        now = residue(law, n, H, g, &a, z, out, P, &size)
         for _step in range(STEPS):
             if not now > 1e-15 * size:
                 break
@@ -88,12 +88,12 @@ cdef inline int32_t rolling_contact(int32_t law, int32_t n, const double* W, con
             for _halving in range(HALVINGS):
                 for i in range(n):
                     to[i] = z[i] + x * f[i]
-                next_ = residue(law, n, H, g, a, to, out, P, &size)
+                next_ = residue(law, n, H, g, &a, to, out, P, &size)
                 if next_ < now:
                     break
                 x = 0.5 * x
             if not next_ < now and now <= 1e-13 * size:
-                residue(law, n, H, g, a, z, out, P, &size)
+                residue(law, n, H, g, &a, z, out, P, &size)
                 break
             slow += not next_ < 0.9 * now
             if slow > SLOW:

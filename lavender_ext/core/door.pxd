@@ -1,0 +1,53 @@
+"""Numbers at the door: what the arrays of a problem may hold, checked once, so that no kernel guards against more.
+
+    |x| <= 1e60             every finite number, and what follows from them: b, and d = diag(A)         (1)
+    x = 0 or x >= 1e-60     masses, inertias, M's pivots, mu, reaches, compliances, the largest |b|     (2)
+
+The same problem in other units has other numbers and the same answer, so no user needs more. Sums of products of four such
+numbers, and their squares, stay within float64. A row of A whose largest entry is below 1e-60 counts as empty.
+"""
+from libc.math cimport fabs
+from libc.stdint cimport int64_t
+
+
+cdef inline double most() noexcept nogil:
+    return 1e60
+
+
+cdef inline double least() noexcept nogil:
+    return 1e-60
+
+
+cdef inline bint is_number(double x) noexcept nogil:
+    return fabs(x) <= most()                            # (1); NaN is none
+
+
+cdef inline bint is_size(double x) noexcept nogil:
+    return x == 0.0 or least() <= x <= most()           # (1), (2)
+
+
+cdef inline int64_t first_outside(const double* x, int64_t n) noexcept nogil:
+    """The first number that (1) excludes, or -1."""
+    cdef int64_t i
+    for i in range(n):
+        if not is_number(x[i]):
+            return i
+    return -1
+
+
+cdef inline int64_t first_unsized(const double* x, int64_t n) noexcept nogil:
+    """The first number that (1) or (2) excludes, or -1."""
+    cdef int64_t i
+    for i in range(n):
+        if not is_size(x[i]):
+            return i
+    return -1
+
+
+cdef inline double largest(const double* x, int64_t n) noexcept nogil:
+    """max |x_i| of numbers; 0 of none."""
+    cdef int64_t i
+    cdef double s = 0.0
+    for i in range(n):
+        s = fabs(x[i]) if fabs(x[i]) > s else s
+    return s
