@@ -42,7 +42,7 @@ class PGS(Threaded):
     ) -> Claim:
         if state.data.is_general:
             return replace(run_kernel(state, impulse, max_iter, tol), form="whitened J")
-        if self.uses_threads(state):
+        if self._uses_threads(state):
             return run_threads(state, impulse, max_iter, tol, self.threads)
         return run_kernel(state, impulse, max_iter, tol)
 

@@ -81,7 +81,7 @@ class SequentialImpulses(Threaded):
             if state.laid is None:
                 state.laid = state.layout.take(impulse)
             lam = state.laid
-        if self.uses_threads(state):
+        if self._uses_threads(state):
             claim = run_threads(state, lam, max_iter, tol, self.threads)
         else:
             claim = run_kernel(state, lam, max_iter, tol)

@@ -16,6 +16,7 @@ from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
+from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
@@ -133,7 +134,7 @@ def over(data: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Sweeping:
+class Sweeping(Solver):
     """Options and life cycle of a sweep solver over A in compressed rows."""
 
     order: Any = "given"
@@ -177,7 +178,7 @@ class Threaded(Sweeping):
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )
 
-    def uses_threads(self, state: SweepState) -> bool:
+    def _uses_threads(self, state: SweepState) -> bool:
         """More than one thread was asked for, and the colours are large enough to gain from it."""
         ptr = state.order.color_ptr
         if self.threads == 1 or ptr is None or len(ptr) < 2:
