@@ -96,6 +96,12 @@ def run_kernel(
     return claim(status, done)
 
 
+def gains_from_threads(state: SweepState) -> bool:
+    """Colours are large enough for more than one thread."""
+    ptr, work = state.order.color_ptr, state.data.work
+    return ptr is not None and len(ptr) > 1 and work >= LEAST and work >= GRAIN * (len(ptr) - 1)
+
+
 def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: float, threads: int) -> Claim:
     """Coloured sweeps on several threads: the bits of one thread."""
     alone = state.alone or {}
@@ -177,11 +183,3 @@ class Threaded(Sweeping):
             raise InputError(
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )
-
-    def _uses_threads(self, state: SweepState) -> bool:
-        """More than one thread was asked for, and the colours are large enough to gain from it."""
-        ptr = state.order.color_ptr
-        if self.threads == 1 or ptr is None or len(ptr) < 2:
-            return False
-        work = state.data.work
-        return work >= LEAST and work >= GRAIN * (len(ptr) - 1)
