@@ -85,5 +85,9 @@ def formed(problem: Problem) -> Count:
     m = float(problem.m)
     entries = min(float(problem.metric.entries_of_a), m * m)
     return Count(
-        "dense", 0.0 if entries < 0.5 * m * m else dense_work(problem.m), entries, m, 1e9 * formed_once(problem)
+        "dense",
+        0.0 if entries < 0.5 * m * m else dense_work(problem.m),
+        entries,
+        m,
+        1e9 * formed_once(problem),
     )

@@ -82,9 +82,7 @@ class PivotState:
 
     def _expected(self) -> float:
         """What the first factor takes [s], by structure."""
-        seconds = first_factor(
-            self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf
-        )
+        seconds = first_factor(self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf)
         if self.symmetric:
             return seconds
         return 2.0 * (max(seconds, _filled(self.problem)) if self.is_sparse else seconds)
