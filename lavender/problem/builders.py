@@ -244,17 +244,17 @@ class Builders(Operators):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         mu = as_array("mu", mu, (rows.n_contacts,))
         if tangents is None:
-            tangents = np.where(mu > 0.0, 2, 0)
+            tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
         contacts = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
-        cones = _joints(rows, lower, upper) + contacts
+        joints = _joints(rows, lower, upper)
+        cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
-        jv = np.zeros(m + 1)
-        # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
-        blank = cls(np.zeros(m), cones, rows=rows, **more)
-        rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
-        return replace(blank, b=target - jv[:m], copy=False)
+        made, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
+        rows_velocity(made.data, rows.v_free, jv)
+        made._aim(target - jv[:m])
+        return made
 
     @classmethod
     def from_jacobian(
@@ -470,6 +470,9 @@ def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: An
         raise InputError(
             f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
         )
+    if not c or tangents.min() == tangents.max():
+        some = int(tangents[0]) if c else 2
+        return Cones.contacts(mu, some, patch_radius, rolling=rolling, shape=shape)
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
     kind = kinds_of(np.ones(c, bool), spin=spin, rolls=rolls)
     free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)

@@ -142,6 +142,13 @@ class ProblemData:
         put(self, "name", str(self.name))
         put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
 
+    def _aim(self, b: FloatArray) -> None:
+        """Take b (m,) [m/s] where the zeros stood with which it was made, before anybody else has seen the problem."""
+        self.b.setflags(write=True)
+        self.b[:] = b
+        as_array("b", self.b, (self.m,), unit="m/s", copy=False)
+        _check_rhs(self.b)
+
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
         """From read-only arrays that an adapter has made and checked, in generalised coordinates: adopted as they are."""

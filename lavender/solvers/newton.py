@@ -39,7 +39,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
@@ -101,7 +101,7 @@ class NewtonState:
 
 
 @dataclass(frozen=True)
-class Newton:
+class Newton(Solver):
     """Interior point and semismooth Newton.
 
     Parameters
