@@ -151,7 +151,7 @@ class ProblemData:
 
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From read-only arrays that an adapter has made and checked, in generalised coordinates: adopted as they are."""
+        """From read-only arrays that an adapter has made and checked, in generalised coordinates; adopted."""
         made = object.__new__(cls)
         derived, put = Derived(), made.__dict__
         put.update(given, derived=derived, precision="float64", copy=True)
