@@ -151,12 +151,10 @@ class ProblemData:
 
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From arrays that an adapter has made and checked, in generalised coordinates: adopted as they are."""
+        """From read-only arrays that an adapter has made and checked, in generalised coordinates; adopted."""
         made = object.__new__(cls)
         derived, put = Derived(), made.__dict__
         put.update(given, derived=derived, precision="float64", copy=True)
-        for name in ("b", "compliance", "key"):
-            put[name].setflags(write=False)
         derived.view = general_data(
             put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
             FRICTION_NUMBER[put["friction"]],
