@@ -169,22 +169,6 @@ def test_no_velocities_no_rows_and_rows_on_nothing():
     assert lv.solve(hopeless, "newton").status is lv.Status.INFEASIBLE
 
 
-# -- cones that are easy to build -------------------------------------------------------------------
-
-
-def test_cones_add_up():
-    cones = lv.Cones.free(6) + lv.Cones.bounded([0.0, -1.0], [1.0, 1.0]) + lv.Cones.contacts(0.5, 2, count=8)
-    assert (cones.n_rows, cones.n_blocks) == (6 + 2 + 24, 6 + 2 + 8)
-    assert np.array_equal(cones.mu[8:], np.full(8, 0.5))
-    # What was put together passes the door of what is made whole.
-    assert lv.Cones(cones.ptr, cones.kind, cones.lower, cones.upper, cones.mu, cones.patch_radius) == cones
-    assert not cones.ptr.flags.writeable
-    assert lv.Cones.contacts(0.5).n_blocks == 1
-    assert lv.Cones.contacts([0.5, 0.6], patch_radius=0.1).n_rows == 8
-    assert lv.Cones.contacts(0.5, 5, count=2).kind.tolist() == [lv.ROUND] * 2
-    assert lv.Cones.free(0) + lv.Cones.free(1) == lv.Cones.free(1)
-
-
 # -- newton over velocities -------------------------------------------------------------------------
 
 
