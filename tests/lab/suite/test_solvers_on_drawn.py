@@ -141,7 +141,7 @@ def test_many_bodies_on_one_leave_half_of_the_rows():
     assert systems.EARLY_FILL < problem.csr.nnz / problem.m**2 < systems.DENSE_FILL
     system = make_system(problem, "impulse")
     assert not system.dense
-    assert system.sparse.work < 0.2 * problem.m**3 / 3.0
+    assert system.work < 0.2 * problem.m**3 / 3.0
     sparse_one = lv.solve(problem, "newton", tol=1e-9)
     with mock.patch.multiple(systems, DENSE_FILL=0.25):
         assert make_system(problem, "impulse").dense
