@@ -238,7 +238,6 @@ class ADMM(Solver):
         """What `prepare` takes [s], as counted; what it leaves is begun by `run` if it fits there."""
         return min(_opening(problem), AT_ONCE) + loading("scipy.sparse", "scipy.linalg.lapack")
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
         load()
