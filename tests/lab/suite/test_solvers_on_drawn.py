@@ -75,7 +75,7 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
     clock, asked = [0.0], []
 
     class Kernel:
-        islands, largest, ends = 1, general.prepare(problem).largest, general.ENDS["spent"]
+        islands, work, ends = 1, general.prepare(problem).work, general.ENDS["spent"]
 
         def run(self, impulse, tol, steps, again):
             asked.append(steps)
