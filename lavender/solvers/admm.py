@@ -27,7 +27,7 @@ from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import LARGEST_MEMORY
-from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, Panels, mirrored, rows_of
+from lavender.solvers.factors import GENERAL_LIMIT, PANELS_WORK, TINY, Panels, mirrored, rows_of
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import loading

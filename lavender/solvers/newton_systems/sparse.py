@@ -17,7 +17,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.solvers._factor import TINY, Panels
+from lavender.solvers.factors import TINY, Panels
 from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.solve import WHATS, Solve

@@ -11,7 +11,7 @@ from typing import Any
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.solvers._factor import DENSE_LIMIT, WIDE
+from lavender.solvers.factors import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender.solvers.setup_times import dense_work

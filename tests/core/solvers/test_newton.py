@@ -17,7 +17,7 @@ from worked import python
 import lavender as lv
 from benchmarks.piles import DT, Pile
 from lavender.problem.cones import ROW
-from lavender.solvers import _factor
+from lavender.solvers import factors
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import make_system
@@ -410,7 +410,7 @@ def test_one_analysis_serves_all_factors_of_few_entries(even, monkeypatch):
             made.append(args[4] if len(args) > 4 else None)
             super().__init__(*args)
 
-    monkeypatch.setattr(_factor, "SparsePanels", Counted)
+    monkeypatch.setattr(factors, "SparsePanels", Counted)
     problem = in_contacts(sparse_rows(1, even=even))
     solution = lv.solve(problem, "newton", tol=1e-8)
     assert solution.success and solution.work["factorisations"] > 5

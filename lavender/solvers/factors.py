@@ -1,4 +1,4 @@
-"""Factorisations under `direct`: which one a matrix gets, and one interface over them.
+"""Factorisations: which one a matrix gets under `direct`, and one interface over them, `factor` and `solve`.
 
     band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
     dense    Cholesky (LAPACK potrf)
