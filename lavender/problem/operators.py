@@ -36,12 +36,10 @@ class Operators(ProblemData):
 
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From arrays that an adapter has made and `export.numbers` has let in, in generalised coordinates: adopted."""
+        """From read-only arrays that `export.numbers` has let in, in generalised coordinates: adopted."""
         made = object.__new__(cls)
         derived, put = Derived(), made.__dict__
         put.update(given, derived=derived, precision="float64", copy=True)
-        for name in ("b", "compliance", "key"):
-            put[name].setflags(write=False)
         derived.view = general_data(
             put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
             FRICTION_NUMBER[put["friction"]],
