@@ -458,21 +458,22 @@ def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
 def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
     """Contacts of 0 to 2 tangents each (c,); with a radius all have a spin row, with mu_r two that roll."""
     spin, rolls, c = patch_radius is not None, rolling is not None, len(mu)
-    if c and (tangents.min() < 0 or tangents.max() > 2):
+    least, most = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
+    if least < 0 or most > 2:
         raise InputError("tangents must be 0, 1 or 2 for each contact")
-    if rolls and c and tangents.min() < 2:
+    if rolls and least < 2:
         raise InputError(
-            f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
+            f"contact {int(np.argmin(tangents))} has {least} tangents; rolling needs two, about which it "
             "rolls: give tangents=2"
         )
-    smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
-    if len(smooth) and not spin:
-        raise InputError(
-            f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
-        )
-    if not c or tangents.min() == tangents.max():
-        some = int(tangents[0]) if c else 2
-        return Cones.contacts(mu, some, patch_radius, rolling=rolling, shape=shape)
+    if least == 0 and not spin:
+        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
+        if len(smooth):
+            raise InputError(
+                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+            )
+    if least == most:
+        return Cones.contacts(mu, most, patch_radius, rolling=rolling, shape=shape)
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
     kind = kinds_of(np.ones(c, bool), spin=spin, rolls=rolls)
     free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)

@@ -115,7 +115,7 @@ class AdmmState:
         if self.kind == _BODIES:
             assert problem.rows is not None
             rows = problem.rows
-            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).cost)
+            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
         return _PANELS_WORK * self.panels.work if m else 0.0
 
     @property

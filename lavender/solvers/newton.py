@@ -78,11 +78,11 @@ class NewtonState:
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
-            return Count("bodies", system.cost, read, float(problem.m))
+            return Count("bodies", system.work, read, float(problem.m))
         made = 0.0 if problem.generalized is None else 1e9 * formed_once(problem)
         return Count(
             "dense" if system.dense else "panels",
-            system.multiply_adds,
+            system.work,
             system.entries,
             float(problem.m),
             made,
