@@ -32,7 +32,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
+from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import factored, over_rows

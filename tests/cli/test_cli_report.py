@@ -16,9 +16,9 @@ import lavender as lv
 from lavender import bench, cli, io
 from lavender import out as export
 from lavender.base.errors import InputError
-from lavender.cli import main
+from lavender.cli import main, measuring
 from lavender.cli.bench import mujoco
-from lavender.lab.bench import simulators
+from lavender.lab.bench import Event, simulators
 from lavender.lab.phenomena import PHENOMENA
 from lavender.out import vectors
 
@@ -194,6 +194,35 @@ def test_vectors_are_of_the_problems_that_the_report_measured(tmp_path, monkeypa
     refused = CliRunner().invoke(cli.cli, command)
     assert isinstance(refused.exception, lv.InputError) and "--replace" in str(refused.exception)
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp_path, monkeypatch):
+    monkeypatch.setattr(export.library, "source", lambda: "of another test")
+    steps, out = tmp_path / "steps", tmp_path / "out"
+    assert lavender("run", "stack", "--steps", 6, "--record", steps)[0] == 0
+    words = ("--solvers", "newton", "anderson", *QUICK, "--out", out)
+    code, _, err = lavender("report", steps, *words)
+    assert code == 0, err
+    code, _, err = lavender("export", "c", tmp_path / "c", "--for", out)
+    assert code == 0, err
+    assert (tmp_path / "c" / "chosen.h").read_text().count("LAV_") >= 1
+    assert (
+        tmp_path / "c" / "vectors.bin"
+    ).stat().st_size > 1000  # bytes: a problem of the steps and its impulse
+
+
+def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):
+    monkeypatch.setattr(measuring, "EVERY", 0.0)  # s between two lines
+    with measuring.Progress() as watch:
+        for done in range(3):
+            watch(Event(done, 3, "stack", "newton"))
+    assert capsys.readouterr().err.splitlines() == [
+        f"{done} of 3, 0 s: stack newton" for done in range(3)
+    ]  # and no control codes or empty lines
+    monkeypatch.setattr(measuring, "EVERY", 1e9)
+    with measuring.Progress() as watch:
+        watch(Event(0, 3, "stack", "newton"))
+    assert capsys.readouterr().err == ""
 
 
 QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")

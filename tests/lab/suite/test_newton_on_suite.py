@@ -136,7 +136,7 @@ def test_a_narrow_matrix_is_factored_by_panels_that_do_not_fill():
     problem = as_matrix(suite.box_stack(n=40).problem)
     system = make_system(problem, "impulse")
     assert not system.dense
-    assert system.sparse.work <= problem.m * 8**2  # two boxes, four points each
+    assert system.work <= problem.m * 8**2  # two boxes, four points each
     # Redundant points: A is singular, to rounding of either sign.
     assert good(lv.solve(problem, "newton", tol=1e-9), 1e-9)
 

@@ -52,6 +52,28 @@ def test_a_box_slides_to_rest_where_friction_says(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_what_moves_less_than_half_of_both_in_a_substep_passes_no_wall(name):
+    rng = np.random.default_rng(1)
+    passed = {0.99: 0, 1.9: 0}  # share of that bound; beyond it nothing is promised, and half of them pass
+    for share in passed:
+        for k in range(12):
+            wall, r = rng.uniform(0.02, 0.3), rng.uniform(0.05, 0.4)
+            speed = share * (wall / 2 + r) * 120
+            scene = lv.Scene(stepper=name, dt=1 / 60, substeps=2, gravity=0.0)
+            scene.add_box((wall, 40, 40), static=True)
+            place = {
+                "position": (-(wall / 2 + r + rng.uniform(0.5, 1.5) * speed / 60), 0, 0),
+                "velocity": (speed, 0, 0),
+            }
+            if k % 2:
+                scene.add_sphere(r, **place)
+            else:
+                scene.add_box((2 * r, 2 * r, 2 * r), **place)
+            passed[share] += bool(run(scene, 20)[1]["positions"][1][0] > 0.0)
+    assert passed[0.99] == 0 and passed[1.9] > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_ball_slides_until_it_rolls(name):
     scene = lv.Scene(stepper=name, dt=1 / 480)
     scene.add_plane()
