@@ -55,7 +55,6 @@ class DirectState:
     general: GeneralFactor | PanelsLU | None = None
     begun: int = 0  # factorisations before `general` that came to nothing
     is_running: bool = False
-    is_over: bool = False  # the rows have nothing left to do
     note: str = ""
 
 
@@ -309,7 +308,6 @@ class _Run:
 
     def end(self, pivot: PivotState, code: int) -> Claim:
         """What the rows deserve after the last turn."""
-        self.state.is_over = code in OVER
         if code == CIRCLES:
             return self.circling()
         if self.problem.law != "linear":

@@ -61,18 +61,6 @@ def test_without_a_problem_nothing_is_printed_but_why(tmp_path):
     assert warm.exit_code == 0 and "ours, median" in warm.output and "momentum" not in warm.output
 
 
-def test_the_command_refuses_what_it_does_not_know(capsys):
-    pytest.importorskip("flint")
-    from lavender.cli import main
-
-    with pytest.raises(SystemExit) as ended:
-        main(["prove", "stack(n=2)", "--solver", "foo"])
-    assert ended.value.code == 2 and "foo" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as ended:
-        main(["prove", "stack(n=64)", "--solver", "pgs"])
-    assert "pgs: MAX_ITERATIONS" in capsys.readouterr().out or ended.value.code == 0
-
-
 def test_the_command(tmp_path):
     out = tmp_path / "found.json"
     done = CliRunner().invoke(
@@ -178,9 +166,6 @@ def test_the_command_shows_the_way_and_gives_it_as_data(capsys):
         main(["explain", "stack(n=200)", "--json", "--tol", "1e-9"])
     plan = json.loads(capsys.readouterr().out)
     assert plan["tol"] == 1e-9 and plan["rows"] == 200 and plan["stages"][0]["solver"] == "anderson"
-    with pytest.raises(SystemExit) as end:
-        main(["explain", "stack(n=200)", "--tol", "0"])
-    assert end.value.code == 2
 
 
 def test_vectors_are_of_the_problems_that_the_report_measured(tmp_path, monkeypatch):

@@ -348,17 +348,6 @@ def test_a_chain_of_bodies_does_not_fill_in():
 # -- answers ------------------------------------------------------------------------------------------
 
 
-def test_rows_that_cannot_move_are_left_where_they_are():
-    a = np.diag([1.0, 2.0, 3.0])
-    problem = lv.Problem.lcp(a, [1.0, 1.0, 1.0], lower=[0.5, 0.0, 0.0], upper=[0.5, 0.0, np.inf])
-    solution = lv.solve(problem, "newton", tol=1e-12)
-    np.testing.assert_allclose(solution.impulse, [0.5, 0.0, 1.0 / 3.0], rtol=0, atol=1e-14)
-    frictionless = lv.Problem.contact(np.eye(6), np.ones(6), [0.0, 0.5], friction="cone")
-    solution = lv.solve(frictionless, "newton", tol=1e-12)
-    assert good(solution, 1e-12)
-    assert np.array_equal(solution.impulse[1:3], [0.0, 0.0])
-
-
 # -- claims -------------------------------------------------------------------------------------------
 
 

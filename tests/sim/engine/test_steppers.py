@@ -124,20 +124,6 @@ def test_a_ball_on_a_rod_swings_with_the_period_of_the_pendulum(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_no_stepper_sees_the_unit_of_mass(name):
-    """Powers of four, whose roots are exact, change no bit."""
-    seen = []
-    for unit in (1.0, 2.0**-40, 2.0**40):
-        scene, before = sliding(name, mass=unit), -1
-        for i in range(4):
-            link = scene.add_box((0.1, 0.1, 0.4), unit * 8.0 ** (i == 3), position=(3.0 + 0.5 * i, 0, 2.0))
-            scene.add_joint("ball", before, link, anchor=(2.75 + 0.5 * i, 0, 2.0))
-            before = link
-        seen.append(run(scene, 60)[1]["positions"].tobytes())
-    assert seen[0] == seen[1] == seen[2]
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_boxes_stand_for_ten_seconds(name):
     # xpbd without warm starts: few of them, in short substeps
     more = {"n": 3, "substeps": 20, "solver_iterations": 1} if name == "xpbd" else {}
@@ -350,29 +336,18 @@ def test_one_correction_of_xpbd_is_equation_2():
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("scene", ["card_house", "bridge"])
-def test_a_snapshot_goes_on_with_the_same_bits(name, scene, tmp_path):
-    sim = after(20, scene, stepper=name)
-    sim.save(tmp_path / "state")
-    end = [sim.step() for _ in range(20)][-1][0]
-    other = lv.Simulation(lv.Scene(scene, stepper=name))
-    other.load(tmp_path / "state")
-    again = [other.step() for _ in range(20)][-1][0]
-    for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
-        assert end[key].tobytes() == again[key].tobytes(), key
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scene", ["card_house", "bridge", "chain"])
 def test_the_unit_of_mass_changes_no_bit_of_the_motion(name, scene):
-    own, other = lv.Scene(scene, stepper=name), lv.Scene(scene, stepper=name)
-    other.bodies[:] = [replace(b, mass=4096.0 * b.mass, inertia=4096.0 * b.inertia) for b in other.bodies]
-    own, other = lv.Simulation(own), lv.Simulation(other)
-    for _ in range(20):
-        seen, scaled = own.step()[0], other.step()[0]
-    for key in ("positions", "quaternions", "velocities"):
-        assert seen[key].tobytes() == scaled[key].tobytes(), key
-    assert (4096.0 * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
+    """Powers of four, whose roots are exact."""
+    own = lv.Scene(scene, stepper=name)
+    seen = run(own, 20)[1]
+    for unit in (2.0**-40, 2.0**12, 2.0**40):
+        other = lv.Scene(scene, stepper=name)
+        other.bodies[:] = [replace(b, mass=unit * b.mass, inertia=unit * b.inertia) for b in own.bodies]
+        scaled = run(other, 20)[1]
+        for key in ("positions", "quaternions", "velocities"):
+            assert seen[key].tobytes() == scaled[key].tobytes(), key
+        assert (unit * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
 
 
 @pytest.mark.parametrize("name", OTHERS)
