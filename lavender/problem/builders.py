@@ -10,9 +10,10 @@ import numpy as np
 
 from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
 from lavender.base.errors import InputError
-from lavender.problem.cones import Cones, check_shape, kinds_of
+from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.data import checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
+from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import Operators
 from lavender.problem.quadratic import quadratic, unpacked
