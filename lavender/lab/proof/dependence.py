@@ -18,7 +18,7 @@ class Tangled(Exception):
     """Rows that depend on each other to rounding, by no simple quotients."""
 
 
-SPARSE = 200  # rows above which the factor is sparse
+SPARSE = 1000  # rows above which the factor is sparse: it does not take the farthest row first
 
 DEPENDS = 1e-10  # of a row's length squared, to the span of those before it: depends on them to rounding
 
