@@ -144,11 +144,11 @@ class ProblemData:
 
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From arrays that an adapter has made and checked, in generalised coordinates: adopted as they are."""
+        """From arrays that were made here and checked, in generalised coordinates: adopted as they are."""
         made = object.__new__(cls)
         derived, put = Derived(), made.__dict__
         put.update(given, derived=derived, precision="float64", copy=True)
-        for name in ("b", "compliance", "key"):
+        for name in given.keys() & {"b", "compliance", "key"}:
             put[name].setflags(write=False)
         derived.view = general_data(
             put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],

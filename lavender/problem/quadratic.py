@@ -20,6 +20,7 @@ whose diagonal is zero are zero, as they must be, D stands on these alone; if P 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.core.checks import largest
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import all_finite, program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
@@ -90,35 +91,43 @@ class QPSolution:
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
 
     @cached_property
-    def _parts(self) -> tuple[FloatArray, ...]:
+    def _curvature(self) -> FloatArray:
+        """P x (n,)."""
+        px, proximal = self.qp.generalized.momentum_of(self.x), self.qp.proximal
+        return px if proximal is None else px - proximal * self.x
+
+    @cached_property
+    def _residuals(self) -> tuple[float, ...]:
+        """r_p, r_d, gap, and what each is the sum of."""
         qp, of = self.qp, self.qp.generalized
-        px = of.momentum_of(self.x)
-        if qp.proximal is not None:
-            px = px - qp.proximal * self.x
-        return px, of.velocity_of(self.x), of.force(self.impulse)
+        least = 0.0
+        if largest(qp.target) == 0.0:  # x = 0 may be the solution
+            least = FLAT * largest(of.velocity_of(of.v_free))
+        found: tuple[float, ...] = program_residuals(
+            self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
+            qp.free, least, FLAT * largest(of.operator.mass[2]),
+        )  # fmt: skip
+        return found
 
     @property
     def objective(self) -> float:
         """1/2 x.P x + q.x."""
-        return float(0.5 * self.x @ self._parts[0] + self.qp.q @ self.x)
+        return float(0.5 * self.x @ self._curvature + self.qp.q @ self.x)
 
     @property
     def primal_residual(self) -> float:
         """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
-        short, free = self.qp.target - self._parts[1], self.qp.free
-        return max(largest(short[:free]), float(short[free:].max(initial=0.0)))
+        return self._residuals[0]
 
     @property
     def dual_residual(self) -> float:
         """max |P x + q + A^T y + G^T z + z_box|, or the largest negative z where that is more."""
-        px, _, force = self._parts
-        wrong = -self.impulse[self.qp.free :].min(initial=0.0)
-        return max(largest(px + self.qp.q - force), float(wrong))
+        return self._residuals[1]
 
     @property
     def duality_gap(self) -> float:
         """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
-        return float(abs(self.x @ (self._parts[0] + self.qp.q) - self.qp.target @ self.impulse))
+        return self._residuals[2]
 
     @cached_property
     def error(self) -> float:
@@ -128,18 +137,8 @@ class QPSolution:
         one over the largest of |q|, |P x|, |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the
         sums of |lambda| and |x|.
         """
-        px, jx, force = self._parts
-        q, target = self.qp.q, self.qp.target
-        wanted = largest(target)
-        rows = max(wanted, largest(jx))
-        if wanted == 0.0:  # x = 0 may be the solution
-            of = self.qp.generalized
-            rows = max(rows, FLAT * largest(of.velocity_of(of.v_free)))
-        curved = FLAT * largest(self.qp.generalized.operator.mass[2]) * largest(self.x)
-        forces = max(curved, largest(px), largest(q), largest(force))
-        energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
-        wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
-        return float(max(found / size if size > 0.0 else found for found, size in wrong))
+        of = self._residuals
+        return max(of[i] / of[i + 3] if of[i + 3] > 0.0 else of[i] for i in range(3))
 
     @property
     def found(self) -> bool:
@@ -185,9 +184,7 @@ class QuadraticProgram:
     @property
     def cones(self) -> Cones:
         """Free rows, then impulses >= 0."""
-        low = np.zeros(len(self.target))
-        low[: self.free] = -np.inf
-        return Cones.bounded(low, np.inf)
+        return _one_sided(self.free, len(self.target))
 
     def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
         """The proximal step from a centre (n,), with this share of D."""
@@ -250,6 +247,13 @@ class QuadraticProgram:
         return read_only(d) if falls else None
 
 
+@lru_cache(maxsize=8)  # programs of one controller have the same
+def _one_sided(free: int, m: int) -> Cones:
+    low = np.zeros(m)
+    low[:free] = -np.inf
+    return Cones.bounded(low, np.inf)
+
+
 def quadratic(given: Given) -> QuadraticProgram:
     """The program of P, q, G, h, A, b, lb, ub as a constraint problem; see `Problem.from_qp`."""
     P, q, G, h, A, b, lb, ub = given
@@ -273,11 +277,8 @@ def quadratic(given: Given) -> QuadraticProgram:
     if low is not None and up is not None:
         rows.bounds(low, lb, 1.0)
         rows.bounds(up, ub, -1.0)
-    jac = stacked(n, rows.parts)
-    target = read_only(
-        rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets])
-    )
-    generalized, proximal = _definite(lower, jac, q, target)
+    jac, target = rows.stacked
+    generalized, proximal = _definite(lower, jac, q, read_only(target))
     return QuadraticProgram(
         generalized=generalized, q=q, target=target, free=free, n_equalities=n_a, n_inequalities=n_g, kept=kept,
         fixed=fixed, lower=low, upper=up, proximal=proximal,
@@ -302,14 +303,15 @@ def unpacked(given: Given) -> Given:
     return tuple(getattr(P, name) for name in names)
 
 
-def _matrix(name: str, given: Any, n: int) -> Compressed:
-    """Rows of a dense or sparse matrix of n columns without its zeros, checked; one dimension is one row."""
-    if not issparse(given):
+def _matrix(name: str, given: Any, n: int, sign: float) -> Compressed:
+    """Rows of a dense or sparse matrix of n columns times a sign, without zeros, checked; one dimension is one row."""
+    sparse = issparse(given)
+    if not sparse:
         dense = borrowed(name, given, (None,) * max(1, len(shape_of(name, given))))
         given = dense[None] if dense.ndim == 1 else dense
     if len(given.shape) != 2 or given.shape[1] != n:
         raise InputError(f"{name} has shape {given.shape}; (any, {n}) is needed, as q has {n} entries")
-    return compressed(name, given) if issparse(given) else dense_to_csr(given)
+    return compressed(name, given, sign) if sparse else dense_to_csr(given, sign)
 
 
 def _hessian(P: Any, n: int) -> Compressed:
@@ -324,18 +326,27 @@ class _Rows:
 
     def __init__(self, n: int) -> None:
         self.n, self.m = n, 0
-        self.parts = list[tuple[Any, ...]]()
+        self.parts = list[Compressed]()
         self.targets = list[FloatArray]()
 
-    def put(self, rows: Compressed, right: FloatArray, sign: float) -> None:
-        self.parts.append((*rows, False, sign, len(right)))
-        self.targets.append(sign * right)
-        self.m += len(right)
+    def put(self, rows: Compressed, target: FloatArray) -> None:
+        self.parts.append(rows)
+        self.targets.append(target)
+        self.m += len(target)
+
+    @property
+    def stacked(self) -> tuple[Compressed, FloatArray]:
+        """J and target, all parts one under another."""
+        if len(self.parts) == 1:
+            return self.parts[0], self.targets[0]
+        parts = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.parts]
+        return stacked(self.n, parts), np.concatenate([np.zeros(0), *self.targets])
 
     def bounds(self, at: IntpArray, bound: FloatArray, sign: float) -> None:
         """sign x_i >= sign bound_i of these variables."""
         k = len(at)
-        self.put((np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.ones(k)), bound[at], sign)
+        rows = np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.full(k, sign)
+        self.put(rows, sign * bound[at])
 
     def given(self, name: str, matrix: Any, side: str, vector: Any) -> tuple[int | None, IntpArray | None]:
         """A or G; how many rows were given, and which of them are put here: None, all; not those with h infinite."""
@@ -344,10 +355,10 @@ class _Rows:
             raise InputError(f"{missing} is missing: {name} and {side} go together")
         if matrix is None:
             return None, None
-        rows = _matrix(name, matrix, self.n)
+        rows = _matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
         m = len(rows[0]) - 1
         if name == "A":
-            self.put(rows, as_array(side, vector, (m,)), 1.0)
+            self.put(rows, as_array(side, vector, (m,)))
             return m, None
         right, kept = as_array(side, vector, (m,), finite=False), None
         if not all_finite(right):
@@ -356,7 +367,7 @@ class _Rows:
             rows, right = _picked(rows, kept), right[kept]
             if not all_finite(right):
                 raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")
-        self.put(rows, right, -1.0)
+        self.put(rows, -right)
         return m, kept
 
 
