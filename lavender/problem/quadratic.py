@@ -11,6 +11,12 @@ All other impulses are >= 0. As M (x - v*) = J^T lambda,
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
+Over velocities J is whitened by the factor of M, which fills it in where P couples many variables. The same program is
+a constraint problem of rows, with x and y as its impulses and A without symmetry, as sparse as P and J:
+
+    [ M  -J^T ] [x]   [ M v*   ]     x within its bounds, lambda as above, J without the rows of bounds
+    [ J   0   ] [y] - [ target ] = w                                                                      (4)
+
 P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
 centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
 D (c - x), and `lavender.solve_qp` repeats it around the x found until that is small. Where the rows of P
@@ -45,6 +51,8 @@ PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
 FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
+# Entries of J, whitened, over those of J and of M's factor, from which (4) costs less, and variables up to which not.
+FILLED, FEW = 3.0, 100
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
@@ -195,6 +203,56 @@ class QuadraticProgram:
         general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
         return replace(self, generalized=general, proximal=d)
 
+    @property
+    def fills_in(self) -> bool:
+        """Whether J, whitened, has so many more entries than J that rows of (4) are solved sooner."""
+        of = self.generalized.operator
+        return bool(of.n > FEW and of.reach > FILLED * (len(of.jac[1]) + len(of.mass[1]) + of.fill))
+
+    @property
+    def _rows_of_box(self) -> tuple[tuple[IntpArray, slice], ...]:
+        """Variables and rows of lb = ub, of lb and of ub."""
+        if self.fixed is None or self.lower is None or self.upper is None:
+            return tuple((np.zeros(0, np.intp), slice(0, 0)) for _ in range(3))
+        end = len(self.target)
+        low = end - len(self.upper)
+        places = slice(self.n_equalities or 0, self.free), slice(low - len(self.lower), low), slice(low, end)
+        return tuple(zip((self.fixed, self.lower, self.upper), places, strict=True))
+
+    @property
+    def _own_rows(self) -> npt.NDArray[np.bool_]:
+        """(m,) Rows of A and G."""
+        own = np.ones(len(self.target), bool)
+        for _, rows in self._rows_of_box:
+            own[rows] = False
+        return own
+
+    def over_rows(self) -> tuple[FloatArray, Cones, sp.csr_array]:
+        """b, cones and A of (4)."""
+        of, own, cones = self.generalized, self._own_rows, self.cones
+        low, high = np.full(of.nv, -np.inf), np.full(of.nv, np.inf)
+        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
+        low[fixed] = high[fixed] = self.target[equal]
+        low[lower], high[upper] = self.target[above], -self.target[below]
+        j = of.jac[own]
+        a = sp.block_array([[of.mass, -j.T], [j, None]], format="csr") if own.any() else of.mass
+        bounds = np.concatenate([low, cones.lower[own]]), np.concatenate([high, cones.upper[own]])
+        return np.concatenate([of.momentum_of(of.v_free), self.target[own]]), Cones.bounded(*bounds), a
+
+    def start_over_rows(self, impulse: FloatArray) -> FloatArray:
+        """Impulses (m,) as those of (4)."""
+        x = self.generalized.v_free + self.generalized.change(impulse)
+        return np.concatenate([x, impulse[self._own_rows]])
+
+    def impulse_from_rows(self, impulse: FloatArray, slack: FloatArray) -> FloatArray:
+        """Impulses (m,) of impulses and slack of (4): bounds carry what is left of the forces."""
+        out, n = np.empty(len(self.target)), len(self.q)
+        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
+        out[self._own_rows] = impulse[n:]
+        out[equal], out[above], out[below] = slack[fixed], slack[lower], -slack[upper]
+        np.maximum(out[self.free :], 0.0, out=out[self.free :])
+        return out
+
     def multipliers(
         self, impulse: FloatArray
     ) -> tuple[FloatArray | None, FloatArray | None, FloatArray | None]:
@@ -221,11 +279,15 @@ class QuadraticProgram:
                 z = whole
         return y, z, box
 
-    def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
-        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,), found if the error is at most tol."""
+    def solution(self, solution: Any, tol: float = 1e-6, x: FloatArray | None = None) -> QPSolution:
+        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,), found if the error is at most tol.
+
+        x (n,), if it is known better than v* + M^-1 J^T lambda.
+        """
         given = getattr(solution, "impulse", None)
         impulse = as_array("impulse", solution, (len(self.target),)) if given is None else given
-        x = self.generalized.v_free + self.generalized.change(impulse)
+        if x is None:
+            x = self.generalized.v_free + self.generalized.change(impulse)
         found = None if given is None else solution
         y, z, box = self.multipliers(impulse)
         return QPSolution(
