@@ -67,7 +67,8 @@ def as_array(
         made = checks.plain(value, shape, finite, copy)
         if made is not None:
             return made
-        if type(value) is float and abs(value) <= MOST and len(shape) == 1 and shape[0] is not None:
+        fits = type(value) is float and (abs(value) <= MOST or not finite)
+        if fits and len(shape) == 1 and shape[0] is not None:
             plain = np.empty(shape[0])
             plain.fill(value)
             return read_only(plain)

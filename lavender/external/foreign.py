@@ -15,25 +15,37 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, read_only
+from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
+from lavender.solvers.registry import Solver
 from lavender_ext.judge.measure import all_finite
 
 __all__ = ["Foreign"]
 
 
-class Foreign:
-    """A solver of another package with the interface of `lavender.solvers.registry`, wrapped."""
+class Foreign(Solver):
+    """A solver of another package, of which `prepare`, `update` and `run` suffice."""
 
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
-        if hasattr(solver, "setup_time"):
-            self.setup_time = solver.setup_time
-        if hasattr(solver, "ready"):
-            self.ready = lambda held, time_limit: solver.ready(held.state, time_limit)
-        if hasattr(solver, "until"):
-            self.until = lambda held, deadline: solver.until(held.state, deadline)
+
+    def _if_there(self, method: str, *arguments: Any) -> Any:
+        asked = getattr(self.solver, method, None)
+        return None if asked is None else asked(*arguments)
+
+    def setup_time(self, problem: Problem) -> float:
+        """What its `prepare` takes [s]; 0 where it does not say."""
+        return self._if_there("setup_time", problem) or 0.0
+
+    def ready(self, held: Held, time_limit: float) -> None:
+        """Start processes."""
+        self._if_there("ready", held.state, time_limit)
+
+    def until(self, held: Held, deadline: Deadline) -> None:
+        """Begin no long step that would end after that."""
+        self._if_there("until", held.state, deadline)
 
     def prepare(self, problem: Problem) -> Held:
         """Factor, colour, allocate, for a copy of the problem."""

@@ -16,6 +16,7 @@ from lavender.external.backend import Backend
 from lavender.external.running import ask
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
+from lavender.solvers.registry import Solver
 
 __all__ = ["OPTIONS", "QPSolver", "refusal"]
 
@@ -30,7 +31,7 @@ OPTIONS = {
 
 
 @dataclass(frozen=True)
-class QPSolver:
+class QPSolver(Solver):
     """A backend with its options, which OPTIONS says in words."""
 
     backend: Backend
@@ -74,9 +75,6 @@ class QPSolver:
                 f"than {DENSE_LIMIT >> 20} MiB; use a sparse backend (osqp, piqp, clarabel)"
             )
         return qp
-
-    def update(self, state: QP, problem: Problem) -> QP:
-        return self.prepare(problem)
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(

@@ -236,7 +236,8 @@ def reference(problem: Problem) -> tuple[float, float]:
     data = problem.metric
     if data.start_energy < 0.0:
         start = measure.begin(data)
-        problem.__dict__.setdefault("_start", start)
+        if problem.derived.start is None:
+            problem.derived.start = start
         if problem.generalized is not None and "csr_data" in problem.__dict__:
             problem.csr_data.set_start(data.start_energy, data.start_velocity)
     return data.start_energy, data.start_velocity

@@ -7,6 +7,7 @@ Arrays are read where they stand, in float32 or float64: what is made of one wor
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any, overload
 
 import numpy as np
@@ -274,17 +275,15 @@ class Batch(Sequence[Problem]):
     def _cones_of(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Blocks of world i, with their own mu (k,) where it is given."""
         place = self.at[i]
-        block, k, row, m = (int(place[PLACE[name]]) for name in ("block", "blocks", "cone_row", "rows"))
+        block, k = (int(place[PLACE[name]]) for name in ("block", "blocks"))
         c = self.cones
         if self._shared and mu is None:
             return c
-        of, rows = slice(block, block + k), slice(row, row + m)
-        rub = c.mu[of] if mu is None else mu
-        check_sizes("mu", rub, "-")
-        return Cones(
-            ptr=c.ptr[block : block + k + 1] - c.ptr[block], kind=c.kind[of], lower=c.lower[rows],
-            upper=c.upper[rows], mu=rub, patch_radius=c.patch_radius[of], rolling=c.rolling[of],
-        )  # fmt: skip
+        part = c.take(np.arange(block, block + k))
+        if mu is None:
+            return part
+        check_sizes("mu", mu, "-")
+        return replace(part, mu=mu)
 
     # -- a sequence of problems ------------------------------------------------------------------------
 
@@ -492,6 +491,6 @@ def _joined(cones: Any, n: int) -> Cones:
         raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
     offset = np.cumsum([0, *(c.n_rows for c in each)])
     ptr = np.concatenate([*(c.ptr[:-1] + at for c, at in zip(each, offset, strict=False)), offset[-1:]])
-    parts = (np.concatenate([getattr(c, name) for c in each] or [np.zeros(0)]) for name in
-             ("kind", "lower", "upper", "mu", "patch_radius", "rolling"))  # fmt: skip
+    names = [f.name for f in fields(Cones) if f.name != "ptr"]
+    parts = (np.concatenate([getattr(c, name) for c in each] or [np.zeros(0)]) for name in names)
     return Cones(ptr.astype(np.int32), *parts)

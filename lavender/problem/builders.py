@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, read_only, shape_of
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, check_shape, kinds_of
 from lavender.problem.data import checked_matrix
@@ -245,17 +245,17 @@ class Builders(Operators):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")
         mu = as_array("mu", mu, (rows.n_contacts,))
         if tangents is None:
-            tangents = np.where(mu > 0.0, 2, 0)
+            tangents = 2 * (mu > 0.0).astype(np.int32)
         tangents = as_array("tangents", tangents, mu.shape, dtype=np.int32)
         contacts = _contacts(mu, tangents, patch_radius, rolling, check_shape("shape", shape))
-        cones = _joints(rows, lower, upper) + contacts
+        joints = _joints(rows, lower, upper)
+        cones = joints + contacts if rows.n_joints else contacts
         m = cones.n_rows
         target = as_array("target", target, (m,), unit="m/s")
-        jv = np.zeros(m + 1)
-        # b = target - J v*: the slack kernel with lambda = 0 and v = v* gives J v* - 0.
-        blank = cls(np.zeros(m), cones, rows=rows, **more)
-        rows_velocity(blank.data, np.ascontiguousarray(rows.v_free), jv)
-        return replace(blank, b=target - jv[:m], copy=False)
+        made, jv = cls(np.zeros(m), cones, rows=rows, **more), np.zeros(m + 1)
+        rows_velocity(made.data, rows.v_free, jv)
+        made._aim(target - jv[:m])
+        return made
 
     @classmethod
     def from_jacobian(
@@ -391,8 +391,9 @@ class Builders(Operators):
         of = qp.generalized
         b = of.bias(qp.target)
         if not more and of.operator.most <= USUAL and (LEAST <= largest(b) <= MOST or not b.any()):
+            rigid = read_only(np.zeros(of.m))
             made: P = cls._of_engine(
-                b=b, cones=qp.cones, generalized=of, compliance=np.zeros(of.m), friction="coulomb", qp=qp
+                b=read_only(b), cones=qp.cones, generalized=of, compliance=rigid, friction="coulomb", qp=qp
             )
             return made
         return cls(b, qp.cones, generalized=of, qp=qp, **more)  # with the words for what is amiss
@@ -466,18 +467,22 @@ def _joints(rows: Rows, lower: ArrayLike, upper: ArrayLike) -> Cones:
 def _contacts(mu: FloatArray, tangents: IntArray, patch_radius: Any, rolling: Any, shape: str) -> Cones:
     """Contacts of 0 to 2 tangents each (c,); with a radius all have a spin row, with mu_r two that roll."""
     spin, rolls, c = patch_radius is not None, rolling is not None, len(mu)
-    if c and (tangents.min() < 0 or tangents.max() > 2):
+    least, most = (int(tangents.min()), int(tangents.max())) if c else (2, 2)
+    if least < 0 or most > 2:
         raise InputError("tangents must be 0, 1 or 2 for each contact")
-    if rolls and c and tangents.min() < 2:
+    if rolls and least < 2:
         raise InputError(
-            f"contact {int(np.argmin(tangents))} has {tangents.min()} tangents; rolling needs two, about which it "
+            f"contact {int(np.argmin(tangents))} has {least} tangents; rolling needs two, about which it "
             "rolls: give tangents=2"
         )
-    smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
-    if len(smooth) and not spin:
-        raise InputError(
-            f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
-        )
+    if least == 0 and not spin:
+        smooth = np.flatnonzero((mu > 0.0) & (tangents == 0))
+        if len(smooth):
+            raise InputError(
+                f"contact {smooth[0]} has mu {mu[smooth[0]]:g} and no tangent to feel it: give tangents=2, or mu 0"
+            )
+    if least == most:
+        return Cones.contacts(mu, most, patch_radius, rolling=rolling, shape=shape)
     ptr = np.concatenate([[0], np.cumsum(1 + tangents + spin + 2 * rolls)]).astype(np.int32)
     kind = kinds_of(np.ones(c, bool), spin=spin, rolls=rolls)
     free, none = np.full(int(ptr[-1]), np.inf), np.zeros(c)

@@ -142,14 +142,19 @@ class ProblemData:
         put(self, "name", str(self.name))
         put(self, "copy", True)  # of what was given here: another problem made of this one says so itself
 
+    def _aim(self, b: FloatArray) -> None:
+        """Take b (m,) [m/s] where the zeros stood with which it was made, before anybody else has seen the problem."""
+        self.b.setflags(write=True)
+        self.b[:] = b
+        as_array("b", self.b, (self.m,), unit="m/s", copy=False)
+        _check_rhs(self.b)
+
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From arrays that were made here and checked, in generalised coordinates: adopted as they are."""
+        """From read-only arrays that were made here and checked, in generalised coordinates; adopted."""
         made = object.__new__(cls)
         derived, put = Derived(), made.__dict__
         put.update(given, derived=derived, precision="float64", copy=True)
-        for name in given.keys() & {"b", "compliance", "key"}:
-            put[name].setflags(write=False)
         derived.view = general_data(
             put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
             FRICTION_NUMBER[put["friction"]],

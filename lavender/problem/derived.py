@@ -8,6 +8,7 @@ from threading import RLock
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, overload
 
 if TYPE_CHECKING:
+    from lavender.base.arrays import FloatArray
     from lavender_ext.core.problem import Data
     from lavender_ext.judge.measure import Judged
 
@@ -30,6 +31,7 @@ class Derived:
         "process",
         "small",
         "spread",
+        "start",
         "vain",
         "view",
     )
@@ -42,8 +44,9 @@ class Derived:
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
         self.factor: Any = None  # the factorisation that suits A: its name, half bandwidth, order
-        # Whose one compiled call did not end, from where, and what it did.
-        self.vain: tuple[str, float, bytes, tuple[int, ...]] | None = None
+        # Whose one compiled call did not end, to what tol and from where, and what it did (`SmallCall.in_vain`).
+        self.vain: tuple[tuple[str, float, bytes], tuple[int, ...]] | None = None
+        self.start: FloatArray | None = None  # (m,) N s, doing nothing
         self.motion: Any = None  # `Kept` of lavender.lab.motion: the reference of motion errors, its operator
 
 

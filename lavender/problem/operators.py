@@ -283,9 +283,12 @@ class Operators(ProblemData):
         """Pi(0) (m,) [N s]: doing nothing, clipped to the bounds; a new array."""
         return self._start.copy()
 
-    @once
+    @property
     def _start(self) -> FloatArray:
-        return nothing_done(self.cones.lower, self.cones.upper)
+        kept = self.derived
+        if kept.start is None:
+            kept.start = nothing_done(self.cones.lower, self.cones.upper)
+        return kept.start
 
 
 def _read_only(matrix: sp.csr_array) -> sp.csr_array:

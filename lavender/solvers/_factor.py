@@ -23,6 +23,7 @@ from lavender.base.later import lapack, load
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
+from lavender.solvers.setup_times import dense_work
 from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
 
@@ -59,7 +60,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     if problem.law == "linear" and nnz <= PANELS_SHARE * m * m:
         # One factor: by what it costs.
         narrow = BAND * m * float(band + 1) ** 2
-        full = LAPACK + DENSE * m**3 / 3.0 + DENSE_ENTRY * float(m) ** 2
+        full = LAPACK + dense_cost(m)
         if panels_cost(nnz, m) < min(narrow, full if m <= DENSE_LIMIT else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
@@ -73,6 +74,11 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
         if band <= SMALL_BAND:
             return "band", band, order
     return "sparse", m - 1, None
+
+
+def dense_cost(m: int) -> float:
+    """Of one Cholesky factor of m rows by LAPACK [ns], without the call."""
+    return DENSE * dense_work(m) + DENSE_ENTRY * float(m) ** 2
 
 
 def panels_cost(nnz: int, m: int) -> float:

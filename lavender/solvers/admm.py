@@ -29,7 +29,7 @@ from lavender.problem import Problem
 from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
 from lavender.solvers.newton_systems.sparse import BACKWARD
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import loading
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
@@ -115,7 +115,7 @@ class AdmmState:
         if self.kind == _BODIES:
             assert problem.rows is not None
             rows = problem.rows
-            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).cost)
+            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
         return _PANELS_WORK * self.panels.work if m else 0.0
 
     @property
@@ -238,7 +238,7 @@ def _arrays(matrix: Any) -> tuple[Any, Any, Any]:
 
 
 @dataclass(frozen=True)
-class ADMM:
+class ADMM(Solver):
     """Proximal splitting with spectral penalty and Anderson mixing."""
 
     memory: int = 10
@@ -252,11 +252,11 @@ class ADMM:
         if not 0.0 < self.relaxation < 2.0:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted; what it leaves is begun by `run` if it fits there."""
         return min(_opening(problem), AT_ONCE) + loading("scipy.sparse", "scipy.linalg.lapack")
 
+    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
         load()
@@ -264,10 +264,6 @@ class ADMM:
             return AdmmState(problem, self.memory, self.relaxation)
         except _Failed as failure:
             return str(failure)
-
-    def update(self, state: Any, problem: Problem) -> AdmmState | str:
-        """A fresh state: the penalty starts anew, so that a solve depends on its problem alone."""
-        return self.prepare(problem)
 
     def until(self, state: AdmmState | str, deadline: Deadline) -> None:
         """Let no factor begin that is expected to end after `deadline`."""

@@ -37,7 +37,7 @@ from lavender.problem.derived import cached_property
 from lavender.solvers import costs
 from lavender.solvers.certify import certify
 from lavender.solvers.newton import ROWS, NewtonState
-from lavender.solvers.registry import SMALL_ROWS, SolverSpec, get
+from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
@@ -257,13 +257,10 @@ class State:
 
 
 @dataclass(frozen=True)
-class Auto:
+class Auto(Solver):
     """Chooses and combines other solvers; the solution's message and `turns` name them."""
 
     def prepare(self, problem: Problem) -> State:
-        return State(problem)
-
-    def update(self, state: State, problem: Problem) -> State:
         return State(problem)
 
     def run(

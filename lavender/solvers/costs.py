@@ -19,7 +19,7 @@ from typing import Any
 
 from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
-from lavender.solvers.setup_times import formed_once
+from lavender.solvers.setup_times import dense_work, formed_once
 
 __all__ = [
     "RATES",
@@ -85,5 +85,9 @@ def formed(problem: Problem) -> Count:
     m = float(problem.m)
     entries = min(float(problem.metric.entries_of_a), m * m)
     return Count(
-        "dense", 0.0 if entries < 0.5 * m * m else m**3 / 3.0, entries, m, 1e9 * formed_once(problem)
+        "dense",
+        0.0 if entries < 0.5 * m * m else dense_work(problem.m),
+        entries,
+        m,
+        1e9 * formed_once(problem),
     )

@@ -34,7 +34,7 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import factored, over_rows
 from lavender.solvers.small import DIRECT
 from lavender_ext.judge import measure
@@ -60,13 +60,13 @@ class DirectState:
 
 
 @dataclass(frozen=True)
-class Direct:
+class Direct(Solver):
     """Direct solution of linear systems and of boxed LCPs, positive semidefinite or asymmetric."""
 
     patience: ClassVar[bool] = True  # to go on where pivoting on one shift is stuck
     exact: ClassVar[bool] = True  # to rounding, whatever the tolerance
 
-    def otherwise(self) -> Any:
+    def otherwise(self) -> Solver:
         """What follows where exchanges go round in circles on friction as bounded rows: one pivot after the other."""
         from lavender.solvers.lemke import Lemke
 

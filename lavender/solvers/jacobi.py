@@ -17,7 +17,7 @@ from lavender.base.arrays import FloatArray, number
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import block_order
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import summed
 from lavender.solvers.sweeping import SweepState, run_kernel
 from lavender_ext.sweep import serial
@@ -32,7 +32,7 @@ class JacobiState(SweepState):
 
 
 @dataclass(frozen=True)
-class Jacobi:
+class Jacobi(Solver):
     """Damped (projected) Jacobi.
 
     Parameters
@@ -53,9 +53,6 @@ class Jacobi:
 
     def prepare(self, problem: Problem) -> JacobiState:
         return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)
-
-    def update(self, state: JacobiState, problem: Problem) -> JacobiState:
-        return self.prepare(problem)
 
     def run(
         self,

@@ -24,7 +24,7 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.polyhedral import count_rows
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import over_rows
 from lavender_ext.pivot import lemke
 from lavender_ext.pivot.lemke import DONE, LATE, RAY
@@ -42,7 +42,7 @@ def _sizes(problem: Problem) -> tuple[int, int]:
 
 
 @dataclass(frozen=True)
-class Lemke:
+class Lemke(Solver):
     """Lemke's complementary pivoting; no options."""
 
     def setup_time(self, problem: Problem) -> float:

@@ -39,7 +39,7 @@ from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import System, make_system
-from lavender.solvers.registry import SolverSpec
+from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
@@ -78,11 +78,11 @@ class NewtonState:
         if system is None:
             return Count("dense", 0.0, 0.0, float(problem.m))
         if system.form == "velocity":
-            return Count("bodies", system.cost, read, float(problem.m))
+            return Count("bodies", system.work, read, float(problem.m))
         made = 0.0 if problem.generalized is None else 1e9 * formed_once(problem)
         return Count(
             "dense" if system.dense else "panels",
-            system.multiply_adds,
+            system.work,
             system.entries,
             float(problem.m),
             made,
@@ -101,7 +101,7 @@ class NewtonState:
 
 
 @dataclass(frozen=True)
-class Newton:
+class Newton(Solver):
     """Interior point and semismooth Newton.
 
     Parameters

@@ -22,7 +22,15 @@ from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import SweepState, Threaded, plan_of, reads_whitened, run_kernel, run_threads
+from lavender.solvers.sweeping import (
+    SweepState,
+    Threaded,
+    gains_from_threads,
+    plan_of,
+    reads_whitened,
+    run_kernel,
+    run_threads,
+)
 from lavender_ext.sweep import serial
 
 _NONE = np.empty(0, np.int32)
@@ -42,7 +50,7 @@ class PGS(Threaded):
     ) -> Claim:
         if state.data.is_general:
             return replace(run_kernel(state, impulse, max_iter, tol), form="whitened J")
-        if self.uses_threads(state):
+        if self.threads > 1 and gains_from_threads(state):
             return run_threads(state, impulse, max_iter, tol, self.threads)
         return run_kernel(state, impulse, max_iter, tol)
 

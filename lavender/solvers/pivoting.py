@@ -17,14 +17,12 @@ from lavender.solvers._factor import (
     LUFactor,
     SparseFactor,
     choose,
+    dense_cost,
     permuted_band,
 )
+from lavender.solvers.setup_times import DENSE, dense_work, first_factor, sparse_work
 from lavender_ext.pivot.direct import Pivoting
 
-# s for each multiply-add of a dense factor, and for each nonzero of a sparse one, with as many times more as it has
-# thousands of rows: what a first factor is refused by where the time is short.
-DENSE, SPARSE, SPARSE_ROWS = 1.5e-10, 1e-7, 1000.0
-FLOP, ENTRY = 0.03, 3.0  # ns for each multiply-add of a dense factor, and for each entry of its matrix
 SWEEP = 4e-9  # s for each nonzero of a sweep both ways and its slack, likewise
 SWEEPS, MOST_SWEEPS = 2, 24  # symmetric sweeps of Gauss-Seidel that guess the free rows, at least and at most
 SHARE = 0.5  # of what a factor costs, that they may; a multiply-add of theirs takes a nanosecond
@@ -84,11 +82,7 @@ class PivotState:
 
     def _expected(self) -> float:
         """What the first factor takes [s], by structure."""
-        m = self.problem.m
-        seconds = DENSE * m**3 / 3.0
-        if self.is_sparse:
-            entries = len(self.problem._compressed[1])
-            seconds = min(seconds, SPARSE * entries * (1.0 + m / SPARSE_ROWS))
+        seconds = first_factor(self.problem.m, len(self.problem._compressed[1]) if self.is_sparse else np.inf)
         if self.symmetric:
             return seconds
         return 2.0 * (max(seconds, _filled(self.problem)) if self.is_sparse else seconds)
@@ -99,9 +93,9 @@ class PivotState:
         if self.outside is None:
             return SWEEPS
         m, data = self.problem.m, self.problem.csr_data
-        factor = FLOP * float(m) ** 3 / 3.0 + ENTRY * float(m) ** 2
+        factor = dense_cost(m)
         if self.is_sparse:
-            factor = min(factor, 100.0 * self.problem.csr.nnz * (1.0 + m / SPARSE_ROWS))
+            factor = min(factor, sparse_work(self.problem.csr.nnz, m))
         return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
 
     def too_late_to_sweep(self, deadline: Deadline) -> bool:
@@ -132,7 +126,7 @@ def _filled(problem: Problem) -> float:
     a = problem.csr
     order = reverse_cuthill_mckee(a, symmetric_mode=False).astype(np.int32)
     width = float(permuted_band(problem, order) + 1)
-    return DENSE * problem.m * min(width * width, problem.m**2 / 3.0)
+    return DENSE * problem.m * min(width * width, dense_work(problem.m) / problem.m)
 
 
 def _same_pattern(p: Problem, q: Problem) -> bool:

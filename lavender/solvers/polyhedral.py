@@ -29,6 +29,7 @@ from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.cones import project
+from lavender.solvers.registry import Solver
 
 # Of (1) and (2): times that they have the problem's rows, and s of making them for each of those.
 FEW, ROW_TIME = 3.0, 2e-5
@@ -144,23 +145,23 @@ class Held:
     state: Any
 
 
-class ThroughRows:
+class ThroughRows(Solver):
     """A solver of bounded rows that also takes friction of boxes.
 
-    Where the solver has `otherwise()`, the one of it follows what did not end at a solution.
+    The one of its `otherwise()` follows where it did not end at a solution.
     """
 
-    def __init__(self, solver: Any) -> None:
+    def __init__(self, solver: Solver) -> None:
         self.solver = solver
-        if hasattr(solver, "setup_time"):
-            self.setup_time = self._setup_time
-        if hasattr(solver, "ready"):
-            self.ready = solver.ready
 
-    def _setup_time(self, problem: Problem) -> float:
-        # What `prepare` takes [s], as counted.
-        own = float(self.solver.setup_time(problem))
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], as counted."""
+        own = self.solver.setup_time(problem)
         return own if problem.law in ("linear", "lcp") else FEW * own + ROW_TIME * problem.m
+
+    def ready(self, held: Any, time_limit: float) -> None:
+        """Start processes."""
+        self.solver.ready(held.state if isinstance(held, Held) else held, time_limit)
 
     def prepare(self, problem: Problem) -> Any:
         """Its state, of the problem or of (1), (2)."""
@@ -194,13 +195,14 @@ class ThroughRows:
     ) -> Claim:
         form = held.form
         z, deadline = form.start(impulse), Deadline(time_limit)
-        claim: Claim = self.solver.run(held.state, z, max_iter, tol, time_limit)
+        claim = self.solver.run(held.state, z, max_iter, tol, time_limit)
         claim = self._judged(form, claim, z, impulse, tol)
-        other = getattr(self.solver, "otherwise", None)
-        if other is None or claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
+        if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR):
+            return claim
+        path = self.solver.otherwise()
+        if path is None:
             return claim
         z = form.start(impulse)
-        path = other()
         more = self._judged(
             form, path.run(path.prepare(form.rows), z, max_iter, tol, deadline.left(1e-3)), z, impulse, tol
         )

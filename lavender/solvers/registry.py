@@ -1,15 +1,8 @@
 """Solvers by name. Each has a `SolverSpec`, which lists its capabilities as data; the tests check every one of them.
 
-A solver is an object that holds only its options. `SolverSpec.factory(**options)` makes it. Its methods:
-
-    prepare(problem) -> state         factor, colour, allocate
-    update(state, problem) -> state   for a problem of the same structure with new numbers; a fresh start
-    run(state, impulse, max_iter, tol, time_limit) -> Claim
-        do `max_iter` more iterations on `impulse` (m,) in place, fewer only if its own convergence test is met. If
-        `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None
-
-Third parties register through the entry point group "lavender.solvers" (an object that is a
-`SolverSpec`, or a function that returns one) or with `register`.
+A solver is an object that holds only its options; `SolverSpec.factory(**options)` makes it. `Solver` has all that is
+asked of one. Third parties register through the entry point group "lavender.solvers" (an object that is a `SolverSpec`,
+or a function that returns one) or with `register`.
 """
 
 from __future__ import annotations
@@ -23,6 +16,7 @@ from functools import cache
 from typing import Any, Protocol
 
 from lavender.base.arrays import FloatArray
+from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
@@ -38,6 +32,11 @@ TABLES = ("lavender.solvers", "lavender.external")
 
 class SmallCall(Protocol):
     """Solves a problem of few rows to tol with the bits of `run`, or leaves it to `run`."""
+
+    def in_vain(
+        self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
+    ) -> None:
+        """The call from there left it after these counts: it need not be made again before `run`."""
 
     @property
     def limits(self) -> Any:
@@ -70,25 +69,52 @@ class State(Protocol):
         """
 
 
-class Solver(Protocol):
-    """What a factory returns; see the module.
+class Solver:
+    """What a factory returns: `prepare` and `run`, and what it does otherwise than here.
 
-    Under a time limit `setup_time(problem)` is asked, if there is one: what `prepare` takes [s], counted from the size
-    of the problem. If that does not fit in the time left, nothing is begun. A resumable solver with long single steps
-    (factorisations) may also have `until(state, deadline)`. It is called before `run` if there is a time limit, with
-    the `lavender.base.deadline.Deadline` after which no such step should end.
+    A plug-in may return any object with `prepare`, `update` and `run` (`external/foreign.py`).
     """
 
     def prepare(self, problem: Problem) -> Any:
-        """Factor, colour, allocate."""
+        """The state: factor, colour, allocate."""
+        raise NotImplementedError
 
     def update(self, state: Any, problem: Problem) -> Any:
-        """The same structure with new numbers, and a fresh start."""
+        """The state of a problem of the same structure with new numbers, and a fresh start."""
+        return self.prepare(problem)
 
     def run(
         self, state: Any, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        """`max_iter` more iterations on `impulse` (m,) in place."""
+        """`max_iter` more iterations on `impulse` (m,) in place, fewer only if its own convergence test is met.
+
+        If `resumable`, n1 and then n2 iterations give the bits of n1 + n2, and time_limit is None.
+        """
+        raise NotImplementedError
+
+    def setup_time(self, problem: Problem) -> float:
+        """What `prepare` takes [s], counted from the size of the problem: begun only if that fits in a time limit."""
+        return 0.0
+
+    def ready(self, state: Any, time_limit: float) -> None:
+        """A limit [s] was given, and its clock stands still: start processes."""
+
+    def until(self, state: Any, deadline: Deadline) -> None:
+        """Before `run`, where it is resumable: begin no long step (a factorisation) that would end after that."""
+
+    def turn(
+        self, state: Any, impulse: FloatArray, n: int, tol: float, time_limit: float | None, left: int | None
+    ) -> Claim:
+        """For `auto`: n iterations or a few more, up to `left`, on from where the last turn ended."""
+        return self.run(state, impulse, n, tol, time_limit)
+
+    def tell(self, state: Any, impulse: FloatArray, claim: Claim) -> Claim:
+        """The claim in the place of what `run` returned, if not `resumable`: when the clock has stopped, to judge."""
+        return claim
+
+    def otherwise(self) -> Solver | None:
+        """Who follows where this one stalls on friction as bounded rows (`polyhedral.py`)."""
+        return None
 
 
 @dataclass(frozen=True)

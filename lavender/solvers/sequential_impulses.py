@@ -21,7 +21,14 @@ from lavender.problem.ordering import Order
 from lavender.solvers.layout import Layout, lay_out
 from lavender.solvers.layout import pays as layout_pays
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import SweepState, Threaded, plan_of, run_kernel, run_threads
+from lavender.solvers.sweeping import (
+    SweepState,
+    Threaded,
+    gains_from_threads,
+    plan_of,
+    run_kernel,
+    run_threads,
+)
 from lavender_ext.sweep import serial
 
 
@@ -81,7 +88,7 @@ class SequentialImpulses(Threaded):
             if state.laid is None:
                 state.laid = state.layout.take(impulse)
             lam = state.laid
-        if self.uses_threads(state):
+        if self.threads > 1 and gains_from_threads(state):
             claim = run_threads(state, lam, max_iter, tol, self.threads)
         else:
             claim = run_kernel(state, lam, max_iter, tol)

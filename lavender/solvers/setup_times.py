@@ -7,20 +7,24 @@ as much again as `python -m benchmarks limits` finds on problems of the suite, d
 from __future__ import annotations
 
 import sys
+from math import inf
 
 from lavender.judge import residuals
 from lavender.problem import Problem
 from lavender.solvers.registry import SMALL_ROWS
 
 __all__ = [
+    "dense_work",
     "entries_of",
     "factored",
+    "first_factor",
     "forming",
     "loading",
     "ordered",
     "over_bodies",
     "over_rows",
     "over_velocities",
+    "sparse_work",
     "summed",
     "sweeping",
 ]
@@ -33,11 +37,7 @@ LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
 BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
 LOADING = 0.3  # s of a part of SciPy
-DENSE, SPARSE, SPARSE_ROWS = (
-    1.5e-10,
-    1e-7,
-    1000.0,
-)  # as the first factors of `direct` are refused by (`pivoting.py`)
+DENSE, SPARSE = 1.5e-10, 1e-9  # s for each multiply-add of a first factor
 
 
 def entries_of(problem: Problem) -> float:
@@ -84,9 +84,22 @@ def summed(problem: Problem) -> float:
 
 def factored(problem: Problem) -> float:
     """The same with its first factor, of all rows."""
-    m = float(problem.m)
-    sparse = SPARSE * entries_of(problem) * (1.0 + m / SPARSE_ROWS)
-    return over_rows(problem) + min(DENSE * m**3 / 3.0, sparse)
+    return over_rows(problem) + first_factor(problem.m, entries_of(problem))
+
+
+def dense_work(m: int) -> float:
+    """Multiply-adds of one factor of m rows, every entry a number."""
+    return m**3 / 3.0
+
+
+def sparse_work(entries: float, m: int) -> float:
+    """Those of one in an order of its own, as size tells before an analysis counts them: fill grows with it."""
+    return 100.0 * entries * (1.0 + m / 1000.0)
+
+
+def first_factor(m: int, entries: float = inf) -> float:
+    """A first factor of m rows, of few entries where these are given."""
+    return min(DENSE * dense_work(m), SPARSE * sparse_work(entries, m))
 
 
 def over_bodies(problem: Problem) -> float:

@@ -143,10 +143,8 @@ class SmallCall:
         kept = problem.derived
         if not tol > 0.0 or problem.m == 0:
             return None, ()
-        if kept.vain is not None:
-            at = (problem._start if impulse is None else impulse).tobytes()
-            if kept.vain[:3] == (self.name, tol, at):
-                return None, kept.vain[3]
+        if kept.vain is not None and kept.vain[0] == self._call(problem, impulse, tol):
+            return None, kept.vain[1]
         if problem.generalized is not None:
             if self.limits is None:
                 return None, ()
@@ -158,10 +156,19 @@ class SmallCall:
             if not small or not (self.pivots if small.pivots else self.hands_over):
                 return None, ()
             found = small.run(impulse, tol, self.hands_over, WARM, most)
-        if found[0] is None and most == inf:  # the same steps need not be done again before the full solver
-            kept.vain = (self.name, tol, (problem._start if impulse is None else impulse).tobytes(), found[1])
+        if found[0] is None and most == inf:
+            self.in_vain(problem, impulse, tol, found[1])
         made: tuple[Any, Any] = found
         return made
+
+    def in_vain(
+        self, problem: Problem, impulse: FloatArray | None, tol: float, counts: tuple[int, ...]
+    ) -> None:
+        """The call from there left it after these counts: it need not be made again before the full solver."""
+        problem.derived.vain = self._call(problem, impulse, tol), counts
+
+    def _call(self, problem: Problem, impulse: FloatArray | None, tol: float) -> tuple[str, float, bytes]:
+        return self.name, tol, (problem._start if impulse is None else impulse).tobytes()
 
     def failed(self, problem: Problem, counts: tuple[int, ...]) -> list[tuple[str, Claim]]:
         """Who did what in a call of these counts, which did not solve the problem."""

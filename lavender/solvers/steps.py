@@ -42,8 +42,7 @@ FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over
 def setup_time(name: str, problem: Problem) -> float:
     """What a step sets up before its first iteration takes [s]; 0: next to nothing."""
     solver, options = METHODS[name]
-    asked = getattr(get(solver).load()(**options), "setup_time", None)
-    return 0.0 if asked is None else float(asked(problem))
+    return get(solver).load()(**options).setup_time(problem)
 
 
 class Step:
@@ -57,7 +56,7 @@ class Step:
 
     def __init__(self, name: str, log: SolveLog) -> None:
         self.name, self.log = name, log
-        self.solver: Any = get(METHODS[name][0]).load()(**METHODS[name][1])
+        self.solver = get(METHODS[name][0]).load()(**METHODS[name][1])
 
     def run(self, n: float) -> None:
         """At most n iterations, offered to the log."""
@@ -92,7 +91,7 @@ class Newton(Step):
         log = self.log
         if not self.state.begun:
             self.impulse = log.impulse.copy()
-        claim: Claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
+        claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.offer()
         return claim
 
@@ -106,7 +105,7 @@ class Direct(Step):
             if log.problem.law == "linear":
                 self.solver = Enough()
             self.state, self.impulse = self.solver.prepare(log.problem), log.impulse.copy()
-        claim: Claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
+        claim = self.solver.run(self.state, self.impulse, n, log.tol, log.time_left)
         self.offer()
         return claim
 
@@ -144,8 +143,7 @@ class Iterations(Step):
         left = self.log.deadline.left()
         time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
         few = min(max(1, int(time / self.each)), n - done)
-        claim: Claim = self.solver.run(self.state, self.impulse, few, self.closer * self.log.tol, None)
-        return claim
+        return self.solver.run(self.state, self.impulse, few, self.closer * self.log.tol, None)
 
 
 class Relaxation(Iterations):

@@ -16,6 +16,7 @@ from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import Order, block_order
+from lavender.solvers.registry import Solver
 from lavender.solvers.setup_times import forming, ordered
 from lavender_ext.judge.watch import AT_FLOOR, CONVERGED, DIVERGED, RUNNING, STALLED, Watch
 from lavender_ext.sweep import serial, threaded
@@ -95,6 +96,12 @@ def run_kernel(
     return claim(status, done)
 
 
+def gains_from_threads(state: SweepState) -> bool:
+    """Colours are large enough for more than one thread."""
+    ptr, work = state.order.color_ptr, state.data.work
+    return ptr is not None and len(ptr) > 1 and work >= LEAST and work >= GRAIN * (len(ptr) - 1)
+
+
 def run_threads(state: SweepState, impulse: FloatArray, max_iter: int, tol: float, threads: int) -> Claim:
     """Coloured sweeps on several threads: the bits of one thread."""
     alone = state.alone or {}
@@ -133,7 +140,7 @@ def over(data: Any) -> str:
 
 
 @dataclass(frozen=True)
-class Sweeping:
+class Sweeping(Solver):
     """Options and life cycle of a sweep solver over A in compressed rows."""
 
     order: Any = "given"
@@ -176,11 +183,3 @@ class Threaded(Sweeping):
             raise InputError(
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )
-
-    def uses_threads(self, state: SweepState) -> bool:
-        """More than one thread was asked for, and the colours are large enough to gain from it."""
-        ptr = state.order.color_ptr
-        if self.threads == 1 or ptr is None or len(ptr) < 2:
-            return False
-        work = state.data.work
-        return work >= LEAST and work >= GRAIN * (len(ptr) - 1)

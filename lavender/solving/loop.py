@@ -18,7 +18,7 @@ from lavender.base.errors import BREAKDOWN, last_words
 from lavender.judge.residuals import Residual, judged, known, remember, remembered, residual
 from lavender.judge.solution import Claim, History, Status
 from lavender.problem import Problem
-from lavender.solvers.registry import State
+from lavender.solvers.registry import Solver, State
 from lavender.solving.outcome import MAX_ITERATIONS, NUMERICAL_ERROR, STALLED, TIME_LIMIT
 from lavender_ext.judge.measure import all_finite
 
@@ -38,7 +38,7 @@ class Loop:
     """Chunks, clock, history and Ctrl-C around one solver's `run`."""
 
     problem: Problem
-    solver: Any
+    solver: Solver
     state: Any
     impulse: FloatArray  # (m,) N s, in place
     tol: float
@@ -61,8 +61,7 @@ class Loop:
             finally:
                 self.time = watch.seconds
             if not self.broken:
-                tell = getattr(self.solver, "tell", None)  # judges, and finds words
-                return claim if tell is None else tell(self.state, self.impulse, claim)
+                return self.solver.tell(self.state, self.impulse, claim)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         # It was in the middle of whatever it does.
@@ -90,9 +89,7 @@ class Loop:
         claim = NOTHING_DONE
         if self.deadline.is_set:
             chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
-            if hasattr(self.solver, "until"):
-                # For work that cannot be cut into chunks: a factorisation that would end too late is not begun.
-                self.solver.until(self.state, self.deadline)
+            self.solver.until(self.state, self.deadline)
         try:
             if records and self._record():
                 return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))

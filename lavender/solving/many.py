@@ -450,9 +450,9 @@ def solve_many(
         deadline.keep(made._late())
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
-    together = spec.own and spec.small is not None and not options and max_iter is None
-    together = together and isinstance(tol, float) and 0.0 < tol < np.inf
-    limits = spec.small.limits if together and spec.small is not None else None
+    together = spec.own and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
+    small = spec.small if together else None
+    limits = small.limits if small is not None else None
 
     def turn(hand: Hand) -> int:
         if not deadline.is_set:
@@ -463,11 +463,8 @@ def solve_many(
 
     def alone(i: int) -> None:
         problem, start = given[i], made.start(i)
-        if made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
-            # The same steps need not be done again.
-            at = problem._start if start is None else start
-            done = tuple(made._worlds.counts[i].tolist())
-            problem.derived.vain = (spec.name, tol, np.ascontiguousarray(at, float).tobytes(), done)
+        if small is not None and made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
+            small.in_vain(problem, start, tol, tuple(made._worlds.counts[i].tolist()))
         if deadline.is_set and not isinstance(given, Batch):
             deadline.keep(-UNREAD)
             if deadline.passed():

@@ -25,7 +25,7 @@ from lavender.judge.residuals import (
 )
 from lavender.judge.solution import Claim, Solution, SolverRun, Status
 from lavender.problem import Problem, check_problem
-from lavender.solvers.registry import SMALL_ROWS, SolverSpec, get
+from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solving.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solving.outcome import (
     CONVERGED,
@@ -286,7 +286,7 @@ class Prepared:
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         left = deadline.left()
-        if left is not None and not self._late and hasattr(self.solver, "ready"):
+        if left is not None and not self._late:
             watch = Stopwatch()
             self.solver.ready(self.state, left)
             deadline.keep(-watch.seconds)
@@ -341,7 +341,7 @@ class Prepared:
         if problem.metric.start_energy < 0.0:
             reference(problem)  # of the judge, before any solver has the problem in its hands
         anew, self._broken = anew or bool(self._broken), ""
-        if deadline.is_set and hasattr(self.solver, "setup_time"):
+        if deadline.is_set:
             self._late = deadline.passed(self.solver.setup_time(problem))
             if self._late:
                 self.state = None
@@ -379,7 +379,7 @@ def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Call
     return call
 
 
-def _make(spec: SolverSpec, options: dict[str, Any]) -> Any:
+def _make(spec: SolverSpec, options: dict[str, Any]) -> Solver:
     factory = spec.load()
     try:
         made = factory(**options)

@@ -159,6 +159,7 @@ def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] code
     made.spell()
     whole.setflags(False)
     numbers.setflags(False)
+    keys.setflags(False)
     made.arrays = (whole[:k + 1], whole[m + 1:m + 1 + k], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
                    numbers[4 * m:4 * m + k], numbers[5 * m:5 * m + k])
     return made if fits else None, numbers[3 * m:4 * m], keys[:k], copy
@@ -192,41 +193,42 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
 
     Of rows that cannot be followed, the first one's number.
     """
-    cdef int32_t i, q, m = <int32_t>count.shape[0]
-    cdef Py_ssize_t at = 0, total = 0, room = min(values.shape[0], columns.shape[0])
-    cdef double x
-    cdef int32_t last, end
+    cdef int32_t i, m = <int32_t>count.shape[0], stray
+    cdef Py_ssize_t q, begin, end, at = 0, total = 0, room = min(values.shape[0], columns.shape[0])
+    cdef double x, factor
     cdef bint ascend = True
     for i in range(m):
         if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
             return i
         total += count[i]
-    indptr_ = new(m + 1, I4)
-    indices_ = new(total, I4)
-    data_ = new(total)
-    cdef int32_t[::1] indptr = indptr_, indices = indices_
-    cdef double[::1] data = data_
+    whole, data_ = new(m + 1 + total, I4), new(total)
+    cdef int32_t[::1] view = whole
+    cdef double[::1] data_view = data_
+    cdef int32_t* indptr = &view[0]
+    cdef int32_t* indices = indptr + m + 1
+    cdef double* data = &data_view[0] if total else NULL
+    cdef const int32_t* column = &columns[0] if room else NULL
+    cdef const double* value = &values[0] if room else NULL
     indptr[0] = 0
     for i in range(m):
-        end = first[i] + count[i]
-        last = -1
-        for q in range(first[i], end):
-            if columns[q] <= last:
-                ascend = False
-                if columns[q] < 0:
-                    return i
-            last = max(last, columns[q])
-            x = values[q] * scale[i]
-            if x != 0.0:
-                indices[at] = columns[q]
-                data[at] = x
-                at += 1
-        if last >= n:
+        factor = scale[i]
+        begin = first[i]
+        end = begin + count[i]
+        stray = 0
+        for q in range(begin, end):
+            stray |= not 0 <= column[q] < n
+        if stray:
             return i
+        for q in range(begin + 1, end):
+            stray |= column[q] <= column[q - 1]
+        ascend &= not stray
+        for q in range(begin, end):
+            x = value[q] * factor
+            indices[at] = column[q]
+            data[at] = x
+            at += x != 0.0                              # what is zero is written over
         indptr[i + 1] = <int32_t>at
-    if not ascend:
-        return None
-    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at].copy(), data_[:at].copy())
+    return (whole[:m + 1], whole[m + 1:m + 1 + at], data_[:at]) if ascend else None
 
 
 def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, const double[::1] values,
@@ -304,12 +306,12 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
     0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
     """
     cdef Py_ssize_t i, j, k, n = v.shape[0], bodies = spatial.shape[0]
-    cdef double term, z, big = 0.0, gap = 0.0, filled = 0.0
+    cdef double term, z, big = 0.0, gap = 0.0, filled = 0.0, lost = 0.0     # lost: 0, or NaN
     if not body.shape[0] == axis.shape[0] == n or parent.shape[0] != bodies or bodies == 0:
         return -1.0, 0.0
-    scratch = np.zeros((bodies, 6))
-    cdef double[:, ::1] made_ = scratch
-    cdef double* made = &made_[0, 0]
+    scratch = new(6 * bodies)
+    cdef double[::1] view = scratch
+    cdef double* made = &view[0]
     cdef const double* c = &spatial[0, 0]
     cdef const double* s = &axis[0, 0] if n else NULL
     cdef const int32_t* of = &body[0] if n else NULL
@@ -320,17 +322,23 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
     for j in range(n):
         if not 0 <= of[j] < bodies:
             return -1.0, 0.0
+    for i in range(6 * bodies):
+        made[i] = -c[i]
+    for j in range(n):
         z = v[j]
         for k in range(6):
             term = s[6 * j + k] * z
             made[6 * of[j] + k] += term
-            big = widest(big, term)
-            filled = widest(filled, s[6 * j + k])
+            big = larger(big, term)
+            filled = larger(filled, s[6 * j + k])
+            lost += 0.0 * term
     for i in range(1, bodies):
         for k in range(6):
-            gap = widest(gap, made[6 * i + k] + c[6 * up[i] + k] - c[6 * i + k])
-            big = widest(big, c[6 * i + k])
-    return (gap if filled != 0.0 else 0.0), big
+            term = made[6 * i + k] + c[6 * up[i] + k]
+            gap = larger(gap, term)
+            big = larger(big, c[6 * i + k])
+            lost += 0.0 * term
+    return (gap + lost if filled != 0.0 else 0.0), big + lost
 
 
 def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale, double dt,
@@ -352,14 +360,22 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
     cdef double c, size, s_v, s_free, f, finite = 0.0, sound = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0
-    rhs_, compliance_, free_, scratch = new(m), new(m), new(n), np.zeros(2 * n + 1)
-    cdef double[::1] rhs = rhs_, compliance = compliance_, free = free_
-    cdef double[::1] pushed = scratch                   # J^T f, and the same of absolute values
+    made = new(2 * m + 5 * n + 1)
+    cdef double[::1] view = made
+    cdef double* rhs = &view[0]
+    cdef double* compliance = rhs + m
+    cdef double* free = compliance + m
+    cdef double* pushed = free + n                      # J^T f, and the same of absolute values
+    cdef double* before = pushed + 2 * n                # v, then dt a0
+    cdef double* change = before + n
     for j in range(n):
-        free[j] = v[j] + dt * smooth[j]
+        before[j] = v[j]
+        change[j] = dt * smooth[j]
+        pushed[j] = pushed[n + j] = 0.0
+        free[j] = before[j] + change[j]
         sound += 0.0 * free[j]
-        top_v = widest(top_v, v[j])
-        top_free = widest(top_free, dt * smooth[j])
+        top_v = widest(top_v, before[j])
+        top_free = widest(top_free, change[j])
         said_3 = widest(said_3, push[j])
         finite += 0.0 * a[j]
     for i in range(m):
@@ -368,8 +384,8 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         for q in range(jptr[i], jptr[i + 1]):
             j = jidx[q]
             c = jval[q]
-            s_v += c * v[j]
-            s_free += c * (dt * smooth[j])
+            s_v += c * before[j]
+            s_free += c * change[j]
             size += fabs(c)
             c *= f
             pushed[j] += c
@@ -391,7 +407,8 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
     for j in range(n):
         gap_3 = widest(gap_3, pushed[j] - push[j])
         big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
-    return rhs_, compliance_, free_, sound == 0.0, gap_0, (
+    made.setflags(False)
+    return made[:m], made[m:2 * m], made[2 * m:2 * m + n], sound == 0.0, gap_0, (
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
@@ -403,6 +420,12 @@ cdef inline bint are_lengths(int32_t n, const int32_t* at, const int32_t* count)
         if at[i + 1] - at[i] != count[i]:
             return False
     return True
+
+
+cdef inline double larger(double so_far, double x) noexcept nogil:
+    """The larger of |x| and what was largest so far, which never was NaN: one is left out."""
+    x = fabs(x)
+    return x if x > so_far else so_far
 
 
 cdef inline double widest(double so_far, double x) noexcept nogil:

@@ -14,7 +14,7 @@ cdef class Layout:
     cdef readonly object nptr, lptr                     # (n + 1) blocks of N by rows, and of L by columns
     cdef readonly object panels                         # of `symbolic.block_panels`, or None
     cdef readonly int n, s
-    cdef readonly double cost                           # multiply-adds of a factor
+    cdef readonly double work                           # multiply-adds of a factor
 
 
 cdef class Solve:

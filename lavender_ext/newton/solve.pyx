@@ -115,12 +115,12 @@ cdef class Layout:
             block_pattern(n, a.nptr, a.nind, a.parent, a.mark, a.lptr, a.rptr, a.scratch, a.lind, a.rind)
         self.n, self.s = n, s
         for i in range(n):
-            self.cost += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
-        self.cost = s**3 * (self.cost + below + n)
+            self.work += 0.5 * <double>(a.lptr[i + 1] - a.lptr[i]) * (a.lptr[i + 1] - a.lptr[i])
+        self.work = s**3 * (self.work + below + n)
         self.body, self.node = part(self.index, a.body, 2 * k).reshape(k, 2), part(self.index, a.node, 2 * k).reshape(k, 2)
         self.turned = part(self.index, a.turned, k)
         self.nptr, self.lptr = part(self.index, a.nptr, n + 1), part(self.index, a.lptr, n + 1)
-        if self.cost >= least:
+        if self.work >= least:
             nind = part(self.index, a.nind, a.nptr[n])
             self.panels = block_panels(self.nptr, nind, self.lptr, self.filled[:below + 1], s, few, share)
 

@@ -14,6 +14,7 @@ from lavender.problem import Problem
 from lavender.solvers._factor import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
+from lavender.solvers.setup_times import dense_work
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
 
@@ -36,7 +37,7 @@ class System:
     """H of a scaled problem, and Newton's method on it."""
 
     form = ""
-    cost = 0.0  # multiply-adds of one factorisation, roughly
+    work = 0.0  # multiply-adds of one factor
     pace = 1e-9  # s for each of them at most, on any machine of the last ten years
     dense = False  # A as a full matrix
     entries = 0.0  # of A
@@ -45,19 +46,14 @@ class System:
         self.problem, self.solve = problem, solve
 
     @property
-    def multiply_adds(self) -> float:
-        """Of one factor."""
-        return self.cost
-
-    @property
     def seconds(self) -> float:
         """What the next factor takes, at that pace."""
-        return self.pace * self.multiply_adds
+        return self.pace * self.work
 
     def took(self, seconds: float) -> None:
         """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
-        if self.cost > 0.0:
-            self.pace = seconds / self.cost
+        if self.work > 0.0:
+            self.pace = seconds / self.work
 
 
 class VelocitySystem(System):
@@ -75,7 +71,7 @@ class VelocitySystem(System):
         of = rows.block_bodies[solve.block], rows.n_bodies, len(columns)
         kept = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*of) else None
         self.layout: Layout = kept or Layout(*of, PANELS, FEW_COLUMNS, ZEROS)
-        self.cost = self.layout.cost
+        self.work = self.layout.work
         solve.over_bodies(panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", WIDE)
         solve.ask(Augmented(solve, self.layout))
 
@@ -97,8 +93,6 @@ class MatrixSystem(System):
             is_full(a.nnz, m, solve.has_friction and problem.law == "cone") and m <= DENSE_LIMIT
         )
         self.entries = float(a.nnz)
-        # Of a sparse factor at first by its size, since fill grows with that.
-        self.cost = m**3 / 3.0 if self.dense else 100.0 * a.nnz * (1.0 + m / 1000.0)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
         if self.dense:
@@ -106,19 +100,14 @@ class MatrixSystem(System):
             self.h *= solve.scale[:, None]
             self.h *= solve.scale
             solve.over_rows(self.h, self.symmetric, WIDE)
+            self.work = dense_work(m)
         else:
             values = scaled_entries(a.indptr, a.indices, a.data, solve.scale)
             self.h = sp.csr_array((values, a.indices, a.indptr), shape=(m, m))
             solve.over_entries(a.indptr, a.indices, values, self.symmetric)
             self.sparse = SparseRows(solve, self.h, self.symmetric)
             solve.ask(self.sparse)
-
-    @property
-    def multiply_adds(self) -> float:
-        """As of all systems; fill is counted before the first number."""
-        if not self.dense:
-            self.cost = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
-        return self.cost
+            self.work = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
 
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:

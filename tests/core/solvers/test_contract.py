@@ -91,6 +91,16 @@ def budget(spec):
     return max(spec.max_iter, 20_000) if spec.resumable else None
 
 
+@pytest.mark.parametrize(
+    "name", [n for n, spec in registry.specs().items() if spec.own and not spec.missing()]
+)
+def test_a_solver_has_no_methods_but_those_of_the_contract(name):
+    """What hosts ask of solvers stands in one place, typed: no name is looked for on an object."""
+    made = registry.get(name).load()()
+    asked = {n for n in dir(made) if not n.startswith("_") and callable(getattr(made, n))}
+    assert isinstance(made, registry.Solver) and asked <= set(dir(registry.Solver))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_spec_says_what_it_is(name):
     spec = registry.specs()[name]

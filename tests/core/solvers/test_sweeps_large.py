@@ -96,7 +96,7 @@ def test_a_leader_needs_no_helper(pile):
 def test_small_problems_stay_on_one_thread():
     problem = lattice_pile(60)
     solver = lv.prepare(problem, "sequential_impulses", order="colored", threads=2)
-    assert not solver.solver.uses_threads(solver.state)
+    assert not sweeping.gains_from_threads(solver.state)
 
 
 def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
