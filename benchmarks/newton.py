@@ -36,7 +36,7 @@ from lavender.problem import Problem
 from lavender.sim.scene.gallery import SCENES
 from lavender.solvers import newton
 from lavender.solvers.newton_systems import sparse, systems
-from lavender.solvers.warm_start import Tried
+from lavender.solvers.warm_start import NOTHING
 from lavender_ext.newton.solve import PHASES
 
 
@@ -106,8 +106,8 @@ def _singular(*_: Any, **_kwargs: Any) -> Any:
     raise RuntimeError
 
 
-def _left(*_: Any) -> Tried:
-    return Tried(0)
+def _left(*_: Any) -> tuple[int, int, int]:
+    return NOTHING
 
 
 FORM_ROWS = {"form": "impulse"}

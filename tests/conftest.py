@@ -114,6 +114,21 @@ def plug_in(register):
 
 
 @pytest.fixture
+def clock(monkeypatch):
+    """The clock of time limits, which goes by what a test counts."""
+    import sys
+
+    from calls import Clock
+
+    from lavender.base import deadline
+
+    made = Clock()
+    monkeypatch.setattr(deadline, "perf_counter", made)
+    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
+    return made
+
+
+@pytest.fixture
 def interrupted_newton(monkeypatch) -> list[float]:
     """Ctrl-C after newton's fifth turn of one factorisation; the list fills with the best residual after each."""
     from lavender.solvers import newton

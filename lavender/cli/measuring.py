@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +14,16 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INTERRUPTED, bytes_of, console, going_on, one_thread, was_given
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as RichProgress
+
     from lavender.lab.bench import Event, Item, Plan, Records
     from lavender.lab.report.sheet import Sheet
 
     P = TypeVar("P", bound=Plan)
 
 __all__ = ["Measured", "Progress", "measure", "run_campaign", "show_sheet"]
+
+EVERY = 10.0  # s between two lines of progress where there is no terminal
 
 
 @dataclass(frozen=True)
@@ -161,32 +166,51 @@ def show_sheet(sheet: Sheet, folder: Path, stopped: bool) -> None:
 
 
 class Progress:
-    """A progress bar over what is measured, pairs of case and solver for one, on a terminal; silent elsewhere."""
+    """What is being measured: a bar on a terminal, elsewhere a line of stderr every EVERY seconds."""
 
     def __enter__(self) -> Callable[[Event], None]:
+        to = console(stderr=True)
+        self.bar: RichProgress | None = None
+        if not to.is_terminal:
+            return self._lines()
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-        self.bar = Progress(
+        bar = Progress(
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
             TextColumn("{task.fields[what]}", markup=False),
-            console=console(stderr=True),
+            console=to,
             transient=True,
             refresh_per_second=4,  # drawing takes time from what is being timed
         )
-        self.bar.start()
-        task = self.bar.add_task("", total=None, what="")
+        bar.start()
+        task = bar.add_task("", total=None, what="")
+        self.bar = bar
 
         def watch(event: Event) -> None:
-            self.bar.update(
-                task,
-                completed=event.done,
-                total=event.total or None,
-                what=f"{event.case} {event.solver}".strip(),
-            )
+            bar.update(task, completed=event.done, total=event.total or None, what=_words(event))
+
+        return watch
+
+    @staticmethod
+    def _lines() -> Callable[[Event], None]:
+        began = told = time.monotonic()
+
+        def watch(event: Event) -> None:
+            nonlocal told
+            now = time.monotonic()
+            if now - told >= EVERY:
+                told = now
+                of = f" of {event.total}" if event.total else ""
+                click.echo(f"{event.done}{of}, {now - began:.0f} s: {_words(event)}", err=True)
 
         return watch
 
     def __exit__(self, *_: object) -> None:
-        self.bar.stop()
+        if self.bar is not None:
+            self.bar.stop()
+
+
+def _words(event: Event) -> str:
+    return f"{event.case} {event.solver}".strip()

@@ -30,6 +30,31 @@ INPUTS = {
 ALONE = ("b", "target", "compliance", "A", "J", "jac", "normal", "tangent", "arm_a", "arm_b")
 
 
+class _Input:
+    """A gradient by one name, kept where it was worked out (its descriptor gives way to the instance's own)."""
+
+    def __init__(self, name: str) -> None:
+        self.name, self.operators, self.alone = name, INPUTS[name], name in ALONE
+        self.work_out = None if name in BODIES else getattr(Gradient, f"_by_{name}")
+
+    def __get__(self, gradient: Any, owner: Any = None) -> Any:
+        if gradient is None:
+            return self
+        name, of, kept = self.name, gradient._of, gradient.__dict__
+        if self.operators is not OPERATORS and of.problem.operator not in self.operators:
+            raise CapabilityError(
+                f"{name} is of problems given as {' or '.join(self.operators)}, and this one was given as "
+                f"{of.problem.operator}"
+            )
+        if self.alone and not of._plain:
+            of._refuse_alone(f"no derivative by {name} exists here")
+        if self.work_out is None:
+            kept.update(of._bodies.back(gradient))
+        else:
+            kept[name] = self.work_out(gradient)
+        return kept[name]
+
+
 class Gradient:
     """Gradients of a scalar by the data of a problem, of cotangents of its solution: `Derivative.vjp`.
 
@@ -60,7 +85,7 @@ class Gradient:
 
     @property
     def _s(self) -> FloatArray:
-        m = self._of.problem.m
+        m = len(self._of._impulse)
         return self._made[m : 2 * m]
 
     @cached_property
@@ -74,21 +99,7 @@ class Gradient:
         return self._made[len(self._made) - self._of.problem.m :]
 
     def __getattr__(self, name: str) -> Any:
-        if name not in INPUTS:
-            raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
-        of, kept = self._of, self.__dict__
-        operator = of.problem.operator
-        if operator not in INPUTS[name]:
-            raise CapabilityError(
-                f"{name} is of problems given as {' or '.join(INPUTS[name])}, and this one was given as {operator}"
-            )
-        if not of._plain and name in ALONE:
-            of._refuse_alone(f"no derivative by {name} exists here")
-        if name in BODIES:
-            kept.update(of._bodies.back(self))
-        else:
-            kept[name] = getattr(self, f"_by_{name}")()
-        return kept[name]
+        raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
     def _by_b(self) -> FloatArray:
         return self._s
@@ -178,3 +189,7 @@ def _on(pattern: Any, *pairs: tuple[FloatArray, FloatArray]) -> sp.csr_array:
     row = np.repeat(np.arange(pattern.shape[0]), np.diff(pattern.indptr))
     data = sum(u[row] * v[pattern.indices] for u, v in pairs)
     return sp.csr_array((data, pattern.indices, pattern.indptr), shape=pattern.shape)
+
+
+for _name in INPUTS:
+    setattr(Gradient, _name, _Input(_name))

@@ -12,7 +12,7 @@ from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
-from lavender.solvers._factor import WIDE
+from lavender.solvers.factors import WIDE
 from lavender.solvers.newton_systems.systems import is_full
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.sparse import SparsePanels, free_part

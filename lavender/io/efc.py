@@ -29,7 +29,13 @@ from lavender_ext.judge.measure import all_finite
 __all__ = ["Imported", "from_efc", "from_mujoco_many"]
 
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7  # numbers of mjtConstraint; all others push only
-OF_ROWS = ("efc_J", "efc_D", "efc_aref", "efc_force", "efc_type", "efc_frictionloss", "efc_vel")
+# What is read of each row, beside efc_J, and of each contact: type and shape.
+OF_ROWS: dict[str, Any] = dict.fromkeys(
+    ("efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel"), (float, ())
+) | dict.fromkeys(("efc_type", "efc_id"), (np.int32, ()))
+OF_CONTACTS: dict[str, Any] = {
+    "efc_address": (np.int32, ()), "dim": (np.int32, ()), "geom": (np.int32, (2,)), "friction": (float, (5,)),
+}  # fmt: skip
 CHUNK = 2**21  # entries of J that are widened at once
 # M a0 beside the smooth force, of their size: 64 roundings, in float64 and in float32, where factors are rounded, too.
 ROUNDING = {"float64": single.ROUNDING, "float32": 2.0**-14}
@@ -182,62 +188,106 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         kinds.setdefault(mj.mj_stateSize(model, kind), kind)
     if size not in kinds:
         raise InputError(f"states have {size} numbers each; one of {sorted(kinds)} is needed")
-    n, elliptic = len(given), model.opt.cone == mj.mjtCone.mjCONE_ELLIPTIC
-    found: list[Any] = [None] * n
-    held: list[Any] = [np.zeros(0, np.int32)] * n  # what names are made of
-    free, smooth = np.full((n, model.nv), np.nan), np.zeros((n, model.nv))
+    n, nv = len(given), model.nv
+    free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
-    none = [np.zeros(0) for _ in OF_ROWS]
     todo = iter(range(n))
+    threads = min(whole_number("threads", threads, 1, None), max(n, 1))
 
-    def work(_: int) -> None:
+    def work(_: int) -> tuple[_Stretches, _Stretches]:
         data = mj.MjData(model)
+        rows = _Stretches(n // threads, efc_J=(float, (nv,)), **OF_ROWS)
+        contacts = _Stretches(n // threads, **OF_CONTACTS)
         for i in todo:
             if not all_finite(given[i]):
-                found[i] = none
                 continue
             mj.mj_setState(model, data, given[i], kinds[size])
             mj.mj_forward(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            arrays = [getattr(data, name).copy() for name in OF_ROWS]
-            if elliptic and data.ncon:
-                c = data.contact
-                arrays += [c.efc_address.copy(), c.dim.copy(), c.friction.copy()]
-            found[i] = arrays
-            contact = data.contact if data.ncon else single.NO_CONTACT
-            held[i] = np.concatenate([data.efc_type, data.efc_id, contact.dim, np.ravel(contact.geom)])
+            rows.take(i, data, data.nefc)
+            if data.ncon:
+                contacts.take(i, data.contact, data.ncon)
+        return rows, contacts
 
-    threads = whole_number("threads", threads, 1, None)
     if threads == 1:
-        work(0)
+        parts = [work(0)]
     else:
-        with ThreadPoolExecutor(min(threads, max(n, 1))) as pool:
-            list(pool.map(work, range(min(threads, max(n, 1)))))
-    made = _gathered(model, found, mass, free, smooth, elliptic)
-    made.batch.names_of = lambda i: single._words(mj, model, held[i], len(found[i][1]), 1)
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(work, range(threads)))
+    rows, ptr = _in_order([of_rows for of_rows, _ in parts], n)
+    contacts, contact_ptr = _in_order([of_contacts for _, of_contacts in parts], n)
+    made = _gathered(model, rows, ptr, contacts, contact_ptr, mass, free, smooth)
+    of_row = rows["efc_type"], rows["efc_id"]
+    of_contact = contacts["dim"], contacts["geom"]
+
+    def words(i: int) -> Any:
+        here, there = slice(ptr[i], ptr[i + 1]), slice(contact_ptr[i], contact_ptr[i + 1])
+        held = np.concatenate([*(x[here] for x in of_row), *(x[there].ravel() for x in of_contact)])
+        return single._words(mj, model, held, int(ptr[i + 1] - ptr[i]), 1)
+
+    made.batch.names_of = words
     return made
 
 
-def _gathered(model: Any, found: list[Any], mass: Any, before: Any, smooth: Any, elliptic: bool) -> Imported:
-    """Ragged arrays of all rows, from those of each state."""
-    n, nv, dt = len(found), model.nv, float(model.opt.timestep)
-    count = np.array([len(x[1]) for x in found], np.int64)
-    ptr = np.concatenate([[0], np.cumsum(count)])
-    jac, stiff, aref, force, of, loss, velocity = (
-        np.concatenate([x[k].ravel() for x in found]) if n else np.zeros(0) for k in range(len(OF_ROWS))
+class _Stretches:
+    """Arrays of many states one after the other, as they come, in room that grows to what `states` will need."""
+
+    def __init__(self, states: int, **kinds: tuple[type, tuple[int, ...]]) -> None:
+        self.arrays: dict[str, Any] = {
+            name: np.empty((0, *shape), dtype) for name, (dtype, shape) in kinds.items()
+        }
+        self.states, self.n, self.room = states, 0, 0
+        self.of: list[int] = []  # which state each stretch is of,
+        self.counts: list[int] = []  # and its length
+
+    def take(self, i: int, source: Any, count: int) -> None:
+        """Those of state i by their names."""
+        begin, end = self.n, self.n + count
+        self.of.append(i)
+        self.counts.append(count)
+        if end > self.room:
+            self.room = int(end * min(4.0, 1.25 * max(1.0, self.states / len(self.of)))) + 1
+            for name, x in self.arrays.items():
+                self.arrays[name] = np.empty((self.room, *x.shape[1:]), x.dtype)
+                self.arrays[name][:begin] = x[:begin]
+        for name, x in self.arrays.items():
+            given = getattr(source, name)
+            x[begin:end] = given if given.ndim == x.ndim else given.reshape(-1, *x.shape[1:])
+        self.n = end
+
+
+def _in_order(parts: list[_Stretches], n: int) -> tuple[dict[str, Any], Any]:
+    """Arrays of all n states in their order, and where each begins (n + 1,)."""
+    count, ptr = np.zeros(n, np.int64), np.zeros(n + 1, np.int64)
+    own = [(np.array(part.of, np.int64), np.array(part.counts, np.int64)) for part in parts]
+    for of, counts in own:
+        count[of] = counts
+    np.cumsum(count, out=ptr[1:])
+    if len(parts) == 1:
+        return {name: x[: ptr[-1]] for name, x in parts[0].arrays.items()}, ptr
+    out = {name: np.empty((ptr[-1], *x.shape[1:]), x.dtype) for name, x in parts[0].arrays.items()}
+    for part, (of, counts) in zip(parts, own, strict=True):
+        to = np.repeat(ptr[of] - (np.cumsum(counts) - counts), counts) + np.arange(part.n)
+        for name, x in part.arrays.items():
+            out[name][to] = x[: part.n]
+    return out, ptr
+
+
+def _gathered(
+    model: Any, rows: Any, ptr: Any, contact: Any, contact_ptr: Any, mass: Any, before: Any, smooth: Any
+) -> Imported:
+    """Of the rows and contacts of all states, one after the other."""
+    dt, jac, of, contacts = float(model.opt.timestep), rows["efc_J"], rows["efc_type"], None
+    if (of == ELLIPTIC).any():
+        address = contact["efc_address"]
+        address = np.where(address < 0, -1, address + np.repeat(ptr[:-1], np.diff(contact_ptr)))
+        contacts = (np.zeros(len(address), int), address, contact["dim"], contact["friction"])
+    cones, scale = _blocks(
+        of[None], rows["efc_frictionloss"][None], np.ones((1, len(of)), bool), contacts, dt
     )
-    jac = jac.reshape(-1, nv)
-    contacts = None
-    if elliptic:
-        held = [x for x in found if len(x) > len(OF_ROWS)]
-        begin = np.repeat(ptr[:-1], [len(x[7]) if len(x) > len(OF_ROWS) else 0 for x in found])
-        parts = [np.concatenate([x[k] for x in held]) if held else np.zeros((0, 5)) for k in (7, 8, 9)]
-        address = np.where(parts[0] < 0, -1, parts[0] + begin) if held else np.zeros(0, int)
-        contacts = (np.zeros(len(address), int), address, parts[1].reshape(len(address)), parts[2])
-    cones, scale = _blocks(of[None], loss[None], np.ones((1, len(of)), bool), contacts, dt)
-    goal = dt * aref + velocity
-    soft, lam = 1.0 / stiff, dt * force
+    goal = dt * rows["efc_aref"] + rows["efc_vel"]
+    soft, lam = 1.0 / rows["efc_D"], dt * rows["efc_force"]
     if scale is not None:
         s = scale[0]
         jac *= s[:, None]

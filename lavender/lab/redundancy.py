@@ -91,10 +91,6 @@ class Redundancy:
         impulse = ("impulse",) if self.rank == self.problem.m else ()
         return ("slack", "body velocities", "objective", *impulse)
 
-    def least_norm(self) -> FloatArray:
-        """The solution of least sum d lambda^2; (m,) [N s]. As `nearest_to` zero."""
-        return self.nearest_to(np.zeros(self.problem.m))
-
     def nearest_to(self, previous: Any) -> FloatArray:
         """The solution with the least sum d (lambda - previous)^2 [J]; (m,) [N s].
 

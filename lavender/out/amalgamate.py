@@ -42,7 +42,7 @@ MODULES = (
 HEADER = HERE / "c" / "lavender.h"
 FRONT = [
     HERE / "front" / f"{name}.c"
-    for name in ("front", "problem", "judge", "solve", "methods", "pivots", "full")
+    for name in ("front", "problem", "judge", "methods", "pivots", "solve", "full")
 ]
 
 

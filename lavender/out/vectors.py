@@ -155,7 +155,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
 
 def _chosen(records: Records, solver: str | None) -> list[Record]:
     """Runs of the solver that is written, to the level that the report recommends by, or else its tightest."""
-    solved = [r for r in records if r.success and r.mode == "tol" and r.way == "call"]
+    solved = [r for r in records if r.success and r.mode == "tol" and r.way in ("call", "steps")]
     names = sorted({r.solver for r in solved if r.solver in METHODS or r.solver == "auto"})
     if solver is None:
         leaders = verdict(records).leaders

@@ -8,16 +8,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, read_only, shape_of
+from lavender.base.arrays import ArrayLike, FloatArray, IntArray, as_array, precision_of, shape_of
 from lavender.base.errors import InputError
-from lavender.problem.cones import Cones, check_shape, kinds_of
+from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.data import checked_matrix
 from lavender.problem.findex import arrays_of, blocks_of, order_of
+from lavender.problem.friction import check_shape
 from lavender.problem.generalized import Generalized
-from lavender.problem.operators import USUAL, Operators
+from lavender.problem.operators import Operators
 from lavender.problem.quadratic import quadratic, unpacked
 from lavender.problem.rows import Rows
-from lavender_ext.core.checks import LEAST, MOST, largest
 from lavender_ext.core.problem import rows_velocity
 
 P = TypeVar("P", bound="Builders")
@@ -388,15 +388,7 @@ class Builders(Operators):
         ([0.3, 0.7], [-1.95], [0.0, 0.1])
         """
         qp = quadratic(unpacked((P, q, G, h, A, b, lb, ub)))
-        of = qp.generalized
-        b = of.bias(qp.target)
-        if not more and of.operator.most <= USUAL and (LEAST <= largest(b) <= MOST or not b.any()):
-            rigid = read_only(np.zeros(of.m))
-            made: P = cls._of_engine(
-                b=read_only(b), cones=qp.cones, generalized=of, compliance=rigid, friction="coulomb", qp=qp
-            )
-            return made
-        return cls(b, qp.cones, generalized=of, qp=qp, **more)  # with the words for what is amiss
+        return cls(qp.generalized.bias(qp.target), qp.cones, generalized=qp.generalized, qp=qp, **more)
 
     def updated(
         self: P,

@@ -36,7 +36,16 @@ from lavender.base.arrays import (
     shape_of,
     whole_number,
 )
-from lavender.base.errors import InputError, UnknownName
+from lavender.base.errors import InputError
+from lavender.problem.friction import (
+    LEAST_SHARE,
+    SHAPES,
+    axes_of,
+    check_parts,
+    check_shape,
+    sides_of,
+    sizes_of,
+)
 from lavender_ext.core import blocks as kernels
 from lavender_ext.core.checks import LEAST, MOST
 
@@ -50,18 +59,11 @@ __all__ = [
     "ROW",
     "SHAPES",
     "Cones",
-    "check_shape",
     "kinds_of",
     "project",
 ]
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
-# What bounds two tangents: their norm, or each by itself.
-SHAPES = ("disk", "box")
-# mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2 in a box: its impulses vanish in any sum with those of mu_2.
-# An ellipse is wider than that.
-LEAST_SHARE = 2.0**-60
-
 
 REACH = "mu patch_radius (of boxes and ellipses mu_2)"
 # Of each kind of contact: least and most rows, what it is called, and what it may have.
@@ -74,19 +76,6 @@ SIZES = {
                       "a normal, two tangents, perhaps spin, and two that roll are needed: 5 rows or 6"),
     CONTACT_ELLIPSE: (3, 3, "an ellipse", "a normal and two tangents are needed"),
 }  # fmt: skip
-
-
-def check_shape(name: str, shape: Any) -> str:
-    """A shape of friction, one of SHAPES.
-
-    Raises
-    ------
-    UnknownName
-        None of them.
-    """
-    if not isinstance(shape, str) or shape not in SHAPES:
-        raise UnknownName(name, shape, SHAPES)
-    return shape
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +190,8 @@ class Cones:
             normal = ptr[:-1][kind != ROW]
             lower[normal] = 0.0
             lower.flags.writeable = upper.flags.writeable = False
-        mu = _sizes("mu", self.mu, k)
-        radius = _sizes("patch_radius", self.patch_radius, k, "m")
+        mu = sizes_of("mu", self.mu, k)
+        radius = sizes_of("patch_radius", self.patch_radius, k, "m")
         wide = ~((radius >= LEAST_SHARE) & (radius <= 1.0 / LEAST_SHARE))
         bad = np.flatnonzero((kind == CONTACT_ELLIPSE) & wide)
         if len(bad):
@@ -211,15 +200,8 @@ class Cones:
                 "1e-18 to 1e18 is needed"
             )
         check_sizes(REACH, np.where(kind == ROW, 0.0, mu * radius), "m")
-        rolling = _sizes("rolling", self.rolling, k, "m")
+        rolling = sizes_of("rolling", self.rolling, k, "m")
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
-
-    @classmethod
-    def _trusted(cls, *values: np.ndarray) -> Cones:
-        # For arrays this package has just made, which are adopted.
-        made = kernels.adopted(*values)
-        # Numbers that another engine should not have held take the long way.
-        return cls(*values) if made is None else cls._of(made)
 
     @classmethod
     def bounded(cls, lower: FloatArray, upper: FloatArray | float) -> Cones:
@@ -286,22 +268,22 @@ class Cones:
             type(mu) is not float and len(shape_of("mu", mu)) > 1,
         )
         if patch_radius is not None or rolling is not None or tangents != 2:
-            _check_parts(mu, tangents, patch_radius is not None, rolling is not None, box, pair)
+            check_parts(mu, tangents, patch_radius is not None, rolling is not None, box, pair)
         ratio, sides = None, 0
         if box and tangents == 2:
             sides = CONTACT_BOX
-            mu, ratio = _sides(mu)
+            mu, ratio = sides_of(mu)
         elif pair and not box:
-            mu, ratio = _axes(mu)
+            mu, ratio = axes_of(mu)
             sides = 0 if ratio is None else CONTACT_ELLIPSE
         given = 1 if type(mu) is float or np.ndim(mu) == 0 else len(mu)
         k = given if count is None else whole_number("count", count)
         if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
-            mu = _sizes("mu", mu, k)
+            mu = sizes_of("mu", mu, k)
         if patch_radius is not None:
-            patch_radius = _sizes("patch_radius", patch_radius, k, "m")
+            patch_radius = sizes_of("patch_radius", patch_radius, k, "m")
         if rolling is not None:
-            rolling = _sizes("rolling", rolling, k, "m")
+            rolling = sizes_of("rolling", rolling, k, "m")
         if ratio is not None:
             patch_radius = np.ascontiguousarray(np.broadcast_to(ratio, (k,)))
         made = kernels.contacts(k, tangents, mu, patch_radius, rolling, sides)
@@ -436,7 +418,7 @@ class Cones:
             kind[two], radius[two & (self.kind == CONTACT)] = CONTACT_BOX, 1.0
         else:
             box = np.flatnonzero(self.kind == CONTACT_BOX)
-            ratio = _axes(self.coefficients[box])[1]
+            ratio = axes_of(self.coefficients[box])[1]
             kind[box] = CONTACT if ratio is None else np.where(ratio == 1.0, CONTACT, CONTACT_ELLIPSE)
             radius[box] = 0.0 if ratio is None else np.where(ratio == 1.0, 0.0, ratio)
         return replace(self, kind=kind, patch_radius=radius)
@@ -554,33 +536,6 @@ def kinds_of(
     return np.where(contact, kind, ROW).astype(np.int32)
 
 
-def _sizes(name: str, value: Any, k: int, unit: str = "") -> FloatArray:
-    array = as_array(name, value, (k,), unit=unit or "-")
-    check_sizes(name, array, unit or "-")
-    return array
-
-
-def _check_parts(mu: Any, tangents: int, spin: bool, rolls: bool, box: bool, pair: bool) -> None:
-    """Raise where no kind of contact has these rows together."""
-    if box and (spin or rolls or tangents > 2):
-        raise InputError(
-            "a box bounds up to two tangents, no spin and no rolling: leave patch_radius, rolling and tangents "
-            "out, or give them as a disk's (shape='disk')"
-        )
-    if pair and not box:
-        raise InputError(
-            f"mu has shape {np.shape(mu)}; one for each of two tangents makes an ellipse, which bounds no spin "
-            "and no rolling: leave patch_radius, rolling and tangents out, or give one mu for each contact"
-        )
-    if tangents > 2 and spin:
-        raise InputError(f"{tangents} tangents make a round cone, which bounds spin itself: no patch_radius")
-    if rolls and tangents != 2:
-        raise InputError(
-            f"rolling needs tangents=2, about which it rolls; tangents is {tangents}"
-            + (", a round cone, which bounds rolling itself" if tangents > 2 else "")
-        )
-
-
 def _fitting(kind: IntArray, size: IntArray) -> IntArray:
     """The kinds, checked by their rows; a round cone of up to two tangents, or a box of one, is a contact."""
     flat = ((kind == ROUND) & (size <= 3)) | ((kind == CONTACT_BOX) & (size <= 2))
@@ -592,41 +547,6 @@ def _fitting(kind: IntArray, size: IntArray) -> IntArray:
         if len(bad):
             raise InputError(f"block {bad[0]} is {name} of {size[bad[0]]} rows; {needed}")
     return kind
-
-
-def _pairs(mu: Any) -> FloatArray:
-    """mu (k, 2), one for each of two tangents, checked."""
-    given = as_array("mu", mu, (None,) * np.ndim(mu))
-    check_sizes("mu", given, "-")
-    if given.ndim != 2 or given.shape[1] != 2:
-        raise InputError(f"mu has shape {given.shape}; (k,) or (k, 2), one for each tangent, is needed")
-    return given
-
-
-def _sides(mu: Any) -> tuple[Any, FloatArray]:
-    """mu_1 (float or (k,)) of boxes and mu_2 / mu_1, (1,) or (k,), from mu: scalar, (k,) or (k, 2)."""
-    if np.ndim(mu) < 2:
-        return mu, np.ones(1)
-    first, second = _pairs(mu).T
-    first = np.where((first <= LEAST_SHARE * second) & (second > 0.0), LEAST_SHARE * second, first)
-    some = first > 0.0
-    return first, np.divide(second, first, out=np.zeros(len(first)), where=some)
-
-
-def _axes(mu: Any) -> tuple[FloatArray, FloatArray | None]:
-    """mu_1 (k,) of ellipses and mu_2 / mu_1 (k,), None where all are disks, from mu (k, 2)."""
-    given = _pairs(mu)
-    flat = np.flatnonzero(
-        (given.min(axis=1) < 2.0 * LEAST_SHARE * given.max(axis=1)) & (given.max(axis=1) > 0.0)
-    )
-    if len(flat):
-        raise InputError(
-            f"mu of contact {flat[0]} is {given[flat[0]].tolist()}; an ellipse needs two numbers above 0 (or no "
-            "friction at all), none 1e18 times the other: shape='box' takes a tangent without friction"
-        )
-    first, second = given[:, 0], given[:, 1]
-    ratio = np.divide(second, first, out=np.ones(len(first)), where=first > 0.0)
-    return first.copy(), ratio if (ratio != 1.0).any() else None
 
 
 def project(cones: Cones, impulse: FloatArray) -> FloatArray:

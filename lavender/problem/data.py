@@ -149,18 +149,6 @@ class ProblemData:
         as_array("b", self.b, (self.m,), unit="m/s", copy=False)
         _check_rhs(self.b)
 
-    @classmethod
-    def _of_engine(cls, **given: Any) -> Any:
-        """From read-only arrays that were made here and checked, in generalised coordinates; adopted."""
-        made = object.__new__(cls)
-        derived, put = Derived(), made.__dict__
-        put.update(given, derived=derived, precision="float64", copy=True)
-        derived.view = general_data(
-            put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
-            FRICTION_NUMBER[put["friction"]],
-        )  # fmt: skip
-        return made
-
     def _check_rows(self, rows: Rows, m: int, k: int) -> None:
         if not isinstance(rows, Rows):
             raise InputError(f"rows is a {type(rows).__name__}; a Rows is needed")

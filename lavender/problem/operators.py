@@ -11,12 +11,12 @@ from lavender.base.errors import CapabilityError, InputError, TooLarge
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem.data import ProblemData
-from lavender.problem.derived import cached_property, once
+from lavender.problem.derived import Derived, cached_property, once
 from lavender_ext.core import assemble
 from lavender_ext.core.assemble import dense_to_csr
 from lavender_ext.core.checks import MOST, largest
 from lavender_ext.core.problem import LAWS as FRICTION_NUMBER
-from lavender_ext.core.problem import Data, nothing_done
+from lavender_ext.core.problem import Data, general_data, nothing_done
 from lavender_ext.factor import sparse
 from lavender_ext.judge import measure
 
@@ -32,6 +32,22 @@ class Operators(ProblemData):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._refuse_extremes()
+
+    @classmethod
+    def _of_engine(cls, **given: Any) -> Any:
+        """From read-only arrays that `export.numbers` has let in, in generalised coordinates: adopted."""
+        made = object.__new__(cls)
+        derived, put = Derived(), made.__dict__
+        put.update(given, derived=derived, precision="float64", copy=True)
+        derived.view = general_data(
+            put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
+            FRICTION_NUMBER[put["friction"]],
+        )  # fmt: skip
+        made._refuse_extremes()
+        return made
+
+    def _refuse_extremes(self) -> None:
         if self.matrix is None and self._is_extreme():
             self.metric  # noqa: B018 - refused here, and not in a solve
 

@@ -27,13 +27,13 @@ from lavender.judge.residuals import reference
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import LARGEST_MEMORY
-from lavender.solvers._factor import GENERAL_LIMIT, PANELS_WORK, TINY, WIDE
+from lavender.solvers.factors import GENERAL_LIMIT, PANELS_WORK, TINY, Panels, mirrored, rows_of
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import loading
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
-from lavender_ext.factor.sparse import SparsePanels, is_mirrored
+from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
 
@@ -106,8 +106,8 @@ class AdmmState:
         self.lu = not problem.is_symmetric
         self.kind = _PANELS
         if problem.m:
-            self.matrix = _mirrored(self.matrix)
-            self.panels = _analysed(self.matrix, self.lu)
+            self.matrix = mirrored(self.matrix)
+            self.panels = Panels(*rows_of(self.matrix)[:2])
 
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
@@ -116,7 +116,7 @@ class AdmmState:
             assert problem.rows is not None
             rows = problem.rows
             return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
-        return _PANELS_WORK * self.panels.work if m else 0.0
+        return _PANELS_WORK * _analysed(self.panels, self.lu).work if m else 0.0
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -149,15 +149,14 @@ class AdmmState:
         if self.kind == _BODIES:
             k = self.jacobian
             e = 1.0 / (self.theta + rho)
-            matrix, shift = _mirrored(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
+            matrix, shift = mirrored(sp.csr_array(k.T @ sp.diags_array(e) @ k)), 1.0
             # Analysed each time: an entry may cancel at one rho and not at another, or alone of a pair.
-            panels = _analysed(matrix, False)
-            extra = (*_arrays(k), e)
+            panels = Panels(*rows_of(matrix)[:2])
+            extra = (*rows_of(k), e)
         done = _factored(panels, matrix, shift, self.lu)
         if not done and self.kind == _PANELS and not self.lu and self.problem.law == "linear":
             # A linear system need not be definite, which L L^T is for.
             self.lu = True
-            self.panels = panels = _analysed(matrix, True, panels)
             done = _factored(panels, matrix, shift, True)
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
@@ -165,11 +164,11 @@ class AdmmState:
                 raise _TooLate
             self.full = True
             self.matrix = matrix = _full(matrix)
-            self.panels = panels = _analysed(matrix, True)
+            self.panels = panels = Panels(*rows_of(matrix)[:2])
             done = _factored(panels, matrix, shift, True)
         if not done:
             raise _Failed(f"the factor of A + rho D broke down at rho = {rho:.1e}")
-        return self.kind, matrix.shape[0], (panels, *extra)
+        return self.kind, matrix.shape[0], (_analysed(panels, self.lu), *extra)
 
 
 def _is_over_bodies(problem: Problem) -> bool:
@@ -191,23 +190,24 @@ def _opening(problem: Problem) -> float:
     return _ENTRY * entries + formed
 
 
-def _analysed(matrix: sp.csr_array, lu: bool, like: SparsePanels | None = None) -> SparsePanels:
+def _analysed(panels: Panels, lu: bool) -> SparsePanels:
     try:
-        return SparsePanels(*_arrays(matrix)[:2], lu, WIDE, like)
+        return panels.analysed(lu)
     except OverflowError as error:
         raise _Failed(str(error)) from None
 
 
-def _factored(panels: SparsePanels, matrix: sp.csr_array, shift: float, lu: bool) -> bool:
+def _factored(panels: Panels, matrix: sp.csr_array, shift: float, lu: bool) -> bool:
     # Whether M = matrix + shift has its factor; of L U also whether what it solves is exact:
     # max |r - M x| <= BACKWARD (max |M_ij| max |x| + max |r|).
-    values, n = _arrays(matrix)[2], matrix.shape[0]
-    if not np.isfinite(values).all() or panels.factor(values, np.ones(n), shift, TINY):
+    values, n = rows_of(matrix)[2], matrix.shape[0]
+    made = _analysed(panels, lu)
+    if not np.isfinite(values).all() or made.factor(values, np.ones(n), shift, TINY):
         return False
     if not lu:
         return True
     r = np.linspace(1.0, 2.0, n)
-    x = panels.solve(r)
+    x = made.solve(r)
     left = np.abs(r - matrix @ x - shift * x).max()
     return bool(left <= BACKWARD * ((np.abs(values).max() + shift) * np.abs(x).max() + 2.0))
 
@@ -217,24 +217,6 @@ def _full(matrix: sp.csr_array) -> sp.csr_array:
     n = matrix.shape[0]
     indptr, indices = np.arange(n + 1, dtype=np.int32) * n, np.tile(np.arange(n, dtype=np.int32), n)
     return sp.csr_array((matrix.toarray().ravel(), indices, indptr), shape=matrix.shape)
-
-
-def _mirrored(matrix: sp.csr_array) -> sp.csr_array:
-    # The same in sorted rows, with an entry, if only 0, at (j, i) wherever there is one at (i, j).
-    matrix.sort_indices()
-    if is_mirrored(*_arrays(matrix)[:2]):
-        return matrix
-    a = sp.coo_array(matrix)
-    where = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
-    return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), where), shape=a.shape)
-
-
-def _arrays(matrix: Any) -> tuple[Any, Any, Any]:
-    # (ptr, index, value) of sorted rows, as the kernels read them.
-    matrix.sort_indices()
-    value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
-    index = np.ascontiguousarray(matrix.indices if matrix.nnz else np.zeros(1), np.int32)
-    return np.ascontiguousarray(matrix.indptr, np.int32), index, value
 
 
 @dataclass(frozen=True)
@@ -256,7 +238,6 @@ class ADMM(Solver):
         """What `prepare` takes [s], as counted; what it leaves is begun by `run` if it fits there."""
         return min(_opening(problem), AT_ONCE) + loading("scipy.sparse", "scipy.linalg.lapack")
 
-    @np.errstate(all="ignore")  # what overflows is judged
     def prepare(self, problem: Problem) -> AdmmState | str:
         """Scale and factor; a text where the factorisation broke down."""
         load()

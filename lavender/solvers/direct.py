@@ -32,7 +32,7 @@ from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender.solvers._factor import SMALL_SIZE, GeneralFactor, PanelsLU
+from lavender.solvers.factors import SMALL_SIZE, GeneralFactor, PanelsLU
 from lavender.solvers.pivoting import PivotState
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import factored, over_rows
@@ -55,7 +55,6 @@ class DirectState:
     general: GeneralFactor | PanelsLU | None = None
     begun: int = 0  # factorisations before `general` that came to nothing
     is_running: bool = False
-    is_over: bool = False  # the rows have nothing left to do
     note: str = ""
 
 
@@ -309,7 +308,6 @@ class _Run:
 
     def end(self, pivot: PivotState, code: int) -> Claim:
         """What the rows deserve after the last turn."""
-        self.state.is_over = code in OVER
         if code == CIRCLES:
             return self.circling()
         if self.problem.law != "linear":

@@ -247,8 +247,8 @@ class Newton(Solver):
         sweeps = worked = 0
         before = system.solve.factorisations if again else 0
         if self.form == "auto" and problem.rows is not None and not again:
-            tried = warm_start(problem, impulse, tol, max_iter, time_limit)
-            claim, sweeps, worked = claim_of(tried), tried.sweeps, tried.factorisations
+            how, sweeps, worked = warm_start(problem, impulse, tol, max_iter, time_limit)
+            claim = claim_of(how, sweeps, worked)
             if claim is not None and general.confirmed(problem, impulse, tol):
                 return claim
         max_iter -= worked

@@ -9,7 +9,7 @@ from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.later import lapack, load
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.solvers._factor import (
+from lavender.solvers.factors import (
     SMALL_SIZE,
     TINY,
     DenseFactor,

@@ -6,8 +6,6 @@ is not within tol, `newton` continues from the original start.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -20,7 +18,9 @@ from lavender_ext.warm.start import (
     from_guess,
 )
 
-__all__ = ["Tried", "claim_of", "warm_start"]
+__all__ = ["claim_of", "warm_start"]
+
+NOTHING = UNDECIDED, 0, 0
 
 #: How the kernel says that it ended; None where nothing was decided.
 ENDED = {
@@ -31,32 +31,26 @@ ENDED = {
 }
 
 
-class Tried(NamedTuple):
-    """Result of the first phase."""
-
-    how: int  # how it ended, a number of the kernel; 0 where it decided nothing
-    sweeps: int = 0
-    factorisations: int = 0
-
-
-def claim_of(tried: Tried) -> Claim | None:
-    """The claim of `newton` for a warm start solved in the first phase; None if it was not."""
-    message = ENDED[tried.how]
+def claim_of(how: int, sweeps: int, factorisations: int) -> Claim | None:
+    """The claim of `newton` for a warm start that ended so in the first phase; None if it decided nothing."""
+    message = ENDED[how]
     if message is None:
         return None
-    work = {"factorisations": tried.factorisations}
-    if tried.sweeps:
-        work["sweeps"] = tried.sweeps
-    form = "impulse" if tried.how == SOLVED else "velocity"
-    return Claim(Status.CONVERGED, tried.factorisations, work, message, form=form)
+    work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
+    form = "impulse" if how == SOLVED else "velocity"
+    return Claim(Status.CONVERGED, factorisations, work, message, form=form)
 
 
 def warm_start(
     problem: Problem, impulse: FloatArray, tol: float, budget: int, time_limit: float | None = None
-) -> Tried:
-    """Solve `impulse` (m,) to tol in place if the first phase can; otherwise leave it unchanged."""
+) -> tuple[int, int, int]:
+    """Solve `impulse` (m,) to tol in place if the first phase can; otherwise leave it unchanged.
+
+    How it ended, of `ENDED`, its sweeps and factorisations.
+    """
     if problem.rows is None or problem.friction != "coulomb" or tol <= 0.0 or budget < 1:
-        return Tried(0)
+        return NOTHING
     if time_limit is not None and MOST_SWEEPS * 1e-9 * problem.data.work > time_limit:
-        return Tried(0)
-    return Tried(*from_guess(problem.data, impulse, tol))
+        return NOTHING
+    how, sweeps, factorisations = from_guess(problem.data, impulse, tol)
+    return how, sweeps, factorisations

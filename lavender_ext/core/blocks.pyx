@@ -197,18 +197,6 @@ def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
     return made
 
 
-def adopted(ptr, kind, lower, upper, mu, patch_radius, rolling):
-    """Blocks over these arrays themselves, read-only from now on; None where anything is amiss."""
-    cdef Blocks made = Blocks.__new__(Blocks)
-    if not made.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not made.check():
-        return None
-    made.spell()
-    for x in (ptr, kind, lower, upper, mu, patch_radius, rolling):
-        x.setflags(False)
-    made.arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
-    return made
-
-
 def free_rows(Py_ssize_t m):
     """m unbounded rows, each its own block; None below 0 and beyond 32 bits."""
     if not 0 <= m < 2147483647:

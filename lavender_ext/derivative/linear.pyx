@@ -8,6 +8,8 @@ with C the compliance, and of a matrix
 
     G^T q = D^-1/2 (c + A^T x),   s = D^-1/2 P^T q - x                                                      (2)
 """
+from cpython.buffer cimport (PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBUF_WRITABLE, PyBuffer_Release,
+                             PyObject_GetBuffer)
 from libc.math cimport fabs
 from libc.stdint cimport int8_t, int32_t
 from libc.string cimport memcpy, memset
@@ -26,6 +28,8 @@ from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
+
+cdef object empty = np.empty, ndarray = np.ndarray
 
 cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
 
@@ -103,24 +107,24 @@ cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, 
     through_mass(v, n, f, p)
 
 
-cdef bint is_plain(given, Py_ssize_t n, const double** to):
-    """Whether it is None, `to` NULL then, or an array (n,) of finite numbers that lie together."""
-    cdef const double[::1] x
+cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
+    """Whether it is None, `to` NULL then, or an array (n,) of finite numbers that lie together, held by `view`."""
     cdef double nought = 0.0                            # or becomes NaN
     cdef Py_ssize_t i
-    to[0] = NULL
     if given is None:
         return True
+    if type(given) is not ndarray:
+        return False
     try:
-        x = given
-    except (TypeError, ValueError):
+        PyObject_GetBuffer(given, view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
+    except ValueError:                                  # dates have no buffer
         return False
-    if x.shape[0] != n:
+    if view.format[0] != 100 or view.format[1] != 0 or view.ndim != 1 or view.shape[0] != n:    # "d"
         return False
-    for i in range(n):
-        nought += 0.0 * x[i]
     if n:
-        to[0] = &x[0]
+        to[0] = <const double*>view.buf
+    for i in range(n):
+        nought += 0.0 * to[0][i]
     return nought == 0.0
 
 
@@ -246,22 +250,31 @@ cdef class Linear:
         """
         cdef view_t v = self.judge.view()
         cdef int32_t m = self.b.n_rows, n = v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
-        cdef const double* y
-        cdef const double* c
-        cdef const double* x
-        if not (is_plain(velocity, n, &y) and is_plain(impulse, m, &c) and is_plain(slack, m, &x)):
-            return None
-        out_ = np.empty(3 * m + 2 * n)
-        cdef double[::1] made = out_
-        cdef double* out = &made[0] if made.shape[0] else NULL
-        with nogil:
-            lav_adjoint(&v, &self.x, self.rows, self.place_, self.lu, self.swap, n, y, c, x, out, out + m, out + 2 * m,
-                        out + 2 * m + n)
-            if c != NULL:
-                memcpy(out + 2 * (m + n), c, m * sizeof(double))
-            else:
-                memset(out + 2 * (m + n), 0, m * sizeof(double))
-        return out_
+        cdef const double* given[3]                     # y, c, x
+        cdef Py_buffer views[4]
+        cdef double* out
+        cdef int i
+        memset(&views[0], 0, 4 * sizeof(Py_buffer))     # what holds nothing is released in vain
+        for i in range(3):
+            given[i] = NULL
+        try:
+            if not (is_plain(velocity, n, &views[0], &given[0]) and is_plain(impulse, m, &views[1], &given[1])
+                    and is_plain(slack, m, &views[2], &given[2])):
+                return None
+            made = empty(3 * m + 2 * n)
+            PyObject_GetBuffer(made, &views[3], PyBUF_WRITABLE)
+            out = <double*>views[3].buf
+            with nogil:
+                lav_adjoint(&v, &self.x, self.rows, self.place_, self.lu, self.swap, n, given[0], given[1], given[2],
+                            out, out + m, out + 2 * m, out + 2 * m + n)
+                if given[1] != NULL:
+                    memcpy(out + 2 * (m + n), given[1], m * sizeof(double))
+                else:
+                    memset(out + 2 * (m + n), 0, m * sizeof(double))
+            return made
+        finally:
+            for i in range(4):
+                PyBuffer_Release(&views[i])
 
     def times(self, v_, bint back=False, bint edge=False):
         """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""

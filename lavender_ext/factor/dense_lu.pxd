@@ -55,18 +55,3 @@ cdef inline void lu_solve(int32_t n, const double* a, const int32_t* swap, doubl
         x[k] -= dot(a + <ssize_t>k * n, x, k)
     for k in range(n - 1, -1, -1):
         x[k] = (x[k] - dot(a + <ssize_t>k * n + k + 1, x + k + 1, n - k - 1)) / a[<ssize_t>k * n + k]
-
-
-cdef inline void lu_solve_back(int32_t n, const double* a, const int32_t* swap, double* x) noexcept nogil:
-    """x <- N^-T x."""
-    cdef int32_t k
-    cdef double t
-    for k in range(n):                                  # U^T, then L^T, then P
-        x[k] = x[k] / a[<ssize_t>k * n + k]
-        take(x + k + 1, a + <ssize_t>k * n + k + 1, x[k], n - k - 1)
-    for k in range(n - 1, -1, -1):
-        take(x, a + <ssize_t>k * n, x[k], k)
-    for k in range(n - 1, -1, -1):
-        t = x[swap[k]]
-        x[swap[k]] = x[k]
-        x[k] = t

@@ -97,28 +97,6 @@ cdef public int32_t lav_tree_components(int32_t k, const int32_t* ptr, const gen
     return number(k, parent, label)
 
 
-cdef public int32_t lav_body_spread(int32_t k, const int32_t* ptr, const int32_t* body, int32_t n_bodies, int32_t* low,
-                                    int32_t* high) noexcept nogil:
-    """Half-bandwidth of A at most: the widest spread of rows over one body; low, high (n_bodies) are scratch."""
-    cdef int32_t i, h, b, widest = 0
-    for b in range(n_bodies):
-        low[b] = -1
-        high[b] = -1
-    for i in range(k):
-        if ptr[i + 1] - ptr[i] - 1 > widest:
-            widest = ptr[i + 1] - ptr[i] - 1
-        for h in range(2):
-            b = body[2 * i + h]
-            if b < 0:
-                continue
-            if low[b] < 0:
-                low[b] = ptr[i]
-            high[b] = ptr[i + 1] - 1
-            if high[b] - low[b] > widest:
-                widest = high[b] - low[b]
-    return widest
-
-
 cdef public int32_t lav_body_pairs(int32_t k, const int32_t* body, int32_t n_bodies, int32_t still, int32_t* first,
                                    int32_t* mark, int32_t* following) noexcept nogil:
     """Pairs of bodies with a block between them; those with a static one count where `still` is not 0.
@@ -198,16 +176,6 @@ def tree_components(Data p):
         with nogil:
             count = lav_tree_components(k, p.blocks.ptr, &p.general, &parent[0], &first[0], &label[0])
     return count, label_array
-
-
-def body_spread(const int32_t[::1] ptr, const int32_t[:, ::1] body, int n_bodies):
-    """Half-bandwidth of A at most, from the bodies of each block (k, 2)."""
-    cdef int32_t k = <int32_t>body.shape[0], widest = 0
-    cdef int32_t[::1] low = np.empty(n_bodies + 1, np.int32), high = np.empty(n_bodies + 1, np.int32)
-    if k:
-        with nogil:
-            widest = lav_body_spread(k, &ptr[0], &body[0, 0], n_bodies, &low[0], &high[0])
-    return widest
 
 
 def body_pairs(const int32_t[:, ::1] body, int n_bodies, bint still):

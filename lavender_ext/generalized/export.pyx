@@ -12,6 +12,7 @@ from libc.string cimport memcmp, memcpy
 import numpy as np
 
 from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.door cimport is_number, is_size
 from lavender_ext.core.parts cimport ROW, contact_kind
 
 
@@ -344,7 +345,7 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
 def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale, double dt,
             const double[:] v, const double[:] smooth, const double[:] aref, const double[:] r, const double[:] inverse,
             const double[:] force, const double[:] vel, const double[:] b, const double[:] push, const double[:] a):
-    """(b, compliance, v*, whether they are finite, max |efc_R efc_D - 1|, gaps) of J scaled by row.
+    """(b, compliance, v*, whether the door takes them, max |efc_R efc_D - 1|, gaps) of J scaled by row.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
@@ -357,9 +358,10 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
     """
     cdef int32_t i, j, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>v.shape[0]
     cdef Py_ssize_t q
-    cdef double c, size, s_v, s_free, f, finite = 0.0, sound = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
+    cdef double c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
-    cdef double top_v = 0.0, top_free = 0.0
+    cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
+    cdef bint sound = True
     made = new(2 * m + 5 * n + 1)
     cdef double[::1] view = made
     cdef double* rhs = &view[0]
@@ -373,7 +375,7 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         change[j] = dt * smooth[j]
         pushed[j] = pushed[n + j] = 0.0
         free[j] = before[j] + change[j]
-        sound += 0.0 * free[j]
+        sound &= is_number(free[j])
         top_v = widest(top_v, before[j])
         top_free = widest(top_free, change[j])
         said_3 = widest(said_3, push[j])
@@ -392,9 +394,8 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
             pushed[n + j] += fabs(c)
         rhs[i] = dt * scale[i] * aref[i] - s_free
         compliance[i] = r[i] * scale[i] * scale[i]
-        sound += 0.0 * rhs[i] + 0.0 * compliance[i]
-        if compliance[i] < 0.0:
-            sound = 1.0
+        top_b = widest(top_b, rhs[i])
+        sound &= is_size(compliance[i])
         gap_0 = widest(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
         gap_1 = widest(gap_1, s_v - c)
@@ -408,7 +409,7 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         gap_3 = widest(gap_3, pushed[j] - push[j])
         big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
     made.setflags(False)
-    return made[:m], made[m:2 * m], made[2 * m:2 * m + n], sound == 0.0, gap_0, (
+    return made[:m], made[m:2 * m], made[2 * m:2 * m + n], sound and is_size(top_b), gap_0, (
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)

@@ -2,7 +2,7 @@
 
 Panels that share a column, directly or through others, are an island: its velocities move no row of another.
 """
-from libc.math cimport ceil, sqrt
+from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
@@ -143,7 +143,6 @@ cdef enum:
 
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
-    int32_t wide                # columns of a full island that costs what the costliest does, at most most[0]
     int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
     double work                 # multiply-adds of N and of its factors, of all islands
@@ -160,8 +159,8 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
                         need_t* need) noexcept nogil:
     """Islands of a problem, in w (`marks_of`), and where L of each has entries."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
-    cdef int32_t i, size, wide
-    cdef double values, work
+    cdef int32_t i, size
+    cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
     f.law = p.law if has_friction(p) else CONE          # where nothing rubs, the convex problem is the whole
@@ -184,7 +183,6 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     need.crowded = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
     f.lptr = w + at
     f.lidx = w + at + f.cptr[f.n_islands] + 1
-    need.wide = need.most[0] if need.crowded else 0
     need.values = 0.0
     need.work = 0.0
     for i in range(panels):
@@ -193,20 +191,13 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
         values = lptr[size] - lptr[0] + size
-        wide = size
         if f.law == COULOMB:                            # whole, since its own N lacks symmetry
             values = <double>size * size
             need.work += values * size / 3.0
         elif size > 0:
-            work = factor_work(size, lptr, f.lidx)
-            wide = <int32_t>ceil(sqrt(6.0 * work / size))
-            need.work += work
+            need.work += factor_work(size, lptr, f.lidx)
         if values > need.values:
             need.values = values
-        if size > wide > need.wide:
-            need.wide = wide
-        elif wide >= size > need.wide:
-            need.wide = size
 
 
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:

@@ -13,14 +13,12 @@ ENDS = {"done": DONE, "spent": SPENT, "stuck": STUCK, "failed": FAILED, "lost": 
 cdef class Newton:
     """Room for Newton's method on a problem in generalised coordinates; `run` as often as wanted.
 
-    `largest`: velocities of the island whose factor costs most, or of a full one that costs the same. `work`:
-    multiply-adds of N and one factor of each island. `soft`: no row needs a proximal term. Where N of an island has more
-    than `most` values (`fits`) there is no room, and no `run`.
+    `work`: multiply-adds of N and one factor of each island. `soft`: no row needs a proximal term. Where N of an island
+    has more than `most` values (`fits`) there is no room, and no `run`.
     """
     cdef flow_t f
     cdef Data data
     cdef list keep
-    cdef readonly int largest
     cdef readonly double work
     cdef readonly bint fits, soft
 
@@ -35,7 +33,7 @@ cdef class Newton:
             if not need.crowded or <double>per * p.general.n > most:
                 break
             per *= 2
-        self.largest, self.work = need.wide, need.work
+        self.work = need.work
         self.soft = is_soft(&p.blocks, &p.general)
         self.fits = not need.crowded and need.values <= most
         if not self.fits:

@@ -10,10 +10,10 @@ import numpy as np
 
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
-from lavender_ext.core.parts cimport add_part, blocks_t, n_directions, n_turns, parts_t
+from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
-from lavender_ext.local.exact cimport boxed_rows, exact_contact
+from lavender_ext.local.exact cimport boxed_rows
 from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
                                               solve_rows_block)
@@ -141,28 +141,6 @@ cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, co
             i = order[q]
             fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
     return fallbacks
-
-
-def solve_contacts(int law, int tangents, bint spin, const double[:, :, ::1] W, const double[:, ::1] q,
-                   const double[::1] mu, const double[::1] patch_radius, double[:, ::1] lam):
-    """One-contact problems, one after the other: lam (n, rows) in place (the guess of spin on entry).
-
-    Returns (n,) int32: 0 open, 1 stick, 2 slip, -1 no exact answer (lam left alone).
-    """
-    cdef Py_ssize_t i, k, n = W.shape[0]
-    cdef int32_t[::1] found = np.empty(n, np.int32)
-    cdef double d[6]
-    cdef parts_t part
-    for i in range(n):
-        part.n = 0
-        if tangents:
-            add_part(&part, tangents, mu[i])
-        if spin:
-            add_part(&part, 1, mu[i] * patch_radius[i])
-        for k in range(W.shape[1]):
-            d[k] = W[i, k, k]
-        found[i] = exact_contact(law, <int32_t>W.shape[1], &W[i, 0, 0], &q[i, 0], d, &part, &lam[i, 0])
-    return np.asarray(found)
 
 
 def solve_boxed(const double[:, :, ::1] W, const double[:, ::1] w, const double[:, ::1] step,

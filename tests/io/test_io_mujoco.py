@@ -261,6 +261,18 @@ def test_impulses_of_noslip_are_marked():
     assert "noslip" in lv.io.from_mujoco(model, data).name
 
 
+@pytest.mark.parametrize(("field", "by"), [("b", 1e-70), ("compliance", 1e-70)])
+def test_numbers_that_the_door_refuses_are_refused_of_an_engine_too(field, by):
+    model, data = state()
+    if field == "b":
+        model.opt.timestep *= by
+        mj.mj_forward(model, data)
+    else:
+        data.efc_R[:], data.efc_D[:] = by, 1.0 / by
+    with pytest.raises(lv.InputError, match=f"{field}.* at least 1e-60"):
+        lv.io.from_mujoco(model, data)
+
+
 def test_something_else_is_an_input_error():
     model, data = state(steps=1)
     with pytest.raises(lv.InputError, match=r"MjModel.*needed"):

@@ -120,7 +120,7 @@ def test_an_indefinite_matrix_has_its_rank_and_nothing_unique(seed):
             abs(null @ (problem.d * (near - previous))) < 1e-5 * np.abs(problem.d).max() * np.abs(near).max()
         )
     with pytest.raises(lv.CapabilityError, match="semidefinite"):
-        redundancy(lv.Problem.lcp(a, problem.b)).least_norm()
+        redundancy(lv.Problem.lcp(a, problem.b)).nearest_to(previous)
 
 
 @given(seed=seeds)
@@ -156,7 +156,7 @@ def test_linear_representatives_are_projections(seed):
     s = a / np.outer(scale, scale)
     for wanted, got in (
         (previous, redundancy(problem).nearest_to(previous)),
-        (np.zeros(m), redundancy(problem).least_norm()),
+        (np.zeros(m), redundancy(problem).nearest_to(np.zeros(problem.m))),
     ):
         # z = sqrt(d) (lambda - wanted) of least norm with S z = D^-1/2 (b - A wanted)
         z = np.linalg.pinv(s, rcond=1e-10) @ ((problem.b - a @ wanted) / scale)
@@ -164,7 +164,7 @@ def test_linear_representatives_are_projections(seed):
 
 
 def test_four_legs_share_evenly():
-    even = redundancy(box_on_corners()).least_norm()
+    even = redundancy(box_on_corners()).nearest_to(np.zeros(4))
     np.testing.assert_allclose(even, 0.025, rtol=1e-9)
     found = redundancy(box_on_corners())
     np.testing.assert_allclose(
@@ -205,7 +205,7 @@ def test_lcp_representatives_are_nearest_on_the_optimal_face(seed):
 
 def test_cone_representatives():
     problem = box_on_corners(0.5)
-    even = redundancy(problem).least_norm()
+    even = redundancy(problem).nearest_to(np.zeros(problem.m))
     np.testing.assert_allclose(even.reshape(4, 3)[:, 0], 0.025, atol=1e-6)
     assert lv.residual(problem, even).relative <= 1e-6
 
@@ -215,7 +215,7 @@ def test_what_has_no_representative_is_refused():
     found = redundancy(problem)
     assert found.unique == ()
     with pytest.raises(lv.CapabilityError, match="relaxed"):
-        found.least_norm()
+        found.nearest_to(np.zeros(problem.m))
     with pytest.raises(lv.InputError, match="tol"):
         redundancy(problem, tol=2.0)
     with pytest.raises(lv.InputError, match="previous"):
@@ -273,7 +273,7 @@ def test_beside_a_diagonal_1e26_times_larger_a_row_is_still_a_row():
     problem = lv.Problem.linear([[1.0, 2.0**43], [2.0**43, 2.0**86]], [1.0, 2.0**43])
     repeated = lv.redundancy(problem)
     assert repeated.rank == 1
-    assert lv.residual(problem, repeated.least_norm()).relative <= 1e-9
+    assert lv.residual(problem, repeated.nearest_to(np.zeros(2))).relative <= 1e-9
 
 
 def test_a_diagonal_that_is_rounding_is_not_scaled_by():

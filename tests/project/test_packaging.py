@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,11 +19,6 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     tomllib = pytest.importorskip("tomli")
-
-import subprocess
-import sys
-
-import pytest
 
 import lavender
 import lavender_ext
@@ -254,12 +250,6 @@ def test_the_clock_of_a_limit_holds_no_import_of_scipy(solver, kinds):
     python("-c", LATE, solver, *kinds.split(", "))
 
 
-def test_public_names_are_there():
-    assert len(lavender.__all__) == len(set(lavender.__all__))
-    for name in lavender.__all__:
-        assert hasattr(lavender, name), name
-
-
 def test_command_is_installed():
     (entry,) = importlib.metadata.entry_points(group="console_scripts", name="lavender")
     assert callable(entry.load())
@@ -387,9 +377,6 @@ def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_pa
     stamp.write_text("as it is asked for now")
     python("-c", code, cwd=tmp_path, status=-signal.SIGKILL)
     assert not stamp.exists()
-
-
-HERE = Path(__file__).resolve().parent
 
 
 def test_a_build_of_the_package_ships_the_modules(tmp_path, module, newton_module):

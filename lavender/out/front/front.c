@@ -70,6 +70,19 @@ struct lav_solver {
 #endif
 };
 
+enum { FREE_ROWS = 1, ROWS_ALONE, COULOMB_ALONE, EVERY_LAW }; /* blocks that a method takes */
+
+typedef struct method_t {
+  int32_t forms, rolling, round; /* 1 << form of those it takes: at all, with parts that roll, with round cones */
+  int32_t blocks, patience;      /* checks without a gain before it stalls */
+  sweep_t sweep;                 /* where it is one after the other */
+  int64_t (*room)(const lav_problem *, const lav_options *, int32_t n_v); /* doubles beside the problem */
+  int32_t (*start)(lav_solver *);                                         /* a problem is set */
+  void (*step)(lav_solver *, const lav_budget *, lav_result *);           /* on from where it is */
+} method_t;
+
+static const method_t *row_of(int32_t method);
+
 #define GIVE_BACK(call)                                             \
   do {                                                              \
     const int32_t code_ = (call);                                   \
@@ -161,31 +174,6 @@ static int32_t check_options(const lav_options *o) {
   return LAV_OK;
 }
 
-/* Does the method take the form, whatever the blocks are? */
-static int32_t takes_form(int32_t method, int32_t form) {
-#ifdef LAV_SWEEPS_ONLY
-  if (form == LAV_VELOCITIES) return 0;
-#endif
-  switch (method) {
-    case LAV_SEQUENTIAL_IMPULSES: return form == LAV_BODIES;
-    case LAV_PGS: return form != LAV_BODIES;
-    case LAV_SOR: case LAV_GAUSS_SEIDEL: case LAV_JACOBI: return form == LAV_MATRIX;
-#ifndef LAV_SWEEPS_ONLY
-    case LAV_BLOCK_GAUSS_SEIDEL: case LAV_ANDERSON: case LAV_NNCG: case LAV_NEWTON: return 1;
-    case LAV_DIRECT: case LAV_LEMKE: case LAV_ADMM: return form != LAV_VELOCITIES; /* over A, which is formed of bodies */
-#endif
-    default: return 0;
-  }
-}
-
-/* Does it take contacts whose rolling is bounded, and cones of more than two tangents? */
-static int32_t takes_kind(int32_t method, int32_t form, int32_t kind) {
-  const int32_t is_general = method == LAV_BLOCK_GAUSS_SEIDEL || method == LAV_ADMM || method == LAV_NNCG ||
-                             (method == LAV_NEWTON && form == LAV_VELOCITIES);
-  if (kind == LAV_ROUND) return is_general && form != LAV_BODIES;
-  return kind != LAV_CONTACT_ROLLING || is_general || method == LAV_ANDERSON || method <= LAV_PGS || method == LAV_JACOBI;
-}
-
 /* Bounds that no other impulse moves. */
 static int32_t are_rows(const lav_problem *q) {
   int32_t i;
@@ -196,8 +184,10 @@ static int32_t are_rows(const lav_problem *q) {
 
 /* As far as counts tell. */
 static int32_t takes_counts(const lav_problem *q, const lav_options *o) {
-  if (!takes_form(o->method, q->form)) return LAV_ERROR_UNSUPPORTED;
-#ifndef LAV_SWEEPS_ONLY
+  if (!(row_of(o->method)->forms >> q->form & 1)) return LAV_ERROR_UNSUPPORTED;
+#ifdef LAV_SWEEPS_ONLY
+  if (q->form == LAV_VELOCITIES) return LAV_ERROR_UNSUPPORTED;
+#else
   if (o->method == LAV_NEWTON && q->form == LAV_BODIES && q->n_bodies > newton_bodies_MOST_BODIES) return LAV_ERROR_BODIES;
 #endif
   return LAV_OK;
@@ -205,20 +195,21 @@ static int32_t takes_counts(const lav_problem *q, const lav_options *o) {
 
 static int32_t takes(const lav_problem *q, const lav_options *o) {
   const int32_t rows_alone = are_rows(q);
+  const method_t *row = row_of(o->method);
   int32_t i, free_rows = 1;
   GIVE_BACK(takes_counts(q, o));
   for (i = 0; q->kind && i < q->n_blocks; i++)
     if (q->kind[i] != LAV_ROW) {
       free_rows = 0;
-      if (!takes_kind(o->method, q->form, q->kind[i])) return LAV_ERROR_UNSUPPORTED;
+      if (q->kind[i] == LAV_CONTACT_ROLLING && !(row->rolling >> q->form & 1)) return LAV_ERROR_UNSUPPORTED;
+      if (q->kind[i] == LAV_ROUND && !(row->round >> q->form & 1)) return LAV_ERROR_UNSUPPORTED;
       if (q->kind[i] == LAV_ROUND && q->law != LAV_CONE) return LAV_ERROR_UNSUPPORTED;
     }
   for (i = 0; i < q->n_rows; i++)
     if ((q->lower && q->lower[i] > -INFINITY) || (q->upper && q->upper[i] < INFINITY)) free_rows = 0;
-  if ((o->method == LAV_SOR || o->method == LAV_GAUSS_SEIDEL) && !free_rows) return LAV_ERROR_UNSUPPORTED;
-  if ((o->method == LAV_DIRECT || o->method == LAV_LEMKE) && !rows_alone) return LAV_ERROR_UNSUPPORTED;
+  if ((row->blocks == FREE_ROWS && !free_rows) || (row->blocks == ROWS_ALONE && !rows_alone)) return LAV_ERROR_UNSUPPORTED;
   if (q->law == LAV_CONE && !rows_alone) {
-    if (o->method <= LAV_JACOBI) return LAV_ERROR_UNSUPPORTED; /* no update for that law */
+    if (row->blocks != EVERY_LAW) return LAV_ERROR_UNSUPPORTED;
     if ((o->method == LAV_ANDERSON || o->method == LAV_NNCG) && o->sweep == LAV_PGS_SWEEP) return LAV_ERROR_UNSUPPORTED;
   }
   return LAV_OK;

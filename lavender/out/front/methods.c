@@ -1,4 +1,107 @@
 
+/* -- sweeps ----------------------------------------------------------------------------------------------------------- */
+
+#ifdef LAV_SWEEPS_ONLY
+/* Block after block, over A or bodies. */
+static void sweep_step(void *context, double *lam, int32_t first, int32_t n) {
+  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
+  int32_t i;
+  for (i = 0; i < n; i++) {
+    sweep_serial_next_order(c, first && i == 0);
+    if (c->csr) sweep_pgs_relax_matrix(c->blocks, c->csr, c->order, 0, c->blocks->n_blocks, lam);
+    else sweep_pgs_relax_bodies(c->blocks, c->rows, c->order, 0, c->blocks->n_blocks, lam, c->v);
+  }
+}
+#else
+#define sweep_step sweep_serial_sweep_step
+
+/* Room for pairs of blocks, with the same bits; `single`: something is done between two sweeps. */
+static void take_packing(lav_solver *s, int32_t single) {
+  if (s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM || s->p.n_blocks > sweep_packed_MOST) return;
+  memset(&s->packing, 0, sizeof s->packing);
+  s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  s->packing.first = single || s->p.n_blocks >= FAR_FROM ? PACK_FAR_AT : PACK_AT;
+  s->packing.single = single;
+  s->swept.packing = &s->packing;
+}
+
+/* Each block's own part of A, for those that are solved exactly. */
+static int32_t prepare_blocks(lav_solver *s) {
+  int32_t *start = TAKE(s, int32_t, s->p.n_blocks);
+  double numbers, *g;
+  if (s->is_short) return LAV_ERROR_ROOM;
+  numbers = k_prepared_sizes(&s->p, start);
+  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
+  g = TAKE(s, double, (int64_t)numbers);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(g, 0, ((size_t)numbers + 1) * sizeof(double));
+  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, start, g);
+  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, start, g);
+  else k_prepare_csr(&s->p, &s->a, start, g);
+  s->swept.start = start;
+  s->swept.g = g;
+  return LAV_OK;
+}
+#endif
+
+/* max_i sum_j |A_ij| sqrt(s_i s_j), s the steps, of which a damping that is safe follows. */
+static double largest_row(const lav_solver *s) {
+  double most = 0.0, sum;
+  int32_t i, q;
+  for (i = 0; i < s->p.n_rows; i++) {
+    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
+      sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
+    sum *= sqrt(s->p.step[i]);
+    if (sum > most) most = sum;
+  }
+  return most;
+}
+
+static int32_t start_sweeps(lav_solver *s) {
+  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
+  s->swept.packing = NULL;
+  s->swept.blocks = &s->p;
+  s->swept.csr = s->form == LAV_MATRIX ? &s->a : NULL;
+  s->swept.rows = s->form == LAV_BODIES ? &s->r : NULL;
+  s->swept.general = general_of(s);
+  s->swept.v = s->v;
+  s->swept.n_v = s->n_v;
+  s->swept.order = s->options.method == LAV_PGS && s->in_rows ? NULL : s->order;
+  s->swept.split = s->split;
+  s->swept.mode = s->mode;
+  s->swept.rng = &s->rng;
+  s->swept.omega = s->options.omega;
+  s->swept.w = s->watch.e; /* which the watch does not need between sweeps */
+  s->context = &s->swept;
+  s->step = row_of(s->options.method)->sweep;
+  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+}
+
+static int32_t start_impulses(lav_solver *s) {
+  GIVE_BACK(start_sweeps(s));
+#ifndef LAV_SWEEPS_ONLY
+  if (s->mode == core_order_GIVEN) take_packing(s, 0);
+#endif
+  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+}
+
+static int32_t start_jacobi(lav_solver *s) {
+  GIVE_BACK(start_sweeps(s));
+  if (s->options.omega == 0.0) {
+    const double most = largest_row(s);
+    s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
+  }
+  return LAV_OK;
+}
+
+#ifndef LAV_SWEEPS_ONLY
+static int32_t start_block_sweeps(lav_solver *s) {
+  GIVE_BACK(start_sweeps(s));
+  s->swept.exact = 1;
+  return prepare_blocks(s);
+}
+#endif
+
 #ifndef LAV_SWEEPS_ONLY
 /* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
 
@@ -10,12 +113,13 @@ static int32_t has_tangents(const blocks_t *p) {
   return 0;
 }
 
-static int32_t prepare_accelerated(lav_solver *s) {
+static int32_t start_accelerated(lav_solver *s) {
   const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
   const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
   const int32_t convex = rubs && !is_cone ? s->options.convex : 0;
   const int64_t n = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
   double *x;
+  GIVE_BACK(start_sweeps(s));
   s->swept.exact = s->options.sweep == LAV_BLOCK_SWEEP || (s->options.sweep == LAV_DEFAULT_SWEEP && is_cone);
   if (s->swept.exact || convex > 0) GIVE_BACK(prepare_blocks(s));
   x = TAKE(s, double, n);
@@ -44,6 +148,64 @@ static int32_t begins_again(lav_solver *s) {
   return 1;
 }
 
+#endif
+
+static int32_t is_timed(const lav_budget *budget) { return budget->seconds > 0.0; }
+
+static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
+  return is_timed(budget) && !(budget->clock(budget->clock_data) < s->deadline);
+}
+
+/* Sweeps until a check, the budget or the clock ends them. */
+static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
+  double now = begin, left;
+  int32_t status = judge_watch_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
+  lav_verdict best;
+#ifndef LAV_SWEEPS_ONLY
+  const int32_t before = s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_ADMM ? restarts_of(s) : 0;
+#endif
+  while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
+    if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
+#ifndef LAV_SWEEPS_ONLY
+    if (s->context == &s->fast) sweep_serial_is_packed(&s->swept, s->impulse, (int64_t)s->fast.turn + n);
+#endif
+    status = judge_watch_watched(&s->watch, &s->read, NULL, s->step, s->context, s->impulse, n, budget->tol, &done);
+    out->iterations += done;
+#ifndef LAV_SWEEPS_ONLY
+    if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
+    if (s->is_broken) {
+      out->outcome = LAV_FAILED;
+      break;
+    }
+#endif
+    if (is_timed(budget) && status == judge_watch_RUNNING) {
+      now = budget->clock(budget->clock_data);
+      left = s->deadline - now;
+      if (!(left > 0.0)) {
+        out->outcome = LAV_TIME_LIMIT;
+        break;
+      }
+      left = 0.5 * left * out->iterations / (now > begin ? now - begin : 1e-7); /* iterations that half of it is for */
+      n = left < 1.0 ? 1 : left > 4.0 * n ? (n < 250000000 ? 4 * n : n) : (int32_t)left;
+    }
+  }
+  if (status != judge_watch_RUNNING) out->outcome = status; /* numbered alike */
+  out->sweeps = out->iterations;
+#ifndef LAV_SWEEPS_ONLY
+  out->restarts = restarts_of(s) - before;
+  if (s->mode == core_order_SYMMETRIC && (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG)) out->sweeps *= 2;
+#endif
+  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
+    judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
+    if (!(best.relative <= s->watch.best_relative)) {
+      COPY(s->impulse, s->watch.best, s->p.n_rows);
+      sweep_serial_form_velocity(&s->swept, s->impulse);
+    }
+  }
+}
+
+#ifndef LAV_SWEEPS_ONLY
 /* -- methods over A: of bodies it is formed first --------------------------------------------------------------------- */
 
 static int32_t form_matrix(lav_solver *s) {
@@ -83,13 +245,13 @@ static int32_t form_matrix(lav_solver *s) {
 static const double CLOSEST = 1e-2;
 
 /* On the impulse as it stands; rows of a formed A where it does not go over bodies. */
-static int32_t start_newton(lav_solver *s, double tol, int32_t budget) {
+static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
   s->newton_options.tol = tol;
   s->newton_options.budget = budget;
   return k_start(&s->view, &s->newton_options, &s->drive, s->impulse);
 }
 
-static int32_t prepare_newton(lav_solver *s) {
+static int32_t start_newton(lav_solver *s) {
   uint64_t from = s->used;
   int32_t how = driver_driver_ROOM;
   s->newton_options.method = driver_driver_NEWTON;
@@ -109,7 +271,7 @@ static int32_t prepare_newton(lav_solver *s) {
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
     if (s->is_short) return LAV_ERROR_ROOM;
-    how = s->view.a ? newton_plan_MORE : start_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
+    how = s->view.a ? newton_plan_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
   }
   s->driven = s->view.a == NULL;
   return LAV_OK;
@@ -136,7 +298,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
   lav_verdict now;
   COPY(s->compare, s->impulse, s->p.n_rows);
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
-    how = start_newton(s, budget->tol, budget->iterations);
+    how = begin_newton(s, budget->tol, budget->iterations);
   s->driven = 0;
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
     how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
@@ -149,7 +311,7 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
       else {
         before = out->iterations;
         closer *= 0.25;
-        start_newton(s, closer * budget->tol, budget->iterations - before);
+        begin_newton(s, closer * budget->tol, budget->iterations - before);
       }
     } else if (how == newton_plan_FLOOR) out->outcome = LAV_FLOOR;
     else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
@@ -198,7 +360,7 @@ static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
   }
 }
 
-static int32_t prepare_admm(lav_solver *s) {
+static int32_t start_admm(lav_solver *s) {
   const int64_t m = s->p.n_rows, numbers = (int64_t)k_admm_room(s->p.n_rows, s->options.memory);
   double *x;
   int32_t bands[2];

@@ -5,7 +5,7 @@
 enum { GUESS_SWEEPS = 2, BATCH = 32 }; /* rounds or pivots between two checks of the clock */
 static const double TINY_PIVOT = 1e-13;
 
-static int32_t prepare_pivots(lav_solver *s) {
+static int32_t start_pivots(lav_solver *s) {
   struct pivot_direct_direct_t *t = &s->direct;
   const int64_t m = s->p.n_rows;
   int32_t bands[2] = {0, 0}, band, i, *index, *whole = NULL;

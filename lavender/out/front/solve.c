@@ -66,239 +66,94 @@ static void carry(lav_solver *s) {
   }
 }
 
-/* -- methods ---------------------------------------------------------------------------------------------------------- */
+/* -- room: numbers that a method has beside the problem; what depends on arrays is guessed ----------------------------- */
 
-#ifdef LAV_SWEEPS_ONLY
-/* Block after block, over A or bodies. */
-static void sweep_step(void *context, double *lam, int32_t first, int32_t n) {
-  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
-  int32_t i;
-  for (i = 0; i < n; i++) {
-    sweep_serial_next_order(c, first && i == 0);
-    if (c->csr) sweep_pgs_relax_matrix(c->blocks, c->csr, c->order, 0, c->blocks->n_blocks, lam);
-    else sweep_pgs_relax_bodies(c->blocks, c->rows, c->order, 0, c->blocks->n_blocks, lam, c->v);
-  }
-}
-#else
-#define sweep_step sweep_serial_sweep_step
-
-/* Room for pairs of blocks, with the same bits; `single`: something is done between two sweeps. */
-static void take_packing(lav_solver *s, int32_t single) {
-  if (s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM || s->p.n_blocks > sweep_packed_MOST) return;
-  memset(&s->packing, 0, sizeof s->packing);
-  s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
-  s->packing.first = single || s->p.n_blocks >= FAR_FROM ? PACK_FAR_AT : PACK_AT;
-  s->packing.single = single;
-  s->swept.packing = &s->packing;
-}
-
-/* Each block's own part of A, for those that are solved exactly. */
-static int32_t prepare_blocks(lav_solver *s) {
-  int32_t *start = TAKE(s, int32_t, s->p.n_blocks);
-  double numbers, *g;
-  if (s->is_short) return LAV_ERROR_ROOM;
-  numbers = k_prepared_sizes(&s->p, start);
-  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
-  g = TAKE(s, double, (int64_t)numbers);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  memset(g, 0, ((size_t)numbers + 1) * sizeof(double));
-  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, start, g);
-  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, start, g);
-  else k_prepare_csr(&s->p, &s->a, start, g);
-  s->swept.start = start;
-  s->swept.g = g;
-  return LAV_OK;
-}
-
-static int32_t prepare_accelerated(lav_solver *s);
-#endif
-
-/* max_i sum_j |A_ij| sqrt(s_i s_j), s the steps, of which a damping that is safe follows. */
-static double largest_row(const lav_solver *s) {
-  double most = 0.0, sum;
-  int32_t i, q;
-  for (i = 0; i < s->p.n_rows; i++) {
-    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
-      sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
-    sum *= sqrt(s->p.step[i]);
-    if (sum > most) most = sum;
-  }
-  return most;
-}
-
-static int32_t prepare_sweeps(lav_solver *s) {
-  const int32_t method = s->options.method;
-  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
-  s->swept.packing = NULL;
-  s->swept.blocks = &s->p;
-  s->swept.csr = s->form == LAV_MATRIX ? &s->a : NULL;
-  s->swept.rows = s->form == LAV_BODIES ? &s->r : NULL;
-  s->swept.general = general_of(s);
-  s->swept.v = s->v;
-  s->swept.n_v = s->n_v;
-  s->swept.order = method == LAV_PGS && s->in_rows ? NULL : s->order;
-  s->swept.split = s->split;
-  s->swept.mode = s->mode;
-  s->swept.rng = &s->rng;
-  s->swept.omega = s->options.omega;
-  s->swept.w = s->watch.e; /* which the watch does not need between sweeps */
-  s->context = &s->swept;
-  s->step = method == LAV_SOR || method == LAV_GAUSS_SEIDEL ? sweep_serial_sor_step
-            : method == LAV_JACOBI                          ? sweep_serial_jacobi_step
-                                                            : sweep_step;
-  if (method == LAV_JACOBI && s->options.omega == 0.0) {
-    const double most = largest_row(s);
-    s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
-  }
+static int64_t sweeps_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  int64_t numbers = 64;
+  (void)q, (void)o, (void)n_v;
 #ifndef LAV_SWEEPS_ONLY
-  if (method == LAV_SEQUENTIAL_IMPULSES && s->mode == core_order_GIVEN) take_packing(s, 0);
-  if (method == LAV_ANDERSON || method == LAV_NNCG) return prepare_accelerated(s);
-  s->swept.exact = method == LAV_BLOCK_GAUSS_SEIDEL;
-  if (s->swept.exact) return prepare_blocks(s);
+  if (q->form == LAV_BODIES && q->n_blocks >= PACK_FROM)
+    numbers += sweep_packed_room_for(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
 #endif
-  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+  return numbers;
 }
 
 #ifndef LAV_SWEEPS_ONLY
-static int32_t prepare_newton(lav_solver *s);
-static int32_t prepare_pivots(lav_solver *s);
-static int32_t prepare_admm(lav_solver *s);
-static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out);
-static void run_pivots(lav_solver *s, const lav_budget *budget, lav_result *out);
-static int32_t restarts_of(const lav_solver *s);
-static int32_t begins_again(lav_solver *s);
-#endif
-
-static int32_t prepare(lav_solver *s) {
-  switch (s->options.method) {
-#ifndef LAV_SWEEPS_ONLY
-    case LAV_NEWTON: return prepare_newton(s);
-    case LAV_DIRECT: case LAV_LEMKE: return prepare_pivots(s);
-    case LAV_ADMM: return prepare_admm(s);
-#endif
-    default: return prepare_sweeps(s);
-  }
+static int64_t blocks_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  (void)o, (void)n_v;
+  return 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
 }
 
-static int32_t is_timed(const lav_budget *budget) { return budget->seconds > 0.0; }
-
-static int32_t is_late(const lav_solver *s, const lav_budget *budget) {
-  return is_timed(budget) && !(budget->clock(budget->clock_data) < s->deadline);
+static int64_t accelerated_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int32_t exact = o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE;
+  const int64_t memory = o->method == LAV_NNCG ? 0 : o->memory;
+  return accelerate_accelerated_accelerated_room(q->n_rows, n_v, memory) + (exact ? 64 : sweeps_room(q, o, n_v)) +
+         (exact || o->convex > 0 ? blocks_room(q, o, n_v) : 0);
 }
 
-/* Sweeps until a check, the budget or the clock ends them. */
-static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  const double begin = is_timed(budget) ? budget->clock(budget->clock_data) : 0.0;
-  double now = begin, left;
-  int32_t status = judge_watch_RUNNING, n = is_timed(budget) ? 1 : budget->iterations, done;
-  lav_verdict best;
-#ifndef LAV_SWEEPS_ONLY
-  const int32_t before = s->options.method == LAV_BLOCK_GAUSS_SEIDEL || s->options.method == LAV_ADMM ? restarts_of(s) : 0;
-#endif
-  while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
-    if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
-#ifndef LAV_SWEEPS_ONLY
-    if (s->context == &s->fast) sweep_serial_is_packed(&s->swept, s->impulse, (int64_t)s->fast.turn + n);
-#endif
-    status = judge_watch_watched(&s->watch, &s->read, NULL, s->step, s->context, s->impulse, n, budget->tol, &done);
-    out->iterations += done;
-#ifndef LAV_SWEEPS_ONLY
-    if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
-    if (s->is_broken) {
-      out->outcome = LAV_FAILED;
-      break;
-    }
-#endif
-    if (is_timed(budget) && status == judge_watch_RUNNING) {
-      now = budget->clock(budget->clock_data);
-      left = s->deadline - now;
-      if (!(left > 0.0)) {
-        out->outcome = LAV_TIME_LIMIT;
-        break;
-      }
-      left = 0.5 * left * out->iterations / (now > begin ? now - begin : 1e-7); /* iterations that half of it is for */
-      n = left < 1.0 ? 1 : left > 4.0 * n ? (n < 250000000 ? 4 * n : n) : (int32_t)left;
-    }
-  }
-  if (status != judge_watch_RUNNING) out->outcome = status; /* numbered alike */
-  out->sweeps = out->iterations;
-#ifndef LAV_SWEEPS_ONLY
-  out->restarts = restarts_of(s) - before;
-  if (s->mode == core_order_SYMMETRIC && (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG)) out->sweeps *= 2;
-#endif
-  if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
-    judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
-    if (!(best.relative <= s->watch.best_relative)) {
-      COPY(s->impulse, s->watch.best, s->p.n_rows);
-      sweep_serial_form_velocity(&s->swept, s->impulse);
-    }
-  }
-}
-
-static void begin_method(lav_solver *s) {
-  const int32_t method = s->options.method;
-  judge_watch_begin_watch(&s->watch, s->start[0], s->start[1],
-                          method == LAV_ANDERSON || method == LAV_NNCG ? LONG_PATIENCE
-                          : method == LAV_ADMM                         ? SPLIT_PATIENCE
-                                                                       : PATIENCE,
-                          s->score_room, s->p.n_rows);
-  sweep_serial_form_velocity(&s->swept, s->impulse);
-}
-
-static void run_method(lav_solver *s, const lav_budget *budget, lav_result *out) {
-#ifndef LAV_SWEEPS_ONLY
-  if (s->options.method == LAV_NEWTON) {
-    run_newton(s, budget, out);
-    return;
-  }
-  if (s->options.method == LAV_DIRECT || s->options.method == LAV_LEMKE) {
-    run_pivots(s, budget, out);
-    return;
-  }
-#endif
-  run_sweeps(s, budget, out);
-}
-
-/* -- the calls -------------------------------------------------------------------------------------------------------- */
-
-#ifndef LAV_SWEEPS_ONLY
-/* Numbers that a method has beside the problem; what depends on arrays is guessed. */
-static int64_t numbers_of(const lav_problem *q, const lav_options *o, int32_t n_v) {
-  const int32_t method = o->method;
-  const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities, n = q->n_bodies;
-  const int32_t bodies = q->form == LAV_BODIES, mj = bodies ? joint_rows(q) : 0, mc = bodies ? contact_rows(q) : 0;
+static int64_t newton_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
-  const int64_t memory = method == LAV_NNCG ? 0 : o->memory, prepared = 9 * m + 26 * k; /* of exact blocks */
-  const int64_t pairs = bodies && k >= PACK_FROM ? sweep_packed_room_for(q->n_joints, mj, k - q->n_joints, mc, q->n_bodies) : 0;
   struct core_view_view_t view;
   struct driver_driver_options_t newton;
   struct driver_driver_room_t room;
-  int64_t numbers = 0, band = q->form == LAV_MATRIX && m > 0 && q->n_entries / m > 64 ? q->n_entries / m : 64;
   csr_t none = {NULL, NULL, NULL};
-  switch (method) {
-    case LAV_ANDERSON: case LAV_NNCG:
-      numbers = accelerate_accelerated_accelerated_room(m, n_v, memory) + 64;
-      return numbers + (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE ? prepared : o->convex > 0 ? pairs + prepared : pairs);
-    case LAV_SEQUENTIAL_IMPULSES: return pairs;
-    case LAV_BLOCK_GAUSS_SEIDEL: return prepared;
-    case LAV_NEWTON:
-      if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
-      if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * n + 2048;
-      memset(&view, 0, sizeof view);
-      memset(&newton, 0, sizeof newton);
-      view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
-      newton.method = driver_driver_NEWTON;
-      k_room(&view, &newton, &room);
-      return room.n_index / 2 + room.n_real + 16;
-    default: break;
-  }
-  if (method == LAV_LEMKE || method == LAV_DIRECT) numbers = 22 * m + (bodies ? 12 * n : 0) + m * (m < band ? m : band);
-  if (method == LAV_LEMKE) numbers += 4 * m * m + 9 * m; /* two places in the dictionary for each row */
-  if (method == LAV_ADMM)
-    numbers = m * m + factor_dense_cholesky_room(q->n_rows) + (int64_t)k_admm_room(q->n_rows, o->memory);
-  return numbers + (bodies ? 90 * m + 6 * k + n : 0) + 64;
+  (void)o, (void)n_v;
+  if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;
+  if (q->form == LAV_BODIES) return 170 * m + 12 * k + 450 * (int64_t)q->n_bodies + 2048;
+  memset(&view, 0, sizeof view);
+  memset(&newton, 0, sizeof newton);
+  view.p.n_blocks = m > 0, view.p.n_rows = q->n_rows, view.p.kind = &one, view.p.ptr = ends, view.a = &none;
+  newton.method = driver_driver_NEWTON;
+  k_room(&view, &newton, &room);
+  return room.n_index / 2 + room.n_real + 16;
+}
+
+/* A of bodies, which is formed first. */
+static int64_t formed_room(const lav_problem *q) {
+  return (q->form == LAV_BODIES ? 90 * (int64_t)q->n_rows + 6 * (int64_t)q->n_blocks + q->n_bodies : 0) + 64;
+}
+
+static int64_t pivots_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int64_t m = q->n_rows, each = q->form == LAV_MATRIX && m > 0 ? q->n_entries / m : 0, band = each > 64 ? each : 64;
+  const int64_t table = o->method == LAV_LEMKE ? 4 * m * m + 9 * m : 0; /* two places in the dictionary for each row */
+  (void)n_v;
+  return 22 * m + (q->form == LAV_BODIES ? 12 * (int64_t)q->n_bodies : 0) + m * (m < band ? m : band) + table + formed_room(q);
+}
+
+static int64_t admm_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
+  const int64_t m = q->n_rows;
+  (void)n_v;
+  return m * m + factor_dense_cholesky_room(q->n_rows) + (int64_t)k_admm_room(q->n_rows, o->memory) + formed_room(q);
 }
 #endif
+
+/* -- the methods ------------------------------------------------------------------------------------------------------ */
+
+static const method_t *row_of(int32_t method) {
+  enum { A = 1 << LAV_MATRIX, B = 1 << LAV_BODIES, V = 1 << LAV_VELOCITIES, ALL = A | B | V };
+  static const method_t table[LAV_ADMM + 1] = {
+    {0, 0, 0, 0, 0, NULL, NULL, NULL, NULL},
+    /* forms, where parts roll, with round cones; blocks, patience; a sweep; room, start, step */
+    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_step, sweeps_room, start_impulses, run_sweeps},
+    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_step, sweeps_room, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
+    {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
+    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_room, start_jacobi, run_sweeps},
+#ifndef LAV_SWEEPS_ONLY
+    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_step, blocks_room, start_block_sweeps, run_sweeps},
+    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_step, accelerated_room, start_accelerated, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_step, accelerated_room, start_accelerated, run_sweeps},
+    {ALL, V, V, EVERY_LAW, PATIENCE, NULL, newton_room, start_newton, run_newton},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
+    {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
+    {A | B, A | B, A, EVERY_LAW, SPLIT_PATIENCE, NULL, admm_room, start_admm, run_sweeps},
+#endif
+  };
+  return table + method;
+}
+
+/* -- the calls -------------------------------------------------------------------------------------------------------- */
 
 int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_t *bytes) {
   lav_solver s; /* of no memory: it only counts */
@@ -319,9 +174,7 @@ int32_t lav_room(const lav_problem *problem, const lav_options *options, uint64_
     const int64_t filled = (int64_t)problem->n_entries + problem->n_entries / 4 + 256;
     numbers += nv + 2 * (int64_t)problem->n_mass_entries + 2 * k + problem->n_entries / 4 + (m * nv < filled ? m * nv : filled);
   }
-#ifndef LAV_SWEEPS_ONLY
-  numbers += numbers_of(problem, options, s.n_v);
-#endif
+  numbers += row_of(options->method)->room(problem, options, s.n_v);
   *bytes = s.used + 8 * (uint64_t)numbers + 4096;
   return LAV_OK;
 }
@@ -421,7 +274,7 @@ static int32_t set_problem(lav_solver *s, const lav_problem *q) {
 #ifndef LAV_SWEEPS_ONLY
   s->is_broken = 0;
 #endif
-  GIVE_BACK(prepare(s));
+  GIVE_BACK(row_of(s->options.method)->start(s));
   s->ready = 1;
   return LAV_OK;
 }
@@ -441,6 +294,7 @@ int32_t lav_set(lav_solver *solver, const lav_problem *problem) {
 }
 
 static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
+  const method_t *row = row_of(s->options.method);
   if (!s->ready) return LAV_ERROR_NO_PROBLEM;
   if (budget->size != sizeof *budget || out->size != sizeof *out) return LAV_ERROR_VERSION;
   if (budget->iterations < 0 || !(budget->tol >= 0.0 && budget->tol < INFINITY)) return LAV_ERROR_OPTION;
@@ -449,13 +303,16 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
-  if (!s->begun) begin_method(s);
+  if (!s->begun) {
+    judge_watch_begin_watch(&s->watch, s->start[0], s->start[1], row->patience, s->score_room, s->p.n_rows);
+    sweep_serial_form_velocity(&s->swept, s->impulse);
+  }
   s->begun = 1;
   if (s->p.n_rows == 0) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;
     else out->iterations = budget->iterations;
   }
-  else run_method(s, budget, out);
+  else row->step(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
   judge(s, s->impulse, 1, &out->verdict);
   return LAV_OK;

@@ -27,7 +27,7 @@ from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import get_stepper
 from lavender.solvers.newton import SPEC as NEWTON_SPEC
 from lavender.solvers.registry import get
-from lavender.solvers.warm_start import Tried, claim_of
+from lavender.solvers.warm_start import claim_of
 from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
@@ -348,7 +348,7 @@ class Stepping:
     def _told(self, pending: _Pending) -> Solution:
         # The arrays of the last substep's problem stay as they were until the next one.
         problem = self._problem(self.state, steps=self._steps)
-        claim = claim_of(Tried(pending.how, pending.sweeps, pending.factorisations))
+        claim = claim_of(pending.how, pending.sweeps, pending.factorisations)
         assert claim is not None
         impulse = self.state.a["impulse"][: problem.m].copy()
         options = dict(self._parameters.solver_options)

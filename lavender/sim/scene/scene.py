@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, check_sizes, flag, number, shape_of, whole_number
 from lavender.base.errors import InputError, UnknownName
-from lavender.problem.cones import check_shape
+from lavender.problem.friction import check_shape
 from lavender.problem.ordering import ENGINE_ORDERS
 from lavender.sim.scene import arithmetic
 from lavender.sim.scene.parts import (

@@ -44,13 +44,6 @@ def prepare(problem: Problem) -> Newton | None:
     return kernel if kernel.fits else None
 
 
-def factor_flops(problem: Problem, largest: int) -> float:
-    """Multiply-adds of the factors of all islands at most, the costliest as of `largest` velocities."""
-    assert problem.generalized is not None
-    flops = float(problem.generalized.nv) * float(largest) ** 2 / 6.0
-    return 2.0 * flops if problem.law == "coulomb" else flops
-
-
 def run(
     problem: Problem,
     kernel: Newton,
@@ -69,7 +62,7 @@ def run(
     status, closer = Status.MAX_ITERATIONS, 1.0
     now = 0.0
     islands = max(1, kernel.islands)
-    step = counted = FLOP * factor_flops(problem, kernel.largest)
+    step = counted = FLOP * kernel.work
     slow = max(LOOKED_UP * step, 1e-9)
     steps = clock = max(1, int(islands * min(CLOCK, WATCHED / slow)))  # a step is one of an island
     if time_limit is not None:

@@ -17,8 +17,8 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
-from lavender.solvers._factor import TINY, WIDE
-from lavender_ext.factor.sparse import SparsePanels, is_mirrored
+from lavender.solvers.factors import TINY, Panels
+from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.solve import WHATS, Solve
 
@@ -47,27 +47,11 @@ class SparseRows:
             self.h = coupled_entries(h.indptr, h.indices, h.data, self.indptr, self.indices)
         row = np.repeat(np.arange(solve.m, dtype=np.int32), np.diff(self.indptr))
         self.diagonal = np.flatnonzero(row == self.indices).astype(np.int32)
-        self.panels: dict[bool, SparsePanels] = {}
+        self.panels = Panels(self.indptr, self.indices)
         self.rows = sp.csr_array((self.h, self.indices, self.indptr))
         self.lu = self.made = False
         self.size = 0.0
         self.instead: Any = None
-
-    def analysed(self, lu: bool) -> SparsePanels:
-        """The panels of all rows; no number is looked at."""
-        found = self.panels.get(lu)
-        if found is None:
-            found = SparsePanels(self.indptr, self.indices, lu, WIDE, self.panels.get(not lu))
-            self.panels[lu] = found
-        return found
-
-    @property
-    def work(self) -> float:
-        """Multiply-adds of L L^T, inf where it has more entries than can be counted."""
-        try:
-            return float(self.analysed(False).work)
-        except OverflowError:
-            return np.inf
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
         """Whether there is a factor."""
@@ -101,11 +85,11 @@ class SparseRows:
         values = self.rows.data
         d = np.ones(len(self.diagonal)) if self.lu else values[self.diagonal]
         self.size = float(np.abs(values).max()) if self.lu else 0.0
-        return bool((d > 0.0).all()) and self.analysed(self.lu).factor(values, d, 0.0, TINY) == 0
+        return bool((d > 0.0).all()) and self.panels.analysed(self.lu).factor(values, d, 0.0, TINY) == 0
 
     def solve_panels(self, r: FloatArray) -> FloatArray | None:
         """M^-1 r with the last factor, None where that is not (1)."""
-        panels = self.analysed(self.lu)
+        panels = self.panels.analysed(self.lu)
         x: FloatArray = panels.solve(r)
         if not self.lu:
             return x

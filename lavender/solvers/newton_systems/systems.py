@@ -11,7 +11,7 @@ from typing import Any
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.solvers._factor import DENSE_LIMIT, WIDE
+from lavender.solvers.factors import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender.solvers.setup_times import dense_work
@@ -107,7 +107,7 @@ class MatrixSystem(System):
             solve.over_entries(a.indptr, a.indices, values, self.symmetric)
             self.sparse = SparseRows(solve, self.h, self.symmetric)
             solve.ask(self.sparse)
-            self.work = self.sparse.work if self.symmetric else 2.0 * self.sparse.work
+            self.work = (1.0 if self.symmetric else 2.0) * self.sparse.panels.work()
 
 
 def make_system(problem: Problem, form: str, like: System | None = None) -> System:

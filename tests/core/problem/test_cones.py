@@ -16,12 +16,16 @@ REFUSED = {
     "a kind that does not exist": (lambda: lv.Cones([0, 1], [9], [0], [1], [0], [0]), "9"),
     "ptr that falls": (lambda: lv.Cones([0, 2, 1], [0, 0], [0], [1], [0, 0], [0, 0]), "increase"),
     "an empty block": (lambda: lv.Cones([0, 0], [0], [], [], [0], [0]), "increase"),
+    "one bound": (lambda: lv.Cones.bounded(0.0, 1.0), r"lower \[N s\] has shape \(\); \(any,\) is needed"),
     "crossed bounds": (lambda: lv.Cones.bounded(np.array([1.0]), np.array([0.0])), "lower <= upper"),
     "nothing between": (lambda: lv.Cones.bounded(np.array([np.inf]), np.array([np.inf])), "between"),
-    "negative friction": (lambda: lv.Cones.contacts(np.array([-0.1])), "mu"),
+    "negative friction": (
+        lambda: lv.Cones.contacts(np.array([-0.1])),
+        r"mu must not be negative; entry \[0\]",
+    ),
     "negative radius": (
         lambda: lv.Cones.contacts(np.array([0.5]), patch_radius=np.array([-1.0])),
-        "patch_radius",
+        "patch_radius must not be negative",
     ),
     "six tangents": (lambda: lv.Cones.contacts(np.array([0.5]), tangents=6), "tangents"),
     "spin without a row": (lambda: lv.Cones([0, 1], [2], [0], [0], [0.5], [0.1]), "contact"),

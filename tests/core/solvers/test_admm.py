@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from random_problems import random_contact_problem, random_lcp, side_by_side
 
 import lavender as lv
-from lavender.solvers import admm
+from lavender.solvers import admm, factors
 
 
 @pytest.mark.parametrize("law", ["linear", "lcp", "coulomb", "cone"])
@@ -114,7 +114,7 @@ def test_a_factor_of_more_entries_than_can_be_counted_is_said(monkeypatch):
         def __init__(self, *_):
             raise OverflowError("the factor has 2^31 entries or more")
 
-    monkeypatch.setattr(admm, "SparsePanels", Large)
+    monkeypatch.setattr(factors, "SparsePanels", Large)
     a = sp.diags_array([np.full(89, -1.0), np.full(90, 2.0), np.full(89, -1.0)], offsets=[-1, 0, 1])
     problem = lv.Problem.lcp(sp.csr_array(a), np.ones(90))
     assert "entries" in admm.ADMM().prepare(problem)  # which auto calls, and goes on to another

@@ -5,27 +5,18 @@ import sys
 
 import numpy as np
 import pytest
-from calls import Clock, dense, over_velocities
+from calls import dense, over_velocities
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from benchmarks.made import fresh
 from lavender import registry
-from lavender.base import deadline
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Auto
 from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming
 from lavender.solvers.small import AUTO, DIRECT, NEWTON
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    made = Clock()
-    monkeypatch.setattr(deadline, "perf_counter", made)
-    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
-    return made
 
 
 def test_set_up_is_inside(clock, monkeypatch):

@@ -46,9 +46,3 @@ def test_the_energy_falls_with_every_safe_sweep(seed):
     energy = [0.5 * x @ a @ x - b @ x for x in (sweeps(problem, "jacobi", n) for n in range(8))]
     # Rounding of the sums leaves some 1e-15 of their size.
     assert np.diff(energy).max() <= 1e-13 * (1.0 + np.abs(energy).max())
-
-
-@pytest.mark.parametrize("omega", [0.0, -1.0, np.inf])
-def test_senseless_damping_is_refused(omega):
-    with pytest.raises(lv.InputError, match="omega"):
-        lv.solve(random_lcp(0), "jacobi", omega=omega)

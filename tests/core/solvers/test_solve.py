@@ -26,6 +26,30 @@ REFUSED = {
     "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
     "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
     "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
+    "threads without colours": (lambda: lv.solve(TINY, "pgs", threads=2), lv.InputError, "colored"),
+    "no thread": (
+        lambda: lv.solve(TINY, "pgs", order="colored", threads=0),
+        lv.InputError,
+        "whole number from 1",
+    ),
+    **{
+        f"damping {omega}": (
+            lambda omega=omega: lv.solve(TINY, "jacobi", omega=omega),
+            lv.InputError,
+            "omega",
+        )
+        for omega in (0.0, -1.0, np.inf)
+    },
+    **{
+        f"memory of {n}": (lambda n=n: lv.solve(TINY, "anderson", memory=n), lv.InputError, "memory")
+        for n in (0, 17)
+    },
+    "sweeps of another law": (
+        lambda: lv.solve(random_contact_problem(1, friction="cone"), "nncg", sweep="pgs"),
+        lv.InputError,
+        "cone law",
+    ),
+    "no convex iterations": (lambda: lv.solve(TINY, "nncg", convex=-1), lv.InputError, "convex"),
     "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
     "history of a finite solver": (
         lambda: lv.solve(TINY, "direct", history=True),
@@ -64,12 +88,6 @@ def test_what_was_done_is_printed_in_words():
     assert ", 1 sweep, " in str(lv.solve(problem, "pgs"))
     assert ", 3 sweeps, " in str(lv.prepare(problem, "pgs").solve(tol=0.0, max_iter=3))
     assert lv.prepare(problem).solve().solver.name == "auto"
-
-
-def test_zero_iterations_judge_the_start():
-    solution = lv.solve(TINY, "pgs", max_iter=0)
-    assert solution.iterations == 0
-    assert solution.residual.relative == lv.residual(TINY, TINY.start()).relative == 1.0
 
 
 @pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])

@@ -145,13 +145,3 @@ def test_stack_contracts_by_cos_squared(n, order):
     # Consistently ordered: the Gauss-Seidel factor is the square of the Jacobi one (Young 1971).
     assert rate == pytest.approx(np.abs(np.linalg.eigvals(jacobi)).max() ** 2, rel=1e-3)
     assert rate == pytest.approx(np.cos(np.pi / (2 * n)) ** 2, rel=2e-3)
-
-
-# -- threads -------------------------------------------------------------------------------------------------
-
-
-def test_threads_need_colors():
-    with pytest.raises(lv.InputError, match="colored"):
-        lv.solve(random_lcp(0), "pgs", threads=2)
-    with pytest.raises(lv.InputError, match="whole number from 1"):
-        lv.solve(random_lcp(0), "pgs", order="colored", threads=0)

@@ -1,15 +1,12 @@
 """A limit is the caller's clock, on built-in problems of all sizes."""
 
-import sys
-
 import numpy as np
 import pytest
-from calls import Clock, dense, over_velocities
+from calls import dense, over_velocities
 
 import lavender as lv
 from benchmarks.made import fresh
 from lavender import registry, suite
-from lavender.base import deadline
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Tree
@@ -20,14 +17,6 @@ OWN = [name for name, spec in registry.specs().items() if spec.own and not spec.
 
 
 LIMITS = [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3]  # s
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    made = Clock()
-    monkeypatch.setattr(deadline, "perf_counter", made)
-    monkeypatch.setattr(sys.modules["lavender.solving.solve"], "perf_counter", made)
-    return made
 
 
 PROBLEMS = {

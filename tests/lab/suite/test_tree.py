@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from random_problems import random_lcp
+from random_problems import as_matrix, random_lcp
 from random_trees import random_general
 
 import lavender as lv
@@ -40,10 +40,6 @@ def over_velocities(friction, m=120, nv=60):
     mass = half @ half.T / nv + np.eye(nv)
     more = {"friction": friction} if friction else {}
     return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, compliance=0.1, **more)
-
-
-def as_matrix(problem):
-    return lv.Problem(problem.b, problem.cones, problem.delassus(), friction=problem.friction)
 
 
 # What the first lines of the tree are, of a problem of each kind.

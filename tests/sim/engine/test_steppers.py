@@ -52,6 +52,28 @@ def test_a_box_slides_to_rest_where_friction_says(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_what_moves_less_than_half_of_both_in_a_substep_passes_no_wall(name):
+    rng = np.random.default_rng(1)
+    passed = {0.99: 0, 1.9: 0}  # share of that bound; beyond it nothing is promised, and half of them pass
+    for share in passed:
+        for k in range(12):
+            wall, r = rng.uniform(0.02, 0.3), rng.uniform(0.05, 0.4)
+            speed = share * (wall / 2 + r) * 120
+            scene = lv.Scene(stepper=name, dt=1 / 60, substeps=2, gravity=0.0)
+            scene.add_box((wall, 40, 40), static=True)
+            place = {
+                "position": (-(wall / 2 + r + rng.uniform(0.5, 1.5) * speed / 60), 0, 0),
+                "velocity": (speed, 0, 0),
+            }
+            if k % 2:
+                scene.add_sphere(r, **place)
+            else:
+                scene.add_box((2 * r, 2 * r, 2 * r), **place)
+            passed[share] += bool(run(scene, 20)[1]["positions"][1][0] > 0.0)
+    assert passed[0.99] == 0 and passed[1.9] > 0
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_ball_slides_until_it_rolls(name):
     scene = lv.Scene(stepper=name, dt=1 / 480)
     scene.add_plane()
@@ -99,20 +121,6 @@ def test_a_ball_on_a_rod_swings_with_the_period_of_the_pendulum(name):
     zeros = np.flatnonzero(np.diff(np.sign(x)))
     period = 2 * np.diff(zeros).mean() / 240
     assert period == pytest.approx(2 * math.pi * math.sqrt(1 / G) * (1 + 0.1**2 / 16), rel=0.01)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_stepper_sees_the_unit_of_mass(name):
-    """Powers of four, whose roots are exact, change no bit."""
-    seen = []
-    for unit in (1.0, 2.0**-40, 2.0**40):
-        scene, before = sliding(name, mass=unit), -1
-        for i in range(4):
-            link = scene.add_box((0.1, 0.1, 0.4), unit * 8.0 ** (i == 3), position=(3.0 + 0.5 * i, 0, 2.0))
-            scene.add_joint("ball", before, link, anchor=(2.75 + 0.5 * i, 0, 2.0))
-            before = link
-        seen.append(run(scene, 60)[1]["positions"].tobytes())
-    assert seen[0] == seen[1] == seen[2]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -328,29 +336,18 @@ def test_one_correction_of_xpbd_is_equation_2():
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("scene", ["card_house", "bridge"])
-def test_a_snapshot_goes_on_with_the_same_bits(name, scene, tmp_path):
-    sim = after(20, scene, stepper=name)
-    sim.save(tmp_path / "state")
-    end = [sim.step() for _ in range(20)][-1][0]
-    other = lv.Simulation(lv.Scene(scene, stepper=name))
-    other.load(tmp_path / "state")
-    again = [other.step() for _ in range(20)][-1][0]
-    for key in ("positions", "quaternions", "velocities", "joint_impulses", "solver"):
-        assert end[key].tobytes() == again[key].tobytes(), key
-
-
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("scene", ["card_house", "bridge", "chain"])
 def test_the_unit_of_mass_changes_no_bit_of_the_motion(name, scene):
-    own, other = lv.Scene(scene, stepper=name), lv.Scene(scene, stepper=name)
-    other.bodies[:] = [replace(b, mass=4096.0 * b.mass, inertia=4096.0 * b.inertia) for b in other.bodies]
-    own, other = lv.Simulation(own), lv.Simulation(other)
-    for _ in range(20):
-        seen, scaled = own.step()[0], other.step()[0]
-    for key in ("positions", "quaternions", "velocities"):
-        assert seen[key].tobytes() == scaled[key].tobytes(), key
-    assert (4096.0 * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
+    """Powers of four, whose roots are exact."""
+    own = lv.Scene(scene, stepper=name)
+    seen = run(own, 20)[1]
+    for unit in (2.0**-40, 2.0**12, 2.0**40):
+        other = lv.Scene(scene, stepper=name)
+        other.bodies[:] = [replace(b, mass=unit * b.mass, inertia=unit * b.inertia) for b in own.bodies]
+        scaled = run(other, 20)[1]
+        for key in ("positions", "quaternions", "velocities"):
+            assert seen[key].tobytes() == scaled[key].tobytes(), key
+        assert (unit * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
 
 
 @pytest.mark.parametrize("name", OTHERS)

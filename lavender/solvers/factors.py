@@ -1,4 +1,4 @@
-"""Factorisations under `direct`: which one a matrix gets, and one interface over them.
+"""Factorisations: which one a matrix gets under `direct`, and one interface over them, `factor` and `solve`.
 
     band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
     dense    Cholesky (LAPACK potrf)
@@ -136,14 +136,34 @@ class DenseFactor:
         return lapack.dpotrs(self.c, rhs, lower=1)[0]
 
 
+class Panels:
+    """Factors of matrices of one symmetric pattern, L L^T and L U in one order, which is found at first use."""
+
+    def __init__(self, indptr: IntArray, indices: IntArray) -> None:
+        self.pattern, self.made = (indptr, indices), dict[bool, SparsePanels]()
+
+    def analysed(self, lu: bool) -> SparsePanels:
+        """What factors and solves, with its multiply-adds as `work`; no number is looked at."""
+        if lu not in self.made:
+            self.made[lu] = SparsePanels(*self.pattern, lu, WIDE, self.made.get(not lu))
+        return self.made[lu]
+
+    def work(self, lu: bool = False) -> float:
+        """Multiply-adds of one factor, inf where it has more entries than can be counted."""
+        try:
+            return float(self.analysed(lu).work)
+        except OverflowError:
+            return np.inf
+
+
 class SparseFactor:
     """Cholesky by panels, in an order of least degree."""
 
     def __init__(self, problem: Problem) -> None:
         self.d = problem.csr_data.d
         self.m = problem.m
-        self.pattern = _mirrored(problem)
-        self.whole: SparsePanels | None = None  # of all rows, kept
+        self.pattern = rows_of(mirrored(problem.csr))
+        self.whole = Panels(*self.pattern[:2])
 
     def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
         self.n = n_free
@@ -151,9 +171,7 @@ class SparseFactor:
             return 0
         indptr, indices, data = self.pattern
         if n_free == self.m:
-            if self.whole is None:
-                self.whole = SparsePanels(indptr, indices, False, WIDE)
-            self.panels, d = self.whole, self.d
+            self.panels, d = self.whole.analysed(False), self.d
         else:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
             self.panels, d = SparsePanels(indptr, indices, False, WIDE), self.d[place >= 0]
@@ -163,15 +181,21 @@ class SparseFactor:
         return self.panels.solve(rhs) if self.n else rhs
 
 
-def _mirrored(problem: Problem) -> tuple[IntArray, IntArray, FloatArray]:
-    """A in compressed rows whose pattern is symmetric, as a symmetric A has it but for zeros that are stored."""
-    compressed = problem._compressed
-    if is_mirrored(*compressed[:2]):
-        return compressed
-    lower = sp.tril(problem.csr, -1)
-    a = sp.csr_array(lower + lower.T + sp.diags_array(problem.csr.diagonal()))
-    a.sort_indices()
-    return a.indptr.astype(np.int32), a.indices.astype(np.int32), a.data
+def mirrored(matrix: sp.csr_array) -> sp.csr_array:
+    """The same in sorted rows, with an entry, if only 0, at (j, i) wherever there is one at (i, j)."""
+    if is_mirrored(*rows_of(matrix)[:2]):
+        return matrix
+    a = sp.coo_array(matrix)
+    where = (np.concatenate([a.row, a.col]), np.concatenate([a.col, a.row]))
+    return sp.csr_array((np.concatenate([a.data, np.zeros(a.nnz)]), where), shape=a.shape)
+
+
+def rows_of(matrix: Any) -> tuple[Any, Any, Any]:
+    """(ptr, index, value) of sorted rows, as the kernels read them."""
+    matrix.sort_indices()
+    value = np.ascontiguousarray(matrix.data if matrix.nnz else np.zeros(1), np.float64)
+    index = np.ascontiguousarray(matrix.indices if matrix.nnz else np.zeros(1), np.int32)
+    return np.ascontiguousarray(matrix.indptr, np.int32), index, value
 
 
 def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:

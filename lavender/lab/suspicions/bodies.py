@@ -1,0 +1,263 @@
+"""Mistakes in arms, normals and masses, equations (1) and (2), of bodies or of J and M that are bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lavender.base.arrays import FloatArray
+from lavender.base.later import sparse as sp
+from lavender.lab.suspicions.suspicion import Suspicion, suspect
+from lavender.problem import Problem
+from lavender.problem.rows import Rows
+
+__all__ = ["CHECKS", "LARGE", "bodies_of", "free_bodies"]
+
+LARGE = 600  # velocities up to which an inverse of M is looked at
+FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
+
+
+def bodies_of(p: Problem) -> Rows | None:
+    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
+    g, c = p.generalized, p.cones
+    contact = c.is_contact
+    if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
+        return p.rows
+    mass, part = g.mass.toarray(), g.jac.toarray()[c.ptr[:-1][contact][:, None] + np.arange(3)]
+    six: list[npt.NDArray[np.intp]] = []
+    for j in free_bodies(mass):  # a ball's spin has one mass, too
+        if j + 6 <= g.nv and (not six or j > six[-1][-1]):
+            six.append(np.arange(j, j + 6))
+    if not six or any(np.delete(mass[x], x, axis=1).any() for x in six):
+        return None
+    at = np.array(six)
+    push, turn = part[:, :, at].reshape(len(part), 3, -1, 2, 3).transpose(3, 2, 0, 1, 4)  # (bodies, c, 3, 3)
+    moment = push.swapaxes(2, 3) @ turn  # sum of d (r x d)^T = [r]^T
+    on = push.any(axis=(2, 3))
+    k, count, first, last = (
+        np.arange(len(part)),
+        on.sum(axis=0),
+        on.argmax(axis=0),
+        -1 - on[::-1].argmax(axis=0),
+    )
+    axes = push[last, k]
+    other = push[first, k] + np.where(count == 2, 1.0, -1.0)[:, None, None] * axes
+    off = np.abs(axes @ axes.swapaxes(1, 2) - np.eye(3)).max() + np.abs(other).max()
+    off += np.abs(moment + moment.swapaxes(2, 3)).max() / max(1.0, np.abs(moment).max())
+    if not off < 1e-6 or np.delete(part, at, axis=2).any() or count.min() < 1 or count.max() > 2:
+        return None
+    arm = np.stack([moment[..., 1, 2], moment[..., 2, 0], moment[..., 0, 1]], axis=-1)
+    return Rows(
+        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.broadcast_to(np.eye(3), (len(six), 3, 3)),
+        v_free=g.v_free[at], normal=axes[:, 0], tangent=axes[:, 1], arm_a=arm[first, k], arm_b=arm[last, k],
+        contact_body=np.stack([np.where(count == 2, first, -1), len(six) + last], axis=1),
+    )  # fmt: skip
+
+
+def geometry(p: Problem) -> Iterator[Suspicion]:
+    r = bodies_of(p)
+    if r is None or not r.n_contacts:
+        return
+    blocks = np.flatnonzero(p.cones.is_contact)
+    a, b = r.contact_body.T
+    reach = np.linalg.norm(np.stack([r.arm_a, r.arm_b]), axis=2) * np.stack([a >= 0, b >= 0])
+    size = reach.sum(axis=0)
+    between = r.arm_a * (a >= 0)[:, None] - r.arm_b * (b >= 0)[:, None]
+    axes = np.stack([r.normal, r.tangent, np.cross(r.normal, r.tangent)], axis=1)
+    along, *aside = np.einsum("cki,ci->kc", axes, between)
+    for row, other in zip(("second", "third"), aside, strict=True):
+        for sign in (1.0, -1.0):
+            if len(along) > 2 and np.all(sign * other > 1e-3 * size) and not np.all(along > 1e-6 * size):
+                reason = f"bodies lie behind each other along the {row} row of contacts and not along the first; a "
+                reason += "contact's rows are normal, tangent, tangent"
+                yield suspect(p, "tangents first", reason, blocks)
+                return
+    against = np.flatnonzero(along < -0.1 * size)  # (1)
+    if len(against):
+        i = int(against[np.argmin(along[against] / size[against])])
+        reason = f"{len(against)} of {len(along)} normals point from body b to body a by their arms: body {a[i]} to "
+        reason += f"{b[i]}, {along[i]:.3g} m; a normal points from a to b, arms from the centres to the point"
+        yield suspect(p, "normals", reason, blocks[against], along=float(along[i]))
+    if p.rows is None:
+        return  # repeated rows are told by J
+    again, opposed = _same_place(r, size)
+    if len(again):
+        reason = f"{len(again)} contacts stand where another of the pair does"
+        yield suspect(p, "duplicate rows", reason, blocks[again])
+    if len(opposed):
+        reason = "two contacts of a pair in one place push opposite ways"
+        yield suspect(p, "opposed normals", reason, blocks[opposed])
+    moving = np.flatnonzero((a >= 0) & (b >= 0))
+    off = _loops(r.contact_body[moving], (r.arm_a - r.arm_b)[moving], r.n_bodies)
+    wrong = moving[off > FAR * size[moving]]
+    if len(wrong) and len(wrong) <= 0.2 * len(moving):
+        i = int(wrong[0])
+        reason = (
+            f"by its arms contact {i} has the centres of bodies {a[i]} and {b[i]} elsewhere than the others "
+        )
+        yield suspect(
+            p,
+            "bodies",
+            reason + "have them: does it name another body?",
+            blocks[wrong],
+            off=float(off.max()),
+        )
+
+
+def _same_place(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Contacts that repeat another of their pair to rounding, and those that oppose one within a hundredth."""
+    pair = np.sort(r.contact_body, axis=1)
+    turned = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
+    arm = np.where(
+        (r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a
+    )  # of the later, a moving body
+    n = turned * r.normal
+    order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
+    again, opposed = [], []
+    for step in (1, 2, 3):
+        i, j = order[:-step], order[step:]
+        near = np.linalg.norm(arm[i] - arm[j], axis=1)
+        same = np.all(pair[i] == pair[j], axis=1)
+        dot = np.einsum("ij,ij->i", n[i], n[j])
+        again.append(j[same & (near <= 1e-12 * size[i]) & (dot > 1.0 - 1e-12)])
+        clash = same & (near <= 1e-2 * size[i]) & (dot < -0.9)
+        opposed += [i[clash], j[clash]]
+    return np.unique(np.concatenate(again)), np.unique(np.concatenate(opposed))
+
+
+def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
+    """|c_b - c_a - between| (e,) [m] with centres c of least sum of such distances: few that err stand out."""
+    if not len(pair):
+        return np.zeros(0)
+    at = np.arange(len(pair))
+    incidence = sp.csr_array(
+        (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
+        shape=(len(pair), n),
+    )
+    scale = np.abs(between).max()
+    if not 0.0 < scale < np.inf:
+        return np.zeros(len(pair))
+    weight = np.ones(len(pair))
+    for _ in range(8):
+        normal = incidence.T @ sp.diags_array(weight) @ incidence + 1e-9 * sp.eye_array(n)
+        centre = sp.linalg.splu(sp.csc_array(normal)).solve(
+            incidence.T @ (weight[:, None] * (between / scale))
+        )
+        off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
+        weight = 1.0 / (off + 1e-4)
+    return scale * off
+
+
+def masses(p: Problem) -> Iterator[Suspicion]:
+    if p.rows is None or not p.rows.n_bodies:
+        return
+    r = p.rows
+    turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
+    still = np.flatnonzero((r.inv_mass == 0.0) & turning)
+    if len(still):
+        reason = f"body {still[0]} has a finite inertia and an infinite mass (inv_mass 0): it turns and never moves"
+        yield suspect(p, "masses", reason, bodies=still.tolist())
+    eigen = np.linalg.eigvalsh(r.inv_inertia)
+    size = _sizes(r)
+    known = np.flatnonzero((r.inv_mass > 0.0) & (eigen[:, 0] > 1e-9 * eigen[:, -1]) & (size > 0.0))
+    if not len(known):
+        return
+    m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
+    readings = {  # (2), with each number read as given, or as its inverse
+        "": (1.0 / e).sum(axis=1) * m,
+        "mass for inverse mass": (1.0 / e).sum(axis=1) / m,
+        "inertia for inverse inertia": e.sum(axis=1) * m,
+        "mass and inertia for their inverses": e.sum(axis=1) / m,
+    }
+    share = {name: float(np.median(np.log10(0.5 * k2 / s2))) for name, k2 in readings.items()}
+    own = share.pop("")
+    best = min(share, key=lambda name: abs(share[name] + 0.4))
+    if abs(own + 0.4) > 1.6 and abs(share[best] + 0.4) < 0.5:
+        reason = (
+            f"radii of gyration are {10 ** (0.5 * own):.2g} times the arms of contacts and joints; ordinary "
+        )
+        yield suspect(
+            p,
+            "masses",
+            reason + f"({10 ** (0.5 * share[best]):.2g}) if {best} was given",
+            ratio=10 ** (0.5 * own),
+        )
+        return
+    density = np.median(1.0 / m / s2**1.5)
+    if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
+        reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with mass for inverse mass"
+        yield suspect(p, "masses", reason, density=float(density))
+
+
+def _sizes(r: Any) -> FloatArray:
+    """Longest arm of each body (n,) [m], of contacts and of joint rows that push."""
+    size = np.zeros(r.n_bodies)
+    joint = np.repeat(r.joint_body, np.diff(r.joint_ptr), axis=0)
+    for side in (0, 1):
+        body = r.contact_body[:, side]
+        arm = np.linalg.norm(r.arm_b if side else r.arm_a, axis=1)
+        np.maximum.at(size, body[body >= 0], arm[body >= 0])
+        push, turn = (np.linalg.norm(r.jac[:, 6 * side + k : 6 * side + k + 3], axis=1) for k in (0, 3))
+        has = (joint[:, side] >= 0) & (push > 0.0)
+        np.maximum.at(size, joint[has, side], turn[has] / push[has])
+    return size
+
+
+def inverse(p: Problem) -> Iterator[Suspicion]:
+    g = p.generalized
+    if g is None or not 3 <= g.nv <= LARGE:
+        return
+    mass = g.mass.toarray()
+    inverse = np.linalg.inv(mass)
+    given, other = free_bodies(mass), free_bodies(inverse)
+    if len(other) and not len(given):
+        reason = "three velocities have one mass, uncoupled, in the inverse of M and not in M: was M^-1 given for M?"
+        yield suspect(p, "masses", reason, velocities=other)
+    elif (
+        p.m == g.nv
+        and len(given)
+        and not _orthogonal(p, g.jac, given)
+        and _orthogonal(p, g.jac.T.tocsr(), given)
+    ):
+        reason = (
+            "contacts' rows are orthogonal unit vectors of a free body in J^T and not in J: is J transposed?"
+        )
+        yield suspect(p, "J transposed", reason)
+    weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
+    seen = weight > 0.0
+    if len(other) > len(given) or np.count_nonzero(seen) < 3:
+        return
+    spread = [np.ptp(np.log10(d[seen] / weight[seen] ** 2)) for d in (mass.diagonal(), inverse.diagonal())]
+    if spread[0] > 2.0 and spread[1] < 0.25 * spread[0]:
+        reason = f"effective masses of the velocities span 10^{spread[0]:.1f}, with the inverse of M 10^{spread[1]:.1f}"
+        yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=spread)
+
+
+def free_bodies(mass: FloatArray) -> list[int]:
+    """First of each three velocities with equal mass and nothing between them: those of a body that flies."""
+    n = len(mass)
+    d = mass.diagonal()
+    at = np.arange(n - 2)
+    size = 1e-9 * d[:-2]
+    equal = (np.abs(d[1:-1] - d[:-2]) <= size) & (np.abs(d[2:] - d[:-2]) <= size)
+    off = sum(np.abs(mass[at + i, at + j]) for i, j in ((0, 1), (0, 2), (1, 2)))
+    return [int(i) for i in np.flatnonzero(equal & (off <= size))]
+
+
+def _orthogonal(p: Problem, jac: Any, free: list[int]) -> bool:
+    """Most contacts that move a free body do so by three orthogonal unit vectors."""
+    c = p.cones
+    first = c.ptr[:-1][c.is_contact & (np.diff(c.ptr) == 3)]
+    eye = np.eye(3)
+    for j in free:
+        parts = [jac[i : i + 3][:, j : j + 3].toarray() for i in first]
+        unit = [np.allclose(x @ x.T, eye, atol=1e-6) for x in parts if x.any()]
+        if unit and np.mean(unit) > 0.5:
+            return True
+    return False
+
+
+CHECKS = (geometry, masses, inverse)
