@@ -18,35 +18,40 @@ class Tangled(Exception):
     """Rows that depend on each other to rounding, by no simple quotients."""
 
 
+SPARSE = 1000  # rows above which the factor is sparse: it does not take the farthest row first
+
+DEPENDS = 1e-10  # of a row's length squared, to the span of those before it: depends on them to rounding
+
+SHIFT = 1e-13  # of the diagonal: what a row that depends on others keeps of itself
+
+
 def pivots(j: Any) -> tuple[Any, int]:
     """An order of the rows of J in which those that depend on others to rounding come last, and how many do not."""
     size = np.maximum(np.sqrt(j.multiply(j).sum(axis=1)), np.finfo(float).tiny)
     unit = sp.csr_array(sp.diags_array(1.0 / size) @ j)
     gram = sp.csc_array(unit @ unit.T)
     m = gram.shape[0]
-    if m > SPARSE:
-        try:
-            options = {"SymmetricMode": True}
-            factor = sparse_lu(gram, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-            if abs(factor.U.diagonal()).min() > 1e-10:
-                return np.arange(m), m
-        except RuntimeError:
-            pass
-    _, order, rank, _ = lapack.dpstrf(gram.toarray(), tol=1e-10)
-    return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
+    if m <= SPARSE:
+        _, order, rank, _ = lapack.dpstrf(gram.toarray(), tol=DEPENDS)
+        return np.concatenate([np.sort(order[:rank]), np.sort(order[rank:])]) - 1, int(rank)
+    shifted = gram + SHIFT * sp.eye_array(m)
+    options = {"SymmetricMode": True}
+    factor = sparse_lu(shifted, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    # Pivots of a Cholesky factor: the squared distances of rows from the span of those before them.
+    alone = abs(factor.U.diagonal()[factor.perm_c]) > DEPENDS
+    return np.concatenate([np.flatnonzero(alone), np.flatnonzero(~alone)]), int(np.count_nonzero(alone))
 
-
-SPARSE = 200  # rows above which a sparse factor is tried first: most depend on none
 
 PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
 
 
-def dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
+def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
     """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
 
     Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
     them; else what these are made of is read modulo the prime as quotients of whole numbers, and held to J in rational
-    numbers. Rows of no target contradict nothing.
+    numbers. Rows of no target contradict nothing. The first `sure` rows are independent to rounding: as many of them as
+    columns that they reach are taken for a basis, which the inverse of their equations proves.
     """
     _, label = sp.csgraph.connected_components(
         sp.block_array([[None, j != 0], [(j != 0).T, None]]).astype(float), directed=False
@@ -55,6 +60,10 @@ def dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
     for k in np.unique(label[: j.shape[0]]):
         rows = np.flatnonzero(label[: j.shape[0]] == k)
         columns = np.flatnonzero(label[j.shape[0] :] == k)
+        basis = rows[rows < sure]
+        if len(basis) == len(columns) and not target[rows].any():
+            kept.append(basis)
+            continue
         for prime in PRIMES:
             found = _dependent(flint, j[rows][:, columns], target[rows], prime)
             if found is not None:
@@ -63,7 +72,7 @@ def dependencies(flint: Any, j: Any, target: FloatArray) -> tuple[Any, Any]:
             raise Tangled(rows)
         kept.append(rows[found[0]])
         contradict.append(rows[found[1]])
-    return np.sort(np.concatenate(kept)), np.sort(np.concatenate(contradict))
+    return np.sort(np.concatenate(kept)), np.sort(np.concatenate([np.zeros(0, np.int64), *contradict]))
 
 
 def _dependent(flint: Any, j: Any, target: FloatArray, prime: int) -> tuple[list[int], list[int]] | None:

@@ -251,7 +251,7 @@ class Search:
         while True:  # w = 0 of rows with load; not of one that touches, which must depend on them alone
             rows = np.concatenate([own, touching])
             try:
-                found = dependencies(self.flint, j[rows], self.operator.target[rows])
+                found = dependencies(self.flint, j[rows], self.operator.target[rows], numerical)
             except Tangled as tangled:
                 if len(touching):
                     touching = touching[:0]

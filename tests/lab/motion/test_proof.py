@@ -87,8 +87,8 @@ def test_a_linear_problem_beside_rational_numbers():
 
 
 CASES = (
-    "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)", "four_bar",
-    "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",
+    "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "pyramid(k=30)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)",
+    "four_bar", "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",
 )  # fmt: skip
 
 
