@@ -103,7 +103,9 @@ class Generalized:
         free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         made._fill(jac, mass, free, names, like)
         if momentum:
-            made.__dict__["v_free"] = read_only(made.solve(free))
+            v = free.copy() if made.order is None else free[made.order]
+            made.operator.solve(v)
+            made.__dict__["v_free"] = read_only(made._given(v))
         return made
 
     def with_jacobian(self, jac: Any = None, v_free: Any = None) -> Generalized:
@@ -339,15 +341,15 @@ def lower_of(
     return lower
 
 
-def compressed(name: str, given: Any) -> Compressed:
-    """Rows of a sparse matrix without entries that are zero, checked whole."""
+def compressed(name: str, given: Any, sign: float = 1.0) -> Compressed:
+    """Rows of a sparse matrix times a sign, without entries that are zero, checked whole."""
     m, n = given.shape
     if given.format in ("csr", "csc") and m < 2**31 > n:
-        made = stacked(n, [(given.indptr, given.indices, given.data, given.format == "csc", 1.0, m)])
+        made = stacked(n, [(given.indptr, given.indices, given.data, given.format == "csc", sign, m)])
         if made is not None:
             return made
     out = as_csr(name, given)  # what can be made to fit, and words for what cannot
-    return stacked(n, [(out.indptr, out.indices, out.data, False, 1.0, m)])
+    return stacked(n, [(out.indptr, out.indices, out.data, False, sign, m)])
 
 
 # -- orders without fill -----------------------------------------------------------------------------

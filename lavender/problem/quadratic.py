@@ -11,6 +11,12 @@ All other impulses are >= 0. As M (x - v*) = J^T lambda,
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
+Over velocities J is whitened by the factor of M, which fills it in where P couples many variables. The same program is
+a constraint problem of rows, with x and y as its impulses and A without symmetry, as sparse as P and J:
+
+    [ M  -J^T ] [x]   [ M v*   ]     x within its bounds, lambda as above, J without the rows of bounds
+    [ J   0   ] [y] - [ target ] = w                                                                      (4)
+
 P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
 centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
 D (c - x), and `lavender.solve_qp` repeats it around the x found until that is small. Where the rows of P
@@ -20,6 +26,7 @@ whose diagonal is zero are zero, as they must be, D stands on these alone; if P 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,7 +41,7 @@ from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
 from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.core.checks import largest
-from lavender_ext.judge.measure import all_finite
+from lavender_ext.judge.measure import all_finite, program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
@@ -44,6 +51,8 @@ PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
 FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
+# Entries of J, whitened, over those of J and of M's factor, from which (4) costs less, and variables up to which not.
+FILLED, FEW = 3.0, 100
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
@@ -90,35 +99,43 @@ class QPSolution:
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
 
     @cached_property
-    def _parts(self) -> tuple[FloatArray, ...]:
+    def _curvature(self) -> FloatArray:
+        """P x (n,)."""
+        px, proximal = self.qp.generalized.momentum_of(self.x), self.qp.proximal
+        return px if proximal is None else px - proximal * self.x
+
+    @cached_property
+    def _residuals(self) -> tuple[float, ...]:
+        """r_p, r_d, gap, and what each is the sum of."""
         qp, of = self.qp, self.qp.generalized
-        px = of.momentum_of(self.x)
-        if qp.proximal is not None:
-            px = px - qp.proximal * self.x
-        return px, of.velocity_of(self.x), of.force(self.impulse)
+        least = 0.0
+        if largest(qp.target) == 0.0:  # x = 0 may be the solution
+            least = FLAT * largest(of.velocity_of(of.v_free))
+        found: tuple[float, ...] = program_residuals(
+            self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
+            qp.free, least, FLAT * largest(of.operator.mass[2]),
+        )  # fmt: skip
+        return found
 
     @property
     def objective(self) -> float:
         """1/2 x.P x + q.x."""
-        return float(0.5 * self.x @ self._parts[0] + self.qp.q @ self.x)
+        return float(0.5 * self.x @ self._curvature + self.qp.q @ self.x)
 
     @property
     def primal_residual(self) -> float:
         """Largest violation of a row: |A x - b|, G x - h, lb - x, x - ub."""
-        short, free = self.qp.target - self._parts[1], self.qp.free
-        return max(largest(short[:free]), float(short[free:].max(initial=0.0)))
+        return self._residuals[0]
 
     @property
     def dual_residual(self) -> float:
         """max |P x + q + A^T y + G^T z + z_box|, or the largest negative z where that is more."""
-        px, _, force = self._parts
-        wrong = -self.impulse[self.qp.free :].min(initial=0.0)
-        return max(largest(px + self.qp.q - force), float(wrong))
+        return self._residuals[1]
 
     @property
     def duality_gap(self) -> float:
         """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
-        return float(abs(self.x @ (self._parts[0] + self.qp.q) - self.qp.target @ self.impulse))
+        return self._residuals[2]
 
     @cached_property
     def error(self) -> float:
@@ -128,18 +145,8 @@ class QPSolution:
         one over the largest of |q|, |P x|, |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the
         sums of |lambda| and |x|.
         """
-        px, jx, force = self._parts
-        q, target = self.qp.q, self.qp.target
-        wanted = largest(target)
-        rows = max(wanted, largest(jx))
-        if wanted == 0.0:  # x = 0 may be the solution
-            of = self.qp.generalized
-            rows = max(rows, FLAT * largest(of.velocity_of(of.v_free)))
-        curved = FLAT * largest(self.qp.generalized.operator.mass[2]) * largest(self.x)
-        forces = max(curved, largest(px), largest(q), largest(force))
-        energy = float(np.abs(self.x).sum() * forces + np.abs(self.impulse).sum() * rows)
-        wrong = ((self.primal_residual, rows), (self.dual_residual, forces), (self.duality_gap, energy))
-        return float(max(found / size if size > 0.0 else found for found, size in wrong))
+        of = self._residuals
+        return max(of[i] / of[i + 3] if of[i + 3] > 0.0 else of[i] for i in range(3))
 
     @property
     def found(self) -> bool:
@@ -185,9 +192,7 @@ class QuadraticProgram:
     @property
     def cones(self) -> Cones:
         """Free rows, then impulses >= 0."""
-        low = np.zeros(len(self.target))
-        low[: self.free] = -np.inf
-        return Cones.bounded(low, np.inf)
+        return _one_sided(self.free, len(self.target))
 
     def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
         """The proximal step from a centre (n,), with this share of D."""
@@ -197,6 +202,56 @@ class QuadraticProgram:
             of = Generalized(of.jac, of.mass - sp.diags_array(self.proximal - d), of.v_free)
         general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
         return replace(self, generalized=general, proximal=d)
+
+    @property
+    def fills_in(self) -> bool:
+        """Whether J, whitened, has so many more entries than J that rows of (4) are solved sooner."""
+        of = self.generalized.operator
+        return bool(of.n > FEW and of.reach > FILLED * (len(of.jac[1]) + len(of.mass[1]) + of.fill))
+
+    @property
+    def _rows_of_box(self) -> tuple[tuple[IntpArray, slice], ...]:
+        """Variables and rows of lb = ub, of lb and of ub."""
+        if self.fixed is None or self.lower is None or self.upper is None:
+            return tuple((np.zeros(0, np.intp), slice(0, 0)) for _ in range(3))
+        end = len(self.target)
+        low = end - len(self.upper)
+        places = slice(self.n_equalities or 0, self.free), slice(low - len(self.lower), low), slice(low, end)
+        return tuple(zip((self.fixed, self.lower, self.upper), places, strict=True))
+
+    @property
+    def _own_rows(self) -> npt.NDArray[np.bool_]:
+        """(m,) Rows of A and G."""
+        own = np.ones(len(self.target), bool)
+        for _, rows in self._rows_of_box:
+            own[rows] = False
+        return own
+
+    def over_rows(self) -> tuple[FloatArray, Cones, sp.csr_array]:
+        """b, cones and A of (4)."""
+        of, own, cones = self.generalized, self._own_rows, self.cones
+        low, high = np.full(of.nv, -np.inf), np.full(of.nv, np.inf)
+        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
+        low[fixed] = high[fixed] = self.target[equal]
+        low[lower], high[upper] = self.target[above], -self.target[below]
+        j = of.jac[own]
+        a = sp.block_array([[of.mass, -j.T], [j, None]], format="csr") if own.any() else of.mass
+        bounds = np.concatenate([low, cones.lower[own]]), np.concatenate([high, cones.upper[own]])
+        return np.concatenate([of.momentum_of(of.v_free), self.target[own]]), Cones.bounded(*bounds), a
+
+    def start_over_rows(self, impulse: FloatArray) -> FloatArray:
+        """Impulses (m,) as those of (4)."""
+        x = self.generalized.v_free + self.generalized.change(impulse)
+        return np.concatenate([x, impulse[self._own_rows]])
+
+    def impulse_from_rows(self, impulse: FloatArray, slack: FloatArray) -> FloatArray:
+        """Impulses (m,) of impulses and slack of (4): bounds carry what is left of the forces."""
+        out, n = np.empty(len(self.target)), len(self.q)
+        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
+        out[self._own_rows] = impulse[n:]
+        out[equal], out[above], out[below] = slack[fixed], slack[lower], -slack[upper]
+        np.maximum(out[self.free :], 0.0, out=out[self.free :])
+        return out
 
     def multipliers(
         self, impulse: FloatArray
@@ -224,11 +279,15 @@ class QuadraticProgram:
                 z = whole
         return y, z, box
 
-    def solution(self, solution: Any, tol: float = 1e-6) -> QPSolution:
-        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,), found if the error is at most tol."""
+    def solution(self, solution: Any, tol: float = 1e-6, x: FloatArray | None = None) -> QPSolution:
+        """x, y, z and z_box of a `Solution` of this problem, or of impulses (m,), found if the error is at most tol.
+
+        x (n,), if it is known better than v* + M^-1 J^T lambda.
+        """
         given = getattr(solution, "impulse", None)
         impulse = as_array("impulse", solution, (len(self.target),)) if given is None else given
-        x = self.generalized.v_free + self.generalized.change(impulse)
+        if x is None:
+            x = self.generalized.v_free + self.generalized.change(impulse)
         found = None if given is None else solution
         y, z, box = self.multipliers(impulse)
         return QPSolution(
@@ -248,6 +307,13 @@ class QuadraticProgram:
         heavy = np.abs(of.operator.mass[2]).max(initial=0.0)
         falls = curved <= tol * heavy and short <= tol * rows and steep > tol * largest
         return read_only(d) if falls else None
+
+
+@lru_cache(maxsize=8)  # programs of one controller have the same
+def _one_sided(free: int, m: int) -> Cones:
+    low = np.zeros(m)
+    low[:free] = -np.inf
+    return Cones.bounded(low, np.inf)
 
 
 def quadratic(given: Given) -> QuadraticProgram:
@@ -273,11 +339,8 @@ def quadratic(given: Given) -> QuadraticProgram:
     if low is not None and up is not None:
         rows.bounds(low, lb, 1.0)
         rows.bounds(up, ub, -1.0)
-    jac = stacked(n, rows.parts)
-    target = read_only(
-        rows.targets[0] if len(rows.targets) == 1 else np.concatenate([np.zeros(0), *rows.targets])
-    )
-    generalized, proximal = _definite(lower, jac, q, target)
+    jac, target = rows.stacked
+    generalized, proximal = _definite(lower, jac, q, read_only(target))
     return QuadraticProgram(
         generalized=generalized, q=q, target=target, free=free, n_equalities=n_a, n_inequalities=n_g, kept=kept,
         fixed=fixed, lower=low, upper=up, proximal=proximal,
@@ -302,14 +365,15 @@ def unpacked(given: Given) -> Given:
     return tuple(getattr(P, name) for name in names)
 
 
-def _matrix(name: str, given: Any, n: int) -> Compressed:
-    """Rows of a dense or sparse matrix of n columns without its zeros, checked; one dimension is one row."""
-    if not issparse(given):
+def _matrix(name: str, given: Any, n: int, sign: float) -> Compressed:
+    """Rows of a dense or sparse matrix of n columns times a sign, without zeros, checked; one dimension is one row."""
+    sparse = issparse(given)
+    if not sparse:
         dense = borrowed(name, given, (None,) * max(1, len(shape_of(name, given))))
         given = dense[None] if dense.ndim == 1 else dense
     if len(given.shape) != 2 or given.shape[1] != n:
         raise InputError(f"{name} has shape {given.shape}; (any, {n}) is needed, as q has {n} entries")
-    return compressed(name, given) if issparse(given) else dense_to_csr(given)
+    return compressed(name, given, sign) if sparse else dense_to_csr(given, sign)
 
 
 def _hessian(P: Any, n: int) -> Compressed:
@@ -324,18 +388,27 @@ class _Rows:
 
     def __init__(self, n: int) -> None:
         self.n, self.m = n, 0
-        self.parts = list[tuple[Any, ...]]()
+        self.parts = list[Compressed]()
         self.targets = list[FloatArray]()
 
-    def put(self, rows: Compressed, right: FloatArray, sign: float) -> None:
-        self.parts.append((*rows, False, sign, len(right)))
-        self.targets.append(sign * right)
-        self.m += len(right)
+    def put(self, rows: Compressed, target: FloatArray) -> None:
+        self.parts.append(rows)
+        self.targets.append(target)
+        self.m += len(target)
+
+    @property
+    def stacked(self) -> tuple[Compressed, FloatArray]:
+        """J and target, all parts one under another."""
+        if len(self.parts) == 1:
+            return self.parts[0], self.targets[0]
+        parts = [(*rows, False, 1.0, len(rows[0]) - 1) for rows in self.parts]
+        return stacked(self.n, parts), np.concatenate([np.zeros(0), *self.targets])
 
     def bounds(self, at: IntpArray, bound: FloatArray, sign: float) -> None:
         """sign x_i >= sign bound_i of these variables."""
         k = len(at)
-        self.put((np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.ones(k)), bound[at], sign)
+        rows = np.arange(k + 1, dtype=np.int32), at.astype(np.int32), np.full(k, sign)
+        self.put(rows, sign * bound[at])
 
     def given(self, name: str, matrix: Any, side: str, vector: Any) -> tuple[int | None, IntpArray | None]:
         """A or G; how many rows were given, and which of them are put here: None, all; not those with h infinite."""
@@ -344,10 +417,10 @@ class _Rows:
             raise InputError(f"{missing} is missing: {name} and {side} go together")
         if matrix is None:
             return None, None
-        rows = _matrix(name, matrix, self.n)
+        rows = _matrix(name, matrix, self.n, 1.0 if name == "A" else -1.0)
         m = len(rows[0]) - 1
         if name == "A":
-            self.put(rows, as_array(side, vector, (m,)), 1.0)
+            self.put(rows, as_array(side, vector, (m,)))
             return m, None
         right, kept = as_array(side, vector, (m,), finite=False), None
         if not all_finite(right):
@@ -356,7 +429,7 @@ class _Rows:
             rows, right = _picked(rows, kept), right[kept]
             if not all_finite(right):
                 raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")
-        self.put(rows, right, -1.0)
+        self.put(rows, -right)
         return m, kept
 
 

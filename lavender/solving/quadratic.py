@@ -2,6 +2,7 @@
 
     x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
 
+Where `auto` has a P that fills J in, it solves the rows (4) of `problem/quadratic.py` in its place, which stay sparse.
 Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
 program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 """
@@ -14,11 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import number
+from lavender.base.arrays import FloatArray, number, read_only
+from lavender.base.deadline import Stopwatch
 from lavender.base.errors import InputError
-from lavender.judge.solution import Status
+from lavender.judge.solution import Claim, Solution, Status
 from lavender.problem import Problem, QPSolution
-from lavender.solving.solve import seconds_of, solve
+from lavender.solvers.registry import SMALL_ROWS, get
+from lavender.solving.solve import judged_later, seconds_of, solve
 
 __all__ = ["solve_qp"]
 
@@ -29,6 +32,7 @@ ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, t
 SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
 IDLE = 10  # steps in a row without a smaller error, after which no other is made
 TIGHTEST = 1e-15  # tol of a step
+CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 # Nothing better comes of the same problem; of another centre something may.
 ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
@@ -86,8 +90,10 @@ def solve_qp(
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
-    solution = solve(problem, solver, tol=tol, time_limit=time_limit, impulse=start, **options)
-    answer = best = qp.solution(solution, tol=tol)
+    sparse = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS and qp.fills_in
+    step = _over_rows if sparse else _over_velocities
+    solution, x = step(problem, solver, tol, time_limit, start, options)
+    answer = best = qp.solution(solution, tol, x)
     centre, tightest, before, idle = None, tol, np.inf, 0
     if answer.error <= tol and qp.proximal is None:
         return answer
@@ -113,13 +119,44 @@ def solve_qp(
         if qp.proximal is None and inner >= tightest:
             break
         tightest, limit = inner, None if time_limit is None else left
-        solution = solve(problem, solver, tol=inner, time_limit=limit, impulse=solution.impulse, **options)
-        answer = qp.solution(solution, tol=tol)
+        solution, x = step(problem, solver, inner, limit, solution.impulse, options)
+        answer = qp.solution(solution, tol, x)
         idle = 0 if answer.error < best.error else idle + 1
         best = min(best, answer, key=lambda one: one.error)
         if idle == IDLE:
             break
     return best
+
+
+Step = tuple[Solution, FloatArray | None]  # and x, where it is known better than by the impulses
+
+
+def _over_velocities(
+    problem: Problem, solver: str, tol: float, time_limit: float | None, impulse: Any, options: dict[str, Any]
+) -> Step:
+    return solve(problem, solver, tol=tol, time_limit=time_limit, impulse=impulse, **options), None
+
+
+def _over_rows(
+    problem: Problem, solver: str, tol: float, time_limit: float | None, impulse: Any, options: dict[str, Any]
+) -> Step:
+    """The sparse rows of `problem.qp`; where these are not solved, velocities."""
+    qp, watch = problem.qp, Stopwatch()
+    b, cones, matrix = qp.over_rows()
+    over = Problem(b, cones, matrix, copy=False)
+    start = None if impulse is None else qp.start_over_rows(problem.impulse_array(impulse))
+    found = solve(over, solver, tol=CLOSER * tol, time_limit=time_limit, impulse=start)
+    solved = found.status in (Status.CONVERGED, Status.FLOOR)
+    lam, x = qp.impulse_from_rows(found.impulse, found.slack), read_only(found.impulse[: len(qp.q)].copy())
+    if not solved or not (qp.proximal is not None or qp.solution(lam, tol, x).found):
+        left = None if time_limit is None else max(time_limit - watch.seconds, 1e-6)
+        return _over_velocities(problem, solver, tol, left, lam if solved else impulse, options)
+    claim = Claim(
+        Status.CONVERGED, found.iterations, dict(found.work), f"over the rows of P and J: {found.message}",
+        turns=found.turns,
+    )  # fmt: skip
+    late: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
+    return Solution.late(read_only(lam), Status.CONVERGED, tol, watch.seconds, late), x
 
 
 def _distance(answer: QPSolution) -> float:

@@ -237,8 +237,8 @@ def delassus(Data p, Py_ssize_t most, int32_t[::1] start, int32_t[::1] blocks):
     return (indptr_, *found)
 
 
-def dense_to_csr(const double[:, ::1] a):
-    """Nonzeros of a dense matrix as (indptr, indices, data), int32; nnz must be below 2^31."""
+def dense_to_csr(const double[:, ::1] a, double sign=1.0):
+    """Nonzeros of a dense matrix times a sign as (indptr, indices, data), int32; nnz must be below 2^31."""
     cdef Py_ssize_t i, j, n = a.shape[0], m = a.shape[1], nnz = 0, q = 0
     for i in range(n):
         for j in range(m):
@@ -252,7 +252,7 @@ def dense_to_csr(const double[:, ::1] a):
         for j in range(m):
             if a[i, j] != 0.0:
                 indices[q] = <int32_t>j
-                data[q] = a[i, j]
+                data[q] = sign * a[i, j]
                 q += 1
         indptr[i + 1] = <int32_t>q
     whole.setflags(False)

@@ -133,6 +133,20 @@ cdef class Operator:
         return out
 
     @property
+    def reach(self):
+        """Entries that J has at least when it is whitened: of each row the path from its last velocity to the root."""
+        cdef int32_t i, last
+        cdef double out = 0.0
+        cdef int32_t[::1] depth = np.empty(self.g.n, np.int32)
+        for i in range(self.g.n):                       # parents stand before their children
+            depth[i] = 1 + (depth[self.g.parent[i]] if self.g.parent[i] >= 0 else 0)
+        for i in range(self.g.m):
+            last = self.g.jptr[i + 1] - 1
+            if last >= self.g.jptr[i]:
+                out += depth[self.g.jidx[last]]
+        return out
+
+    @property
     def parents(self):
         """Parent of each velocity in the tree of M's factor (n,), -1 at a root; a new array."""
         cdef int32_t i

@@ -1,4 +1,6 @@
-"""The judge for Python: thin entries of judge/measure.pxd."""
+"""The judge for Python: thin entries of judge/measure.pxd, and the residuals of quadratic programs."""
+from libc.math cimport fabs
+from libc.stdint cimport int32_t
 from libc.string cimport memcmp
 
 import numpy as np
@@ -207,3 +209,40 @@ def squares_of_float32(Data p, mass, const double[::1] free, const double[::1] l
 def size_of_square(Data p, const double[::1] square):
     """Changes of w in the judge's two norms beside those of doing nothing; their squares (m) [m2/s2] given."""
     return relative_size(&p.blocks, &square[0] if square.shape[0] else NULL, p.start_energy, p.start_velocity)
+
+
+cdef inline double larger(double s, double x) noexcept nogil:
+    # NaN where either is
+    return s if x <= s or s != s else x
+
+
+def program_residuals(const double[::1] x, const double[::1] q, const double[::1] px, const double[::1] force,
+                      const double[::1] jx, const double[::1] target, const double[::1] lam, int32_t free,
+                      double rows, double curved):
+    """(r_p, r_d, gap, rows, forces, energy) of a quadratic program: three residuals, and what each is the sum of.
+
+    r_p    max |J x - target| on the first `free` rows, max of target - J x on the others
+    r_d    max |P x + q - J^T lambda|, and the largest of -lambda on the others
+    gap    |x.(P x + q) - target.lambda|
+    energy sum |x| forces + sum |lambda| rows
+
+    rows is at least what is given, forces at least `curved` max |x|; px (n,) = P x, force (n,) = J^T lambda, jx (m,).
+    """
+    cdef Py_ssize_t i, n = x.shape[0], m = lam.shape[0]
+    cdef double primal = 0.0, dual = 0.0, gap = 0.0, forces = 0.0, size = 0.0, far = 0.0, impulse = 0.0, short
+    for i in range(n):
+        dual = larger(dual, fabs(px[i] + q[i] - force[i]))
+        gap += x[i] * (px[i] + q[i])
+        forces = larger(larger(larger(forces, fabs(px[i])), fabs(q[i])), fabs(force[i]))
+        size += fabs(x[i])
+        far = larger(far, fabs(x[i]))
+    forces = larger(forces, curved * far)
+    for i in range(m):
+        short = target[i] - jx[i]
+        primal = larger(primal, fabs(short) if i < free else short)
+        if i >= free:
+            dual = larger(dual, -lam[i])
+        gap -= target[i] * lam[i]
+        rows = larger(larger(rows, fabs(target[i])), fabs(jx[i]))
+        impulse += fabs(lam[i])
+    return primal, dual, fabs(gap), rows, forces, size * forces + impulse * rows

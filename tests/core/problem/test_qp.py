@@ -363,3 +363,62 @@ def test_a_program_starts_from_the_impulses_of_the_one_before():
         cold = lv.solve_qp(problem)
         warm = lv.solve_qp(problem, impulse=cold.solution.impulse)
         assert warm.found and np.allclose(warm.x, cold.x, atol=1e-9)
+
+
+# -- P that couples many variables -------------------------------------------------------------------
+
+
+def chained(seed, n=150, singular=False):
+    """A trajectory of n places with limits on them, on its steps and on some sums, a few places fixed or free."""
+    rng = np.random.default_rng(seed)
+    bend = sp.diags_array(
+        [np.ones(n - 2), -2.0 * np.ones(n - 2), np.ones(n - 2)], offsets=[0, 1, 2], shape=(n - 2, n)
+    )
+    step = sp.diags_array([-np.ones(n - 1), np.ones(n - 1)], offsets=[0, 1], shape=(n - 1, n))
+    x = np.cumsum(rng.uniform(-0.05, 0.05, n))
+    h = np.full(2 * (n - 1), 0.1)
+    h[rng.random(len(h)) < 0.1] = np.inf
+    some = sp.csr_array(rng.normal(size=(3, n)) * (rng.random((3, n)) < 0.1))
+    lb, ub = x - rng.random(n), x + rng.random(n)
+    fixed = rng.random(n) < 0.05
+    lb[fixed] = ub[fixed] = x[fixed]
+    if not singular:
+        lb[rng.random(n) < 0.3], ub[rng.random(n) < 0.3] = -np.inf, np.inf
+    P = bend.T @ bend + (0.0 if singular else 0.05) * sp.eye_array(n)
+    G = sp.csr_array(sp.vstack([step, -step]))
+    return dict(zip(NAMES, (sp.csr_array(P), rng.normal(size=n), G, h, some, some @ x, lb, ub), strict=True))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_hessian_that_fills_j_in_is_solved_over_sparse_rows_to_the_same_judge(seed):
+    qp = chained(seed)
+    problem = lv.Problem.from_qp(*(qp[name] for name in NAMES))
+    answer = lv.solve_qp(problem, tol=1e-9)
+    assert "over the rows of P and J" in answer.solution.message
+    assert answer.found
+    other = lv.solve_qp(problem, "newton", tol=1e-9)
+    # The least eigenvalue of P is 0.05: x is known to the error of the forces over that.
+    np.testing.assert_allclose(answer.x, other.x, atol=1e-6)
+    assert max(kkt(qp, answer)) <= 1e-6  # of forces and sides of size 1
+    assert answer.solution.residual.relative <= 1e-6  # the judge of the constraint problem, asked later
+    warm = lv.solve_qp(problem, tol=1e-9, impulse=answer.solution.impulse)
+    assert warm.found
+    assert warm.solution.work.get("factorisations", 0) <= answer.solution.work.get("factorisations", 0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_singular_hessian_that_fills_j_in_is_solved_over_sparse_rows(seed):
+    qp = chained(seed, singular=True)
+    problem = lv.Problem.from_qp(*(qp[name] for name in NAMES))
+    answer = lv.solve_qp(problem, tol=1e-8)
+    assert "over the rows of P and J" in answer.solution.message
+    assert answer.found
+    assert max(kkt(qp, answer)) <= 1e-5
+
+
+def test_a_wide_program_without_a_feasible_point_is_proven_infeasible():
+    qp = chained(0)
+    qp["A"], qp["b"] = sp.csr_array(np.ones((2, 150))), np.array([0.0, 1.0])
+    answer = lv.solve_qp(lv.Problem.from_qp(*(qp[name] for name in NAMES)))
+    assert answer.solution.status is lv.Status.INFEASIBLE
+    assert not answer.found
