@@ -56,7 +56,7 @@ class Operators(ProblemData):
         if self.compliance is not None and largest(self.compliance) > USUAL:
             return True
         if self.generalized is not None:
-            return self.generalized.operator.most > USUAL
+            return bool(self.generalized.operator.is_beyond(USUAL))
         r = self.rows
         return r is not None and any(
             largest(x.reshape(-1)) > USUAL for x in (r.jac, r.arm_a, r.arm_b, r.inv_mass, r.inv_inertia)

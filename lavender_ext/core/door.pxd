@@ -44,6 +44,15 @@ cdef inline int64_t first_unsized(const double* x, int64_t n) noexcept nogil:
     return -1
 
 
+cdef inline bint is_beyond(const double* x, int64_t n, double bound) noexcept nogil:
+    """Whether any of these numbers is larger than the bound in size; without a branch, so that compilers take several at once."""
+    cdef int64_t i
+    cdef int found = 0
+    for i in range(n):
+        found |= fabs(x[i]) > bound
+    return found
+
+
 cdef inline double largest(const double* x, int64_t n) noexcept nogil:
     """max |x_i| of numbers; 0 of none."""
     cdef int64_t i

@@ -5,7 +5,7 @@ from libc.string cimport memcmp
 
 import numpy as np
 
-from lavender_ext.core.door cimport largest
+from lavender_ext.core.door cimport is_beyond
 from lavender_ext.core.generalized cimport jac_push, jac_row, tree_factor, tree_pattern, tree_solve
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
@@ -117,12 +117,10 @@ cdef class Operator:
             least = min(least, 1.0 / (self.g.inv_pivot[i] * mval[mptr[i + 1] - 1]))
         return least
 
-    @property
-    def most(self):
-        """The largest of |J_ij|, |L_ij| and 1 / D_i."""
-        cdef double x = largest(self.g.jval, self.g.jptr[self.g.m]), y = largest(self.g.lval, self.g.lptr[self.g.n])
-        cdef double z = largest(self.g.inv_pivot, self.g.n)
-        return max(x, y, z)
+    def is_beyond(self, double bound):
+        """Whether any |J_ij|, |L_ij| or 1 / D_i is larger."""
+        return (is_beyond(self.g.jval, self.g.jptr[self.g.m], bound) or is_beyond(self.g.inv_pivot, self.g.n, bound)
+                or is_beyond(self.g.lval, self.g.lptr[self.g.n], bound))
 
     @property
     def work(self):
