@@ -10,6 +10,7 @@ from random_problems import dragged, random_ellipses
 from random_trees import random_tree, tree_mass
 
 import lavender as lv
+from lavender import registry
 from lavender.judge.certificates import check_certificate
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
@@ -183,3 +184,14 @@ def system_in(problem, form):
         system = make_system(problem, "impulse")
     assert not system.dense
     return system
+
+
+#: QP backends of other packages that are here, and those of all that need a definite A.
+BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
+DEFINITE = {"quadprog", "ecos", "pyqpmad"}
+
+
+def installed(*names):
+    """Backends by name, skipped where they are not."""
+    absent = pytest.mark.skipif(True, reason="not installed")
+    return [name if name in BACKENDS else pytest.param(name, marks=absent) for name in names]

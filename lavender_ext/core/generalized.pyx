@@ -6,7 +6,8 @@ from libc.string cimport memcmp
 import numpy as np
 
 from lavender_ext.core.door cimport is_beyond
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_factor, tree_pattern, tree_solve
+from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
+from lavender_ext.core.tree cimport tree_factor, tree_pattern
 
 cdef object new = np.empty, I4 = np.dtype(np.int32)
 

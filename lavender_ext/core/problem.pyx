@@ -4,8 +4,7 @@
               others' d, or 1 (factored: only empty rows fall back); on two tangents the mean of both, and on
               the two that roll                                                                   (1)
     nu_i    = d_i; on a row that spins or rolls d of its normal; on an angular joint row 1/m_a + 1/m_b           (2)
-    step_i  = 1/d_i; on tangents 1/lambda_max of the symmetric part of A_tt, d_t where not positive;
-              likewise on the two that roll                                                       (3)
+    step_i  by `core/steps.pxd`                                                                   (3)
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
@@ -20,9 +19,9 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside, least
 from lavender_ext.core.generalized cimport Operator, dot, generalized_t, panel_pattern, panel_whiten
-from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, groups_of, is_box, n_directions, n_turns, parts_of, parts_t
-from lavender_ext.core.rows cimport (contact_diagonal, dot12, largest_eigenvalue, minv_times, reciprocal,
-                                     rows_t, rows_times)
+from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_box, n_directions, n_turns, parts_of, parts_t
+from lavender_ext.core.rows cimport contact_diagonal, dot12, largest_eigenvalue, minv_times, rows_t, rows_times
+from lavender_ext.core.steps cimport block_steps, csr_largest, pair_means
 from lavender_ext.core.view cimport view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 
@@ -71,47 +70,6 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
                 most[g] = csr_largest(a, j + part.first[g], d, step)
         block_steps(p, i, &part, most, d, step)
     return n_empty
-
-
-cdef inline double csr_largest(const csr_t* a, int32_t j, const double* d, const double* big) noexcept nogil:
-    # lambda_max of (3) on rows j and j + 1, with the largest entry of each row in `big`
-    cdef double most = big[j] if big[j] > big[j + 1] else big[j + 1], e
-    e = largest_eigenvalue(csr_entry(a, j, j), 0.5 * (csr_entry(a, j, j + 1) + csr_entry(a, j + 1, j)),
-                           csr_entry(a, j + 1, j + 1))
-    return e if e > 1e-10 * most else d[j]
-
-
-cdef inline void block_steps(const blocks_t* p, int32_t i, const parts_t* part, const double* most, const double* d,
-                             double* step) noexcept nogil:
-    # (3) of block i: `most` is lambda_max of its parts of two rows, d where not positive
-    cdef int32_t j = p.ptr[i], g, k
-    for k in range(j, p.ptr[i + 1]):
-        step[k] = reciprocal(d[k])
-    for g in range(part.n):
-        if part.size[g] == 2:                           # no sweep relaxes a round cone
-            k = j + part.first[g]
-            step[k] = step[k + 1] = reciprocal(most[g] if most[g] > 0.0 else d[k])
-
-
-cdef inline void pair_means(const blocks_t* p, int32_t i, double* d) noexcept nogil:
-    # One d for the two rows of a part.
-    cdef parts_t group
-    cdef int32_t g, k
-    groups_of(p, i, &group)
-    for g in range(group.n):
-        if group.size[g] == 2:
-            k = p.ptr[i] + group.first[g]
-            d[k] = 0.5 * (d[k] + d[k + 1])
-            d[k + 1] = d[k]
-
-
-cdef inline double csr_entry(const csr_t* a, int32_t i, int32_t j) noexcept nogil:
-    cdef int32_t q
-    cdef double s = 0.0
-    for q in range(a.indptr[i], a.indptr[i + 1]):
-        if a.indices[q] == j:
-            s += a.data[q]
-    return s
 
 
 cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:

@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport ldl_solve
+from lavender_ext.core.tree cimport ldl_solve
 from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
 from lavender_ext.generalized.flow cimport block_end, block_from, flow_t, spread

@@ -9,7 +9,8 @@ than a dense one would.
 """
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.generalized cimport generalized_t, tree_pattern
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.tree cimport tree_pattern
 
 
 cdef enum:

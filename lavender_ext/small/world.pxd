@@ -8,7 +8,8 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
 from lavender_ext.core.door cimport first_outside, first_unsized, is_size, largest, least
-from lavender_ext.core.generalized cimport generalized_t, jac_row, tree_factor, tree_pattern
+from lavender_ext.core.generalized cimport generalized_t, jac_row
+from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.judge.rounding cimport mass_t

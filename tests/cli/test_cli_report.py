@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from stacks import stack
+from stacks import idle_problem, stack
 
 import lavender as lv
 from lavender import bench, cli, io
@@ -84,10 +84,6 @@ def test_the_list_tells_truths_without_running():
     assert done.exit_code == 0
     for name, p in PHENOMENA.items():
         assert f"{name}: {p.title}" in done.output
-
-
-def idle_problem():
-    return lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -1.0], name="flying apart")
 
 
 def test_the_terminal_shows_speeds_on_request(lavender, tmp_path):

@@ -245,14 +245,14 @@ static int32_t factor_mass(lav_solver *s, const lav_problem *q) {
     s->used = from;
     columns = TAKE(s, int32_t, room);
     if (s->is_short) return LAV_ERROR_ROOM;
-    count = core_generalized_tree_pattern(n, mptr, midx, (int32_t)room, (int32_t *)(uintptr_t)s->g.lptr, columns,
+    count = core_tree_tree_pattern(n, mptr, midx, (int32_t)room, (int32_t *)(uintptr_t)s->g.lptr, columns,
                                           (int32_t *)(uintptr_t)s->g.parent, s->marks, s->marks + n, s->marks + 2 * n);
     if (count >= 0) break;
     if (room >= most) return LAV_ERROR_MASS;
   }
   values = TAKE(s, double, count);
   if (s->is_short) return LAV_ERROR_ROOM;
-  if (core_generalized_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, values, pivot,
+  if (core_tree_tree_factor(n, mptr, midx, mval, s->g.lptr, columns, values, pivot,
                                    (double *)(uintptr_t)s->g.inv_pivot) >= 0)
     return LAV_ERROR_MASS;
   for (i = 0; i < n; i++) pivot[i] = sqrt(s->g.inv_pivot[i]);

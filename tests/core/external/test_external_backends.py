@@ -4,6 +4,7 @@ import itertools
 
 import numpy as np
 import pytest
+from calls import BACKENDS, DEFINITE, installed
 from random_problems import random_contact_problem, spd, touching
 
 import lavender as lv
@@ -13,15 +14,7 @@ from lavender.external.running import Answer
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
 
-BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
-DEFINITE = {"quadprog", "ecos", "pyqpmad"}
 PROVE_INFEASIBLE = {"osqp", "clarabel", "clarabel_cone", "piqp", "qpalm", "daqp", "scs"}
-
-
-def installed(*names):
-    """Backends by name, skipped where they are not."""
-    absent = pytest.mark.skipif(True, reason="not installed")
-    return [name if name in BACKENDS else pytest.param(name, marks=absent) for name in names]
 
 
 def replaced(register, name, call):

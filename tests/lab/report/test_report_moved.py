@@ -7,8 +7,8 @@ import os
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from stacks import idle_problem
 
 import lavender as lv
 from lavender import bench, report
@@ -21,10 +21,6 @@ from lavender.lab.report.write import write
 PLAN = bench.Plan(
     levels=(1e-3,), speed_levels=(1e-2, 1e-4), budgets=(8,), repeats=1, orders=(), time_limit=60.0
 )
-
-
-def idle_problem():
-    return lv.Problem.lcp(np.eye(3), [-1.0, -2.0, -1.0], name="flying apart")
 
 
 @pytest.fixture(scope="module")

@@ -2,22 +2,12 @@
 
 import numpy as np
 import pytest
+from calls import BACKENDS, DEFINITE, installed
 from random_problems import spd
 
 import lavender as lv
 from lavender import registry, suite
 from lavender.external import qp_solver
-
-BACKENDS = sorted(n for n in lv.available(law="lcp") if registry.specs()[n].external)
-
-
-DEFINITE = {"quadprog", "ecos", "pyqpmad"}
-
-
-def installed(*names):
-    """Backends by name, skipped where they are not."""
-    absent = pytest.mark.skipif(True, reason="not installed")
-    return [name if name in BACKENDS else pytest.param(name, marks=absent) for name in names]
 
 
 @pytest.mark.parametrize("name", BACKENDS)

@@ -1,0 +1,195 @@
+"""The factor of M (nv, nv), whose pattern is a tree or nearly one.
+
+    M = L^T D L, L unit lower triangular: row k is eliminated into rows before it, k = nv - 1 ... 0, so that a leaf
+    of a kinematic tree comes before its ancestors and nothing fills in (Featherstone 2008, section 6.5)     (1)
+"""
+from libc.stdint cimport int32_t
+from libc.string cimport memcpy
+
+from lavender_ext.core.door cimport least
+
+
+cdef inline void take_from(double* x, const double* l, double z, int32_t n) noexcept nogil:
+    cdef int32_t i
+    if z != 0.0:
+        for i in range(n):
+            x[i] -= l[i] * z
+
+
+cdef inline int32_t tree_pattern(int32_t n, const int32_t* mptr, const int32_t* midx, int32_t room, int32_t* lptr,
+                                 int32_t* lidx, int32_t* parent, int32_t* mark, int32_t* next_child,
+                                 int32_t* first_child) noexcept nogil:
+    """Pattern of L from the lower triangle of M; entries of L, or -1 where `room` does not hold them.
+
+    Rows are found from the last: row k has the entries of M and those that rows below it, whose last column is k,
+    leave there. They are written from the end of `lidx` backwards; `lptr` counts from the front afterwards.
+    """
+    cdef int32_t k, q, c, j, at = room, start, end, i, x
+    for k in range(n):
+        mark[k] = -1
+        first_child[k] = -1
+    for k in range(n - 1, -1, -1):
+        end = at
+        mark[k] = k
+        for q in range(mptr[k + 1] - 1, mptr[k] - 1, -1):   # backwards, so that the row stands ascending
+            j = midx[q]
+            if j < k and mark[j] != k:
+                mark[j] = k
+                at -= 1
+                if at < 0:
+                    return -1
+                lidx[at] = j
+        c = first_child[k]
+        while c >= 0:
+            for q in range(lptr[c] + parent[c] - 1, lptr[c] - 1, -1):   # parent holds the length until the end
+                j = lidx[q]
+                if mark[j] != k:
+                    mark[j] = k
+                    at -= 1
+                    if at < 0:
+                        return -1
+                    lidx[at] = j
+            c = next_child[c]
+        start = at
+        for i in range(start + 1, end):                     # rows of a tree come sorted
+            x = lidx[i]
+            j = i - 1
+            while j >= start and lidx[j] > x:
+                lidx[j + 1] = lidx[j]
+                j -= 1
+            lidx[j + 1] = x
+        lptr[k] = start
+        parent[k] = end - start
+        if end > start:
+            j = lidx[end - 1]
+            next_child[k] = first_child[j]
+            first_child[j] = k
+    for k in range(n):
+        lptr[k] -= at
+    lptr[n] = room - at
+    for q in range(at, room):
+        lidx[q - at] = lidx[q]
+    for k in range(n):
+        parent[k] = lidx[lptr[k + 1] - 1] if lptr[k + 1] > lptr[k] else -1
+    return lptr[n]
+
+
+cdef inline int32_t tree_factor(int32_t n, const int32_t* mptr, const int32_t* midx, const double* mval,
+                                const int32_t* lptr, const int32_t* lidx, double* lval, double* pivot,
+                                double* inv_pivot) noexcept nogil:
+    """L and 1 / D of (1); -1, or the row whose pivot is no more than rounding of M_kk, or below the door's least.
+
+    Two rows of a chain, whose columns are the same but for the upper one's own place, are eliminated together: with the
+    bits of one after the other, and half of what is read and written.
+    """
+    cdef int32_t k, q, a, j, first, count, at
+    cdef double f, g
+    cdef double* l
+    cdef double* u
+    for k in range(n):
+        at = lptr[k]
+        first = mptr[k]
+        count = mptr[k + 1] - first - 1
+        if lptr[k + 1] - at == count >= 0 and midx[first + count] == k:     # no fill
+            memcpy(lval + at, mval + first, count * sizeof(double))
+            pivot[k] = inv_pivot[k] = mval[first + count]   # M_kk, until its row is eliminated
+            continue
+        pivot[k] = inv_pivot[k] = 0.0
+        for q in range(at, lptr[k + 1]):
+            lval[q] = 0.0
+        for q in range(first, mptr[k + 1]):
+            j = midx[q]
+            if j == k:
+                pivot[k] = inv_pivot[k] = mval[q]
+            elif j < k:
+                while lidx[at] != j:
+                    at += 1
+                lval[at] = mval[q]
+    k = n - 1
+    while k >= 0:
+        if not has_reciprocal(pivot, inv_pivot, k):
+            return k
+        first = lptr[k]
+        count = lptr[k + 1] - first
+        l = lval + first
+        if count == 0 or lidx[first + count - 1] != k - 1 or first - lptr[k - 1] != count - 1:
+            for a in range(count - 1, -1, -1):
+                j = lidx[first + a]
+                f = l[a] * inv_pivot[k]
+                pivot[j] -= f * l[a]
+                take_row(lptr, lidx, lval, j, first, a, f, l)
+                l[a] = f
+            k -= 1
+            continue
+        count -= 1                                          # of row k - 1, which row k leaves first
+        u = lval + lptr[k - 1]
+        f = l[count] * inv_pivot[k]
+        pivot[k - 1] -= f * l[count]
+        take_from(u, l, f, count)
+        l[count] = f
+        k -= 1
+        if not has_reciprocal(pivot, inv_pivot, k):
+            return k
+        for a in range(count - 1, -1, -1):
+            j = lidx[first + a]
+            f = l[a] * inv_pivot[k + 1]
+            g = u[a] * inv_pivot[k]
+            pivot[j] = (pivot[j] - f * l[a]) - g * u[a]
+            if lptr[j + 1] - lptr[j] == a:                  # the same columns
+                take_two(lval + lptr[j], l, f, u, g, a)
+            else:
+                take_row(lptr, lidx, lval, j, first, a, f, l)
+                take_row(lptr, lidx, lval, j, first, a, g, u)
+            l[a] = f
+            u[a] = g
+        k -= 1
+    return -1
+
+
+cdef inline bint has_reciprocal(const double* pivot, double* inv_pivot, int32_t k) noexcept nogil:
+    # inv_pivot holds M_kk before, 1 / D_k afterwards.
+    if not (pivot[k] > 8.8817841970012523e-16 * inv_pivot[k] and pivot[k] >= least()):
+        return False
+    inv_pivot[k] = 1.0 / pivot[k]
+    return True
+
+
+cdef inline void take_row(const int32_t* lptr, const int32_t* lidx, double* lval, int32_t j, int32_t first,
+                          int32_t count, double f, const double* l) noexcept nogil:
+    """Row j loses f l (count), which stands on the columns from place `first`."""
+    cdef int32_t b, i, at = lptr[j]
+    if lptr[j + 1] - at == count:                           # the same columns
+        take_from(lval + at, l, f, count)
+        return
+    for b in range(count):
+        i = lidx[first + b]
+        while lidx[at] != i:
+            at += 1
+        lval[at] -= f * l[b]
+
+
+cdef inline void take_two(double* x, const double* l, double f, const double* u, double g, int32_t n) noexcept nogil:
+    cdef int32_t i
+    for i in range(n):
+        x[i] = (x[i] - f * l[i]) - g * u[i]
+
+
+cdef inline void ldl_solve(int32_t n, const int32_t* lptr, const int32_t* lidx, const double* lval,
+                           const double* inv_pivot, double* x) noexcept nogil:
+    """x <- (L^T D L)^-1 x (n); lval is counted as lidx is, from wherever lptr begins."""
+    cdef int32_t k, q, first, end
+    cdef double z
+    for k in range(n - 1, -1, -1):                          # L^T z = x
+        z = x[k]
+        if z != 0.0:
+            first = lptr[k]
+            end = lptr[k + 1]
+            for q in range(first, end):
+                x[lidx[q]] -= lval[q] * z
+    for k in range(n):                                      # D, then L x = z
+        z = x[k] * inv_pivot[k]
+        first = lptr[k]
+        end = lptr[k + 1]
+        for q in range(first, end):
+            z -= lval[q] * x[lidx[q]]
+        x[k] = z
