@@ -231,12 +231,17 @@ def page(found: list[Entry], recorded: Sequence[Entry] = ()) -> str:
         "problems with blocks on a border; problems by law; and what is known. "
         "Open are problems on the border of two states, where no proof by signs exists."
     )
+    claims = (
+        "None of the files says which solver claimed what, so no published claim stands here to be contradicted; "
+        "`lavender report @hard --prove` holds what solvers claim of a run of yours against what is proved."
+    )
     laws = sorted({e.law for e in found})
     out = [
         "# Catalogue",
         first,
         how,
         columns,
+        claims,
         "| set | problems | rows | sweeps | condition | on a border | "
         + " | ".join(laws)
         + " | enclosed | one motion | infeasible | open |",

@@ -144,6 +144,8 @@ def _way_left(problem: Problem, relative: float, tol: float, done: int, per_deca
 def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tuple[str, FloatArray] | None:
     """Rows of A that are all zero: put on the bound that b asks for, or prove that there is none to `tol`."""
     cones, worst, empty = problem.cones, -1, problem.metric.empty
+    if not len(empty):
+        return None
     # What is behind a normal is bounded by its impulse.
     asks = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
     if not len(asks):
