@@ -73,7 +73,9 @@ def table(steps: Sequence[Step]) -> str:
     errors = Table(
         ["next step, relative error", "MuJoCo, median", "worst", "ours, median", "worst"], next_step
     )
-    start = f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. From `one call` on: {OVER}."
+    start = (
+        f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. From `one call` on: {OVER}."
+    )
     return "\n".join([start, "", *markdown(Table(heads, rows)), "", told, "", *markdown(errors)])
 
 
