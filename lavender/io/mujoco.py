@@ -67,9 +67,7 @@ SAME = 1e-9  # -, R D - 1
 SUMMED = (
     2.0**-40
 )  # of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
-ALIKE = (
-    1e-10  # -, least over largest singular value of a body's axes from which its velocities are told apart
-)
+ALIKE = 1e-10  # -, least share of a joint's axis that those before it in its body leave, to tell their velocities apart
 # Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
@@ -322,17 +320,8 @@ def _before(model: Any, data: Any) -> FloatArray:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
     if gap <= SUMMED * size or (not np.any(spatial) and np.any(data.efc_vel)):  # not filled by a copy
         return data.qvel
-    return _before_step(parent, bodies, axis, spatial, SUMMED * size)
-
-
-@np.errstate(over="ignore", invalid="ignore")
-def _before_step(parent: Any, bodies: Any, axis: Any, spatial: Any, allowed: float) -> FloatArray:
-    v, known = np.zeros(len(axis)), True
-    for body in np.unique(bodies):
-        own = np.flatnonzero(bodies == body)
-        v[own], _, rank, _ = np.linalg.lstsq(axis[own].T, spatial[body] - spatial[parent[body]], rcond=ALIKE)
-        known &= bool(rank == len(own))
-    if not known or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= allowed:
+    v: FloatArray | None = export.motion_before(parent, bodies, axis, spatial, ALIKE)
+    if v is None or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
         raise CapabilityError(
             "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
             "MjData was changed since its forward pass: run mj_forward"

@@ -5,7 +5,7 @@ whose coefficients f differ has the rows of its tangents scaled by f_j / f_0, so
 
     |(lambda_1 / f_0, ..., lambda_n / f_n)| <= lambda_n   <=>   |lambda'| <= f_0 lambda_n,   lambda'_j = lambda_j f_0 / f_j   (1)
 """
-from libc.math cimport fabs
+from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
 from libc.string cimport memcmp, memcpy
 
@@ -340,6 +340,61 @@ def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[
             big = larger(big, c[6 * i + k])
             lost += 0.0 * term
     return (gap + lost if filled != 0.0 else 0.0), big + lost
+
+
+def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
+                  const double[:, ::1] spatial, double alike):
+    """v (nv) of which spatial velocities c were made, from arrays that `motion_gap` takes; None where s does not tell it.
+
+    Least squares body by body, as modified Gram-Schmidt has them; `alike`: share of an axis s_j that others of its body leave.
+    """
+    cdef Py_ssize_t i, j = 0, k, r, count, n = body.shape[0]
+    cdef double[36] q, upper
+    cdef double[6] left, x
+    cdef double size, dot
+    found = new(n)
+    cdef double[::1] v = found
+    while j < n:
+        count = 1
+        while j + count < n and body[j + count] == body[j]:
+            count += 1
+        if count > 6:
+            return None
+        for k in range(6):
+            left[k] = spatial[body[j], k] - spatial[parent[body[j]], k]
+        for i in range(count):
+            size = 0.0
+            for k in range(6):
+                q[6 * i + k] = axis[j + i, k]
+                size += q[6 * i + k] * q[6 * i + k]
+            for r in range(i):
+                dot = 0.0
+                for k in range(6):
+                    dot += q[6 * r + k] * q[6 * i + k]
+                upper[6 * r + i] = dot
+                for k in range(6):
+                    q[6 * i + k] -= dot * q[6 * r + k]
+            size *= alike * alike
+            dot = 0.0
+            for k in range(6):
+                dot += q[6 * i + k] * q[6 * i + k]
+            if not dot > size:
+                return None
+            dot = sqrt(dot)
+            upper[7 * i] = dot
+            x[i] = 0.0
+            for k in range(6):
+                q[6 * i + k] /= dot
+                x[i] += q[6 * i + k] * left[k]
+            for k in range(6):
+                left[k] -= x[i] * q[6 * i + k]
+        for i in range(count - 1, -1, -1):
+            for r in range(i + 1, count):
+                x[i] -= upper[6 * i + r] * x[r]
+            x[i] /= upper[7 * i]
+            v[j + i] = x[i]
+        j += count
+    return found
 
 
 def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale, double dt,

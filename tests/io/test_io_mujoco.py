@@ -1,6 +1,7 @@
 """MuJoCo's constraint problem read from memory: its own solution is the judge's solution too."""
 
 import copy
+from time import thread_time_ns
 
 import numpy as np
 import pytest
@@ -494,6 +495,30 @@ def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, in
             assert np.array_equal(stepped.b, problem.b)
         mj.mj_forward(model, data)
         problem = lv.io.from_mujoco(model, data)
+
+
+def test_a_state_after_a_step_is_imported_in_about_the_time_of_one_after_a_forward_pass():
+    ball = '<body pos=".3 0 0"><joint type="ball"/><joint type="slide"/><geom size=".1" pos=".1 0 .2"/>{}</body>'
+    arm = ball.format(ball.format('<body pos=".2 0 0"><joint axis="1 2 3"/><geom size=".1"/></body>'))
+    model = mj.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="0 0 .09"><freejoint/><geom size=".1"/>{arm}</body>'
+        "</worldbody></mujoco>"
+    )
+    data = mj.MjData(model)
+    data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
+    before = data.qvel.copy()
+    least = {}
+    for made, run in ("forward", mj.mj_forward), ("step", mj.mj_step):
+        run(model, data)
+        problem, times = lv.io.from_mujoco(model, data), []
+        for _ in range(30):
+            start = thread_time_ns()
+            lv.io.from_mujoco(model, data)
+            times.append(thread_time_ns() - start)
+        least[made] = min(times)
+        found = problem.generalized.v_free - model.opt.timestep * data.qacc_smooth
+        np.testing.assert_allclose(found, before, atol=1e-12, rtol=0)
+    assert least["step"] < 2 * least["forward"]
 
 
 def test_joints_that_move_one_body_alike_hide_the_velocity_before_a_step():
