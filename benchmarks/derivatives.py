@@ -245,7 +245,7 @@ def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
     return Cost(source, problem.law, problem.operator, problem.m, *best.tolist())
 
 
-def batch(source: str, problems: list[lv.Problem], repeats: int = 5) -> Cost:
+def batch(source: str, problems: list[lv.Problem], repeats: int = 20) -> Cost:
     """The same of many at once, from `solve_many` to arrays of all problems."""
     best = np.full(3, np.inf)
     for _ in range(repeats):

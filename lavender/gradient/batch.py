@@ -10,7 +10,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, IntArray, places
 from lavender.base.errors import InputError
 from lavender.gradient.derivative import ACCEPTED, Derivative, derivative
-from lavender.gradient.result import Gradient
+from lavender.gradient.result import INPUTS, MATRICES, Gradient
 from lavender.gradient.system import SMALL
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
@@ -46,9 +46,15 @@ class _Each(Sequence[Any]):
     def _make(self, i: int) -> Any:
         raise NotImplementedError
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {self._n} problems>"
+
 
 class Gradients(_Each):
-    """Gradients of many problems: `[i]` is the `Gradient` of problem i. Made by `Derivatives.vjp`."""
+    """Gradients of many problems: `[i]` is the `Gradient` of problem i. Made by `Derivatives.vjp`.
+
+    `b`, `mu`, `v_free` and what else is no matrix are those of all problems, one after the other in one array.
+    """
 
     def __init__(self, of: Derivatives, numbers: FloatArray, alone: dict[int, Gradient]) -> None:
         super().__init__(len(of), alone)
@@ -57,17 +63,15 @@ class Gradients(_Each):
     def _make(self, i: int) -> Gradient:
         return Gradient(self._of._one(i), self._numbers[self._of._linears.place(i)])
 
-    @property
-    def b(self) -> FloatArray:
-        """By b, of all rows: those of the problems one after the other."""
-        return self._numbers[self._of._rows] if self._whole else np.concatenate([g.b for g in self])
-
-    @property
-    def v_free(self) -> FloatArray:
-        """By v*, of all velocities: those of the problems one after the other; CapabilityError of a matrix."""
-        if self._whole:
-            return self._numbers[self._of._velocities]
-        return np.concatenate([g.v_free.ravel() for g in self])
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in INPUTS or name in MATRICES:
+            raise AttributeError(
+                f"gradients have no {name!r} of all problems; [i] is the gradient of problem i"
+            )
+        if self._whole and name in ("b", "target", "v_free"):
+            of = self._of
+            return self._numbers[of._velocities if name == "v_free" else of._rows]
+        return np.concatenate([getattr(g, name) for g in self] or [np.zeros(0)])
 
 
 class Derivatives(_Each):

@@ -12,7 +12,7 @@ from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
 from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, INPUTS, Gradient
+from lavender.gradient.result import BODIES, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
@@ -93,6 +93,11 @@ class Derivative:
         general = problem.generalized
         # The kernel has all that `vjp` needs, in the order given.
         self._plain = regular and not problem.cones.has_ellipse and (general is None or general.order is None)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the data that this problem has, by which there are gradients."""
+        return tuple(name for name, of in INPUTS.items() if self.problem.operator in of)
 
     @cached_property
     def _system(self) -> System:
@@ -371,13 +376,13 @@ class Derivative:
 
     def _checked(self, changes: dict[str, Any]) -> dict[str, Any]:
         p, out = self.problem, {}
-        known = [name for name, of in INPUTS.items() if p.operator in of and name != "coefficients"]
+        known = [name for name in self.inputs if name != "coefficients"]
         for name, value in changes.items():
             if name not in known:
                 raise InputError(
                     f"{name!r} is no data of this problem ({p.operator}): there are {', '.join(known)}"
                 )
-            if name in ("A", "J", "M"):
+            if name in MATRICES:
                 like = p.matrix if name == "A" else p.jacobian if name == "J" else p.generalized.mass  # type: ignore[union-attr]
                 out[name] = as_csr(name, value) if issparse(value) else as_array(name, value, like.shape)
                 if out[name].shape != like.shape:
@@ -477,6 +482,9 @@ class Derivative:
         Under Coulomb's law there may be several: a gradient is then of this one, whose choice it does not know.
         """
         return above("lavender.lab.motion").motions_of(self.problem.disk)
+
+    def __repr__(self) -> str:
+        return f"<Derivative of {self.m} rows: {self}>"
 
     def __str__(self) -> str:
         words = [repr(self.states)]

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
+from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
 
-__all__ = ["BODIES", "INPUTS", "Gradient"]
+__all__ = ["BODIES", "INPUTS", "MATRICES", "Gradient"]
 
+MATRICES = ("A", "J", "M")
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
 INPUTS = {
@@ -102,6 +103,9 @@ class Gradient:
     def _c(self) -> FloatArray:
         return self._made[len(self._made) - self._of.m :]
 
+    def __repr__(self) -> str:
+        return f"<Gradient of {self._of.m} rows by {', '.join(self._of.inputs)}>"
+
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
@@ -185,6 +189,8 @@ class Gradient:
 
     def full(self, name: str) -> FloatArray:
         """The whole of A, J or M, a dense array with entries outside its pattern, too."""
+        if name not in MATRICES:
+            raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is no matrix with a pattern")
         getattr(self, name)  # refuses what is not there
         return np.asarray(sum(np.outer(u, v) for u, v in self._pairs(name)))
 

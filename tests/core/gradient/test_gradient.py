@@ -305,7 +305,7 @@ def test_arrays_of_a_batch_are_those_of_its_gradients():
                 lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)
             ]
             assert np.array_equal(found.v_free, np.concatenate([g.v_free for g in each]))
-            assert [g.mu.tolist() for g in found] == [g.mu.tolist() for g in each]
+            assert np.array_equal(found.mu, np.concatenate([g.mu for g in each]))
             assert np.array_equal(found[-1].v_free, each[-1].v_free) and len(found[:2]) == 2
         if twice in given:
             with pytest.raises(lv.CapabilityError, match="share a load"):
@@ -317,6 +317,17 @@ def test_arrays_of_a_batch_are_those_of_its_gradients():
         weights[1][0] = np.nan
         with pytest.raises(lv.InputError, match="problem 1: velocity"):
             d.vjp(velocity=weights)
+
+
+def test_what_an_array_of_a_batch_is_not():
+    p = drawn(0, "disk", "cone", "generalized")
+    found = lv.derivatives([p], [solved(p)]).vjp(impulse=[np.ones(p.m)])
+    with pytest.raises(AttributeError, match=r"gradients have no 'M' of all problems; \[i\]"):
+        found.M  # noqa: B018 - read
+    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is no matrix"):
+        found[0].full("mu")
+    assert repr(found) == "<Gradients of 1 problems>" and "compliance, J, M>" in repr(found[0])
+    assert repr(lv.derivatives([p], [solved(p)])[0]).startswith(f"<Derivative of {p.m} rows: ")
 
 
 def test_a_stacked_batch_and_solutions_of_other_problems():
