@@ -4,8 +4,8 @@ from libc.stdint cimport int32_t, int64_t
 
 import numpy as np
 
-from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, FLOOR, LOST, MORE, REACHED, ROOM, SPENT, STUCK, UNFIT, options_t,
-                                       room_t, said_t)
+from lavender_ext.core.method cimport (BROKEN, CERTIFICATE, FLOOR, LOST, MORE, REACHED, ROOM, SPENT, STUCK, options_t, room_t,
+                                       said_t)
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, method_t

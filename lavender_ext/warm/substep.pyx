@@ -78,17 +78,17 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     return <int32_t>room if room < MOST else -1
 
 
-cdef inline int32_t solve_in_turns(const view_t* view, const options_t* o, room_t* room, warm_t* s, double* lam,
+cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, room_t* room, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
     """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
     cdef said_t said
-    cdef int32_t how = bodies_start(view, o, room, lam)
+    cdef int32_t how = bodies_start(problem, o, room, lam)
     while how == MORE or how == CERTIFICATE:
-        how = system_step(view, o, room, 1, lam, &said)
+        how = system_step(problem, o, room, 1, lam, &said)
         s.factorisations = said.factorisations
         if s.trace != NULL:
-            judged(&view.p, view.r, s, said.tried, v, o.e0, o.v0)
-    s.relative = judged(&view.p, view.r, s, lam, v, o.e0, o.v0)
+            judged(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
+    s.relative = judged(&problem.p, problem.r, s, lam, v, o.e0, o.v0)
     return FACTORED if said.relative <= o.tol else UNDECIDED
 
 
@@ -96,7 +96,7 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
                                    int32_t* scratch, double* room, double* lam, double* v) noexcept nogil:
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
-    cdef view_t view
+    cdef view_t problem
     cdef options_t o
     cdef room_t n
     if how != UNDECIDED or p.n_rows == 0 or not turns:
@@ -112,10 +112,10 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     if not scratch[1]:
         return UNDECIDED
-    view = view_t(p[0], NULL, r, NULL)
+    problem = view_t(p[0], NULL, r, NULL)
     o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0)
     n = room_t(scratch[1], MOST, scratch + HEAD, room, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
-    return solve_in_turns(&view, &o, &n, s, lam, v)
+    return solve_in_turns(&problem, &o, &n, s, lam, v)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,
