@@ -256,28 +256,6 @@ def test_a_round_cone_is_one_cone(tangents):
             assert reason and ("round cones" in reason or "pip install" in reason)
 
 
-# -- many at once -------------------------------------------------------------------------------------
-
-
-def test_many_start_where_they_are_told():
-    problem = random_general(4, "cone")
-    cold = lv.solve(problem, tol=1e-9)
-    warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
-    assert warm[0].iterations == 0
-    assert warm[1].iterations > 0
-    with pytest.raises(lv.InputError, match="one Problem; a list"):
-        lv.solve_many(problem)
-    with pytest.raises(lv.InputError, match="1 impulses for 2"):
-        lv.solve_many([problem, problem], impulses=[None])
-    with pytest.raises(lv.InputError, match="threads is 0"):
-        lv.solve_many([problem], threads=0)
-    with pytest.raises(lv.UnknownName):
-        lv.solve_many([problem], "pgss")
-    with pytest.raises(lv.InputError):
-        lv.solve_many([3])
-    assert len(lv.solve_many([])) == 0
-
-
 def test_updated_is_the_same_structure_with_new_numbers():
     problem = random_general(9, "cone")
     general = problem.generalized
@@ -299,13 +277,14 @@ def test_updated_is_the_same_structure_with_new_numbers():
         problem.updated(J=jac[:, 1:], target=0.0)
 
 
-def test_nothing_of_the_judge_forms_a():
+def test_nothing_of_the_judge_forms_a(monkeypatch):
     problem = random_general(6, "cone")
+    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     solution = lv.solve(problem, tol=1e-8)
     lv.residual(problem, solution.impulse)
     problem.velocity(solution.impulse)
-    assert "csr_data" not in problem.__dict__
-    assert "_compressed" not in problem.__dict__
+    with pytest.raises(TypeError):
+        _ = problem.csr
 
 
 @given(seed=seeds)
