@@ -564,6 +564,8 @@ def test_rows_of_ellipses_are_the_problems_own(form):
     assert e.rows == pytest.approx(np.abs(p.slack(y) - p.slack(x)).max(), rel=1e-6)
     assert e.row == 2
     assert e.row_name == p.row_name(2)
+    near = lv.motion_error(p, x)
+    assert near.rows < 1e-6 and near.bound < 1e-6 * e.bound and e.energy <= e.bound
 
 
 @pytest.mark.parametrize(("slow", "light"), [(1.0, 1.0), (1e-11, 1e-22), (1e-10, 1e-24)])
