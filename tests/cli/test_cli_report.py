@@ -22,19 +22,12 @@ from lavender.lab.bench import Event, simulators
 from lavender.lab.phenomena import PHENOMENA
 from lavender.out import vectors
 
-MODEL = """<mujoco><option timestep="0.004"/><worldbody><geom type="plane" size="0 0 1"/>
-  <body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/>
-    <body><joint name="arm" range="-30 30" limited="true"/>
-      <geom type="capsule" fromto="0 0 .1 .3 0 .1" size=".03"/></body>
-  </body></worldbody><actuator><motor joint="arm" gear="2"/></actuator></mujoco>"""
 
-
-def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
+def test_the_command_writes_a_table_and_says_what_it_left_out(boxes, tmp_path):
     pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(MODEL)
     (tmp_path / "torn.xml").write_text("<mujoco><worldbody>")
     out = tmp_path / "steps.jsonl"
-    models = [str(tmp_path / name) for name in ("arm.xml", "torn.xml")]
+    models = [str(boxes()), str(tmp_path / "torn.xml")]
     words = [*models, "--steps", "2", "--warm", "40", "--out", str(out)]
     done = CliRunner().invoke(mujoco, words)
     assert done.exit_code == 1, done.output
@@ -44,15 +37,14 @@ def test_the_command_writes_a_table_and_says_what_it_left_out(tmp_path):
     assert "ours, median" in done.output.split("| kinetic energy |")[1]  # the second table
     lines = [json.loads(line) for line in out.read_text().splitlines()]
     assert "mujoco" in lines[0]
-    assert {line["model"] for line in lines[1:]} == {"arm"}
+    assert {line["model"] for line in lines[1:]} == {"boxes"}
     assert sum("kernel" in line for line in lines[1:]) == 2
     assert max(line["residual"] for line in lines[1:]) <= simulators.TARGET
 
 
-def test_without_a_problem_nothing_is_printed_but_why(tmp_path):
+def test_without_a_problem_nothing_is_printed_but_why(boxes):
     pytest.importorskip("mujoco")
-    (tmp_path / "arm.xml").write_text(MODEL)
-    words = [str(tmp_path / "arm.xml"), "--steps", "0"]
+    words = [str(boxes()), "--steps", "0"]
     done = CliRunner().invoke(mujoco, words)
     assert isinstance(done.exception, InputError) and "no step of these models" in str(done.exception)
     for bad in (["--every", "0"], ["--warm", "-1"], ["--steps", "-1"]):

@@ -176,7 +176,6 @@ BAD_PROBLEMS = {
     ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
-    "a judge without a problem": (lambda: lv.residual(None, [1.0]), "a lavender.Problem is needed"),
     "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
     "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
     "friction beyond float64": (

@@ -262,12 +262,6 @@ def test_zero_at_the_reference_and_one_where_nothing_is_done(law):
     assert lv.motion_error(p, np.zeros(p.m)).relative == pytest.approx(1.0)
 
 
-def test_wrong_input_is_refused():
-    p = problems("cone", 5)
-    with pytest.raises(lv.InputError, match="Problem"):
-        lv.motion_error("p", p.start())
-
-
 def test_an_empty_problem_has_no_error():
     p = lv.Problem.lcp(np.zeros((0, 0)), [])
     e = lv.motion_error(p, [])
