@@ -485,11 +485,13 @@ def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, in
 
 
 def test_a_state_after_a_step_is_imported_in_about_the_time_of_one_after_a_forward_pass():
-    ball = '<body pos=".3 0 0"><joint type="ball"/><joint type="slide"/><geom size=".1" pos=".1 0 .2"/>{}</body>'
+    ball = (
+        '<body pos=".3 0 0"><joint type="ball"/><joint type="slide"/><geom size=".1" pos=".1 0 .2"/>{}</body>'
+    )
     arm = ball.format(ball.format('<body pos=".2 0 0"><joint axis="1 2 3"/><geom size=".1"/></body>'))
     model = mj.MjModel.from_xml_string(
-        f'<mujoco><worldbody><geom type="plane" size="9 9 1"/><body pos="0 0 .09"><freejoint/><geom size=".1"/>{arm}</body>'
-        "</worldbody></mujoco>"
+        '<mujoco><worldbody><geom type="plane" size="9 9 1"/>'
+        f'<body pos="0 0 .09"><freejoint/><geom size=".1"/>{arm}</body></worldbody></mujoco>'
     )
     data = mj.MjData(model)
     data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
