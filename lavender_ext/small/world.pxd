@@ -7,7 +7,7 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy
 
-from lavender_ext.core.door cimport first_unsized, is_size, largest, least, most
+from lavender_ext.core.door cimport first_unsized, is_number, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport room_t
@@ -95,9 +95,8 @@ cdef inline bint has_outside(const double* x, int32_t n) noexcept nogil:
     """Does the door exclude any of these? Without a branch, so that compilers take several at once."""
     cdef int32_t i
     cdef int found = 0
-    cdef double bound = most()
     for i in range(n):
-        found |= not fabs(x[i]) <= bound
+        found |= not is_number(x[i])
     return found
 
 
