@@ -101,10 +101,8 @@ def from_efc(
     CapabilityError
         M qacc_smooth is not the smooth force: another matrix has made the problem.
     """
-    jac, one = (
-        np.asarray(efc_J),
-        np.asarray(timestep),
-    )  # MJX and Warp hold the time step as an array of one number
+    jac = np.asarray(efc_J)
+    one = np.asarray(timestep)  # MJX and Warp hold the time step as an array of one number
     dt = number("timestep", one.item() if one.size == 1 else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")

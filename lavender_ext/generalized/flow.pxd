@@ -55,6 +55,8 @@ cdef struct flow_t:
     const int32_t* cptr         # (n_islands + 1) columns of each island in `icols`
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
+    int32_t plain               # bounded rows alone
+    int32_t thin                # S serves every step; L is not known
     const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
     const int32_t* lidx         # columns in their island, ascending
     const int32_t* pblock       # (n_panels + 1) first block of each panel
@@ -88,7 +90,8 @@ cdef struct flow_t:
     double* turned              # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
-    int32_t* swap               # (s)
+    int32_t* swap               # (s); or row and panel of each row that answers
+    int32_t n_answering         # rows of S, whose factor stands in `factor`; -1: it is that of N
     double energy_limit         # sqrt J of one island
     double velocity_limit       # m/s
     int32_t steps               # Newton steps left
@@ -156,6 +159,15 @@ cdef inline void respond(const flow_t* f, int32_t first, int32_t last, const dou
     cdef const double* center = f.center
     cdef const double* soft = f.soft
     cdef double z, low, high
+    if f.plain:                                         # V of a row stands in its place
+        end = ptr[last]
+        for k in range(ptr[first], end):
+            z = (rho[k] * center[k] - s[k]) * soft[k]
+            low = lower[k]
+            high = upper[k]
+            v[k] = soft[k] if low < z < high else 0.0
+            lam[k] = low if z < low else (high if z > high else z)
+        return
     for i in range(first, last):
         j = ptr[i]
         end = ptr[i + 1]
@@ -249,6 +261,10 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]
+        if f.plain:
+            for k in range(row_from(f, a), row_end(f, a)):
+                tally_row(&f.p, k, row_error(lam[k], w[k], d[k], lower[k], upper[k]), &t)
+            continue
         last = block_end(f, a)
         for i in range(block_from(f, a), last):
             if is_rows(&f.p, i):

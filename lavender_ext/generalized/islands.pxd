@@ -7,7 +7,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
-from lavender_ext.generalized.flow cimport flow_t
+from lavender_ext.generalized.flow cimport flow_t, row_end, row_from
 from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
 
 
@@ -148,6 +148,42 @@ cdef struct need_t:             # what the islands of a problem ask for
     double work                 # multiply-adds of N and of its factors, of all islands
 
 
+cdef inline bint is_thin(const flow_t* f) noexcept nogil:
+    """Are bounded rows so few in every island that they have less work than its N, whichever answer?
+
+    All entries that the columns of one panel have with each other are in L.
+    """
+    cdef int32_t i, a, b, nc, wide
+    cdef double rows
+    if not f.plain:
+        return False
+    for i in range(f.n_islands):
+        rows = wide = 0
+        for a in range(f.iptr[i], f.iptr[i + 1]):
+            rows += row_end(f, a) - row_from(f, a)
+            for b in range(f.run[2 * a], f.run[2 * a + 1]):
+                nc = f.g.pcol[b + 1] - f.g.pcol[b]
+                if nc > wide:
+                    wide = nc
+        if rows * rows > 0.5 * wide * (wide - 1.0):
+            return False
+    return True
+
+
+cdef inline void count_rows(const flow_t* f, need_t* need) noexcept nogil:
+    """What S of all rows asks for."""
+    cdef int32_t i, a, values
+    cdef double rows
+    for i in range(f.n_islands):
+        rows = values = 0
+        for a in range(f.iptr[i], f.iptr[i + 1]):
+            rows += row_end(f, a) - row_from(f, a)
+            values += f.g.pval[f.run[2 * a + 1]] - f.g.pval[f.run[2 * a]]
+        need.work += ADDED * 0.5 * rows * values + rows * rows * rows / 6.0
+        if 0.5 * rows * (rows + 1.0) > need.values:
+            need.values = 0.5 * rows * (rows + 1.0)
+
+
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
     """int32 that `settle` needs, with room for `per` entries in a row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
@@ -180,11 +216,21 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
                                <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
     f.swap = w                                          # scratch of before
     f.wait.island = -1
+    f.plain = True
+    for i in range(p.n_blocks):
+        if not is_rows(p, i):
+            f.plain = False
+            break
+    f.thin = is_thin(f)
+    need.values = 0.0
+    need.work = 0.0
+    need.crowded = 0
+    if f.thin:
+        count_rows(f, need)
+        return
     need.crowded = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
     f.lptr = w + at
     f.lidx = w + at + f.cptr[f.n_islands] + 1
-    need.values = 0.0
-    need.work = 0.0
     for i in range(panels):
         need.work += ADDED * 0.5 * (g.pval[i + 1] - g.pval[i]) * (g.pcol[i + 1] - g.pcol[i])
     for i in range(0 if need.crowded else f.n_islands):

@@ -210,10 +210,11 @@ cdef inline void soften(const flow_t* f, int32_t island, double share) noexcept 
                 if not x >= low * d[k]:
                     x += share * d[k]
                 theta[k] = x
-            parts_of(&f.p, i, &q)
-            for g in range(q.n):
-                if q.size[g] > 1:
-                    one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
+            if not is_rows(&f.p, i):
+                parts_of(&f.p, i, &q)
+                for g in range(q.n):
+                    if q.size[g] > 1:
+                        one_theta(theta, j + q.first[g], j + q.first[g] + q.size[g])
             for k in range(j, end):
                 rho[k] = theta[k] - compliance[k]
                 soft[k] = 1.0 / theta[k]
