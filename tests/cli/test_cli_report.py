@@ -157,7 +157,7 @@ def test_the_command_shows_the_way_and_gives_it_as_data(capsys):
         main(["explain", "stack(n=200)", "granularF(n=4)"])
     assert end.value.code in (0, None)
     shown = capsys.readouterr().out
-    assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "relaxation" in shown
+    assert "newton is counted to take" in shown and "granularF(n=4)" in shown and "nncg" in shown
     with pytest.raises(SystemExit):
         main(["explain", "stack(n=200)", "--json", "--tol", "1e-9"])
     plan = json.loads(capsys.readouterr().out)
