@@ -4,7 +4,7 @@
 PYTHON ?= .venv/bin/python
 BIN := $(dir $(PYTHON))
 
-.PHONY: help setup kernels test quick lint format types coverage docs verdict wasm fingerprint ci release clean
+.PHONY: help setup kernels test quick lint format types coverage docs wasm fingerprint ci release clean
 
 help:  ## this list
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -44,11 +44,6 @@ coverage:  ## which lines of the Python files the tests reach, in build/coverage
 
 docs:  ## the documentation, in site/
 	$(PYTHON) -m sphinx -W --keep-going -q -b html docs site
-
-verdict:  ## docs/verdict.md: the tables of the built-in report, measured on this machine
-	$(BIN)lavender report --fresh --no-figures --out build/verdict
-	sed -i '1,/^The tables/!d' docs/verdict.md
-	sed -e '1d' -e 's/^```python/```text/' -e '/^\*\*Cases/,$$d' build/verdict/summary.md >> docs/verdict.md
 
 wasm:  ## the WebAssembly modules, in lavender/sim/web/
 	$(BIN)lavender web build lavender/sim/web/lavender.wasm

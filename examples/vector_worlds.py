@@ -106,6 +106,8 @@ def numbers(n=64, steps=50, iterations=None):
 
 def main():
     words = sys.argv[1:]
+    if not all(map(str.isdecimal, words)):
+        sys.exit(__doc__)
     n, steps, iterations = (*map(int, words), *(64, 50, None)[len(words) :])
     found = numbers(n, steps, iterations)
     own, judge = n * steps / found["seconds"]

@@ -141,7 +141,7 @@ def inverse_times(m, x):
 
 def curved(problem):
     """Whether a square root stands in the conditions: two rows bounded by their norm."""
-    return any(len(rows) > 1 for i in contacts(problem) for rows, _ in parts(problem, i))
+    return any(len(rows) > 1 for i in contacts(problem) for rows, _ in parts(problem.cones, i))
 
 
 def contacts(problem):
@@ -150,9 +150,8 @@ def contacts(problem):
     return np.flatnonzero((c.kind != ROW) & (np.diff(c.ptr) > 1))
 
 
-def parts(problem, i, number=float):
+def parts(c, i, number=float):
     """(rows, most of their norm over the normal impulse) of all that a contact bounds by itself."""
-    c = problem.cones
     mu, first = number(c.mu[i]), c.ptr[i] + 1
     found = [(np.arange(first, first + c.n_together[i]), mu)] if c.n_together[i] else []
     if c.apart_rows[i] >= 0:  # spin, or the other side of a box
@@ -199,7 +198,7 @@ def conditions(problem, x, w, d, numbers):
         rim = x[j] * numbers.number(1 + 1e-12)
         slides = tuple(
             bool(norm(z[rows], numbers.sqrt) > reach * rim)
-            for rows, reach in parts(problem, i, numbers.number)
+            for rows, reach in parts(problem.cones, i, numbers.number)
         )
         modes[j] = "open" if z[j] <= 0 and x[j] <= 0 else slides
     return modes
@@ -234,7 +233,7 @@ def equations(problem, modes, a, x, w, numbers):
             for k in range(j, c.ptr[i + 1]):
                 given(k, none)
             continue
-        for (rows, reach), slides in zip(parts(problem, i, numbers.number), modes[j], strict=True):
+        for (rows, reach), slides in zip(parts(problem.cones, i, numbers.number), modes[j], strict=True):
             if not slides:
                 continue
             size = norm(w[rows], numbers.sqrt)
@@ -268,7 +267,7 @@ def holds(problem, modes, a, b, x, w, numbers):
             return False
     for i in contacts(problem):
         j, lift = c.ptr[i], 0 * x[0]
-        for rows, reach in parts(problem, i, numbers.number):
+        for rows, reach in parts(problem.cones, i, numbers.number):
             if norm(x[rows], numbers.sqrt) > reach * x[j] + small:
                 return False
             lift += reach * norm(w[rows], numbers.sqrt)
@@ -286,6 +285,6 @@ def shift_in(problem, a, y, numbers):
         p[k] = numbers.number(low) if z[k] < low else numbers.number(high) if z[k] > high else z[k]
     for i in contacts(problem):
         j, end = c.ptr[i], c.ptr[i + 1]
-        bounds = [(rows - j, reach) for rows, reach in parts(problem, i, numbers.number)]
+        bounds = [(rows - j, reach) for rows, reach in parts(problem.cones, i, numbers.number)]
         p[j:end] = project_cone(z[j:end], d[j:end], bounds, numbers.sqrt)
     return d * (y - p)

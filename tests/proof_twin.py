@@ -252,6 +252,8 @@ def attack(seed):
     )
     if amount > SLACK * size:
         return label, True, f"{words} is off by {float(amount):.1e}"
+    if found.impulse_radius > off * (1 + 1e-9) + SLACK * size:
+        return label, True, f"{found.impulse_radius:.3e} where {float(off):.3e} is enough"
     if (
         off > Fraction(found.impulse_radius) + SLACK * size
         or moved > Fraction(found.velocity_radius) + SLACK * size

@@ -154,6 +154,10 @@ def random_ellipses(seed, friction="coulomb", **sizes):
 
 #: Every way to give a problem, made of one given by rows.
 FORMS = {"rows": lambda problem: problem, "matrix": as_matrix, "J and M": general}
+#: And by a dense matrix with a guess.
+GIVEN = FORMS | {
+    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
+}
 #: Every kind of contact that rows may have: (seed, friction, sizes) to a problem of rows.
 CONTACTS = {
     "disks": partial(random_contact_problem, tangents=2, spin=False),

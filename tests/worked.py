@@ -3,11 +3,14 @@
 import ast
 import functools
 import importlib.util
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from random_problems import rotation
 
 import lavender
@@ -53,6 +56,15 @@ def energy(scene, observation):
             omega = rotation(q).T @ v[3:]
             total += 0.5 * body.mass * v[:3] @ v[:3] + 0.5 * omega @ body.inertia @ omega - body.mass * g @ x
     return total
+
+
+def chromium():
+    """Where a browser is, for playwright; whoever has none is skipped."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        pytest.skip(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    return found
 
 
 def python(*words, status=0, **more):

@@ -73,7 +73,8 @@ def from_efc(
     efc_type : (n, m) or (m,) int
         Of mjtConstraint.
     M : (n, nv, nv)
-        Mass matrix, both triangles.
+        Mass matrix, both triangles. Or its lower triangles in compressed rows, as MuJoCo Warp holds them: (values
+        (n, entries), indices, indptr).
     qvel, qacc_smooth : (n, nv)
         Velocity before the step and unconstrained acceleration.
     timestep : float, s
@@ -100,7 +101,11 @@ def from_efc(
     CapabilityError
         M qacc_smooth is not the smooth force: another matrix has made the problem.
     """
-    jac, dt = np.asarray(efc_J), number("timestep", timestep, above=0.0)
+    jac, one = (
+        np.asarray(efc_J),
+        np.asarray(timestep),
+    )  # MJX and Warp hold the time step as an array of one number
+    dt = number("timestep", one.item() if one.size == 1 else timestep, above=0.0)
     if jac.ndim != 3:
         raise InputError(f"efc_J has shape {jac.shape}; (n, m, nv) is needed")
     n, m, nv = jac.shape
@@ -118,9 +123,10 @@ def from_efc(
         raise InputError(
             f"efc_D of world {off[0][0]}, row {off[0][1]} is {stiff[tuple(off[0])]:g}; above 0 is needed"
         )
-    precision = precision_of(jac, np.asarray(M), np.asarray(qvel))
+    mass = _whole(*map(np.asarray, M)) if isinstance(M, tuple) else np.asarray(M)
+    precision = precision_of(jac, mass, np.asarray(qvel))
     if qfrc_smooth is not None:
-        _check_mass(np.asarray(M), smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv)), precision)
+        _check_mass(mass, smooth, as_array("qfrc_smooth", qfrc_smooth, (n, nv)), precision)
     free = before + dt * smooth
     step = max(1, CHUNK // max(1, m * nv))
     for i in range(0, n, step):
@@ -131,7 +137,7 @@ def from_efc(
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
         goal, soft = goal * scale, soft * scale * scale
-    batch = Batch(jac, M, free, target=goal, cones=cones, compliance=soft, friction="cone", count=count)
+    batch = Batch(jac, mass, free, target=goal, cones=cones, compliance=soft, friction="cone", count=count)
     batch.precision = precision
     if efc_force is None:
         return Imported(batch, None)
@@ -305,12 +311,12 @@ def _gathered(
     return Imported(batch, lam)
 
 
-def whole_mass(model: Any, mass: Any) -> Any:
-    """M (n, nv, nv) of its lower triangles (n, entries), stored as the model says."""
-    n, nv = len(mass), model.nv
-    row, whole = np.repeat(np.arange(nv), model.M_rownnz), np.zeros((n, nv, nv), mass.dtype)
-    whole[:, row, model.M_colind] = mass
-    whole[:, model.M_colind, row] = mass
+def _whole(values: Any, indices: Any, indptr: Any) -> Any:
+    """M (n, nv, nv) of its lower triangles in compressed rows."""
+    nv = len(indptr) - 1
+    row, whole = np.repeat(np.arange(nv), np.diff(indptr)), np.zeros((len(values), nv, nv), values.dtype)
+    whole[:, row, indices] = values
+    whole[:, indices, row] = values
     return whole
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray, number, whole_number
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.efc import from_efc, whole_mass
+from lavender.io.efc import from_efc
 from lavender.io.recording import Control, control_of, drive_of, model_of
 from lavender.problem.batch import Batch
 
@@ -152,7 +152,8 @@ def frames(engine: str, runs: Runs) -> Iterator[Frame]:
         state, efc, mass, contact, rest = step(ctrl)
         where, address, dim, rub, _ = contact
         given = {f"efc_{name}": x for name, x in efc.items()} | rest
-        given |= {"M": mass if mass.ndim == 3 else whole_mass(model, mass), "qvel": state["qvel"]}
+        triangle = mass, model.M_colind, np.append(model.M_rowadr, len(model.M_colind))
+        given |= {"M": mass if mass.ndim == 3 else triangle, "qvel": state["qvel"]}
         made = from_efc(**given, timestep=dt, contacts=(where, address, dim, rub))
         made.batch.names_of = _namer(mj, model, made.batch, efc["type"], contact)
         assert made.impulse is not None

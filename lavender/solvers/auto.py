@@ -217,6 +217,8 @@ class Tree:
         cost, short = newton - self.begun, self.is_short(newton)
         if short and not self.begun:
             cost = max(cost, 0.5 * self.deadline.nanoseconds())
+        if short and self.law == "coulomb":
+            cost *= 0.5  # nncg has the other half
         pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
@@ -320,11 +322,11 @@ class Auto(Solver):
 @np.errstate(all="ignore")  # what overflows is judged
 def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
     """The lines of the tree, until one solves the problem or none has more to do; `sweeps` that are set up."""
+    steps: dict[str, Step] = {}
     if sweeps is not None:
         sweeps.begin(log)
-        sweeps.finish()
+        finish(log, tree, steps, sweeps)
         return
-    steps: dict[str, Step] = {}
     idle = 0  # lines in a row that had nothing to do
     lines = iter(tree)
     while not log.done() and idle <= len(METHODS):  # before the next line counts what it needs
@@ -336,7 +338,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps) and not tree_goes_on(log, tree, steps, stage.cost):
-                step.finish()
+                finish(log, tree, steps, step)
                 return
             if isinstance(step, Newton | Direct):
                 set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
@@ -349,6 +351,21 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
+
+
+def finish(log: SolveLog, tree: Tree, steps: dict[str, Step], sweeps: Sweeps) -> None:
+    """All of the time left for sweeps, where nobody who factors would end; half of it for `nncg` where they stagnate."""
+    quarter, after = 0.25 * log.deadline.nanoseconds(), list[float]()
+    if quarter > FEW * tree.sweep:
+        for _ in range(2):
+            sweeps.least, sweeps.cost = inf, quarter
+            sweeps.run(quarter / tree.sweep)
+            after.append(sweeps.relative)
+        if after[1] > 0.5 * after[0] and not log.done():
+            name = tree.gradients(quarter, "").solver
+            (steps.get(name) or make(name, log, tree)).run(inf)
+    if not log.done():
+        sweeps.finish()
 
 
 def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:

@@ -8,7 +8,7 @@ from libc.stdint cimport int32_t
 import numpy as np
 
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW
+from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, lay_frictions
 
 cdef enum:
     CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
@@ -121,9 +121,7 @@ cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
         made.at.kind = &i[k + 1]
         made.at.lower = &x[0]
         made.at.upper = &x[m]
-        made.at.mu = &x[2 * m]
-        made.at.patch_radius = &x[2 * m + k]
-        made.at.rolling = &x[2 * m + 2 * k]
+        lay_frictions(&made.at, &x[2 * m], k)
     whole.setflags(False)
     numbers.setflags(False)
     made.arrays = (whole[:k + 1], whole[k + 1:], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],

@@ -52,6 +52,25 @@ cdef struct parts_t:            # of one contact
     double reach[PARTS]         # a_g of (1)
 
 
+cdef enum:
+    FRICTIONS = 3               # numbers of a block: mu, patch_radius, rolling
+
+
+cdef inline void lay_frictions(blocks_t* p, const double* x, Py_ssize_t stride) noexcept nogil:
+    """x: mu of all blocks, then, from each stride on, their other numbers."""
+    p.mu, p.patch_radius, p.rolling = x, x + stride, x + 2 * stride
+
+
+cdef inline void frictions_of(const blocks_t* p, const double** x) noexcept nogil:
+    """Where each of the FRICTIONS begins."""
+    x[0], x[1], x[2] = p.mu, p.patch_radius, p.rolling
+
+
+cdef inline void from_block(blocks_t* p, const blocks_t* all, int32_t i) noexcept nogil:
+    """What has one number in each block, from block i on."""
+    p.kind, p.mu, p.patch_radius, p.rolling = all.kind + i, all.mu + i, all.patch_radius + i, all.rolling + i
+
+
 cdef inline bint is_rows(const blocks_t* p, int32_t i) noexcept nogil:
     """Bounded rows, without a normal."""
     return p.kind[i] == ROW

@@ -13,7 +13,7 @@ import numpy as np
 
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport ROW, contact_kind
+from lavender_ext.core.parts cimport ROW, contact_kind, lay_frictions
 
 
 cpdef enum:
@@ -143,7 +143,7 @@ def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] code
         for j in range(5):
             x[7 * m + 5 * i + j] = friction[i, j]
     k = lav_export_blocks(m, &held[0], &held[m], &codes[0], limits, &held[2 * m], &x[7 * m], &held[2 * m + c],
-                          &x[6 * m], dt, &w[0], &w[m + 1] if m else NULL, &x[0], &x[m], &x[2 * m], &x[3 * m], &key[0])
+                          &x[6 * m], dt, &w[0], &w[m + 1] if m else NULL, &x[0], &x[m], &x[3 * m], &x[2 * m], &key[0])
     if k < 0:
         return -1 - k
     made.at.n_blocks = k
@@ -153,17 +153,15 @@ def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] code
         made.at.kind = &w[m + 1]
         made.at.lower = &x[0]
         made.at.upper = &x[m]
-        made.at.mu = &x[2 * m]
-        made.at.patch_radius = &x[4 * m]
-        made.at.rolling = &x[5 * m]
+        lay_frictions(&made.at, &x[3 * m], m)
     fits = made.check()
     made.spell()
     whole.setflags(False)
     numbers.setflags(False)
     keys.setflags(False)
-    made.arrays = (whole[:k + 1], whole[m + 1:m + 1 + k], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
+    made.arrays = (whole[:k + 1], whole[m + 1:m + 1 + k], numbers[:m], numbers[m:2 * m], numbers[3 * m:3 * m + k],
                    numbers[4 * m:4 * m + k], numbers[5 * m:5 * m + k])
-    return made if fits else None, numbers[3 * m:4 * m], keys[:k], copy
+    return made if fits else None, numbers[2 * m:3 * m], keys[:k], copy
 
 
 def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[::1] scale):

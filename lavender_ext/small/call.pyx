@@ -21,7 +21,7 @@ from libc.string cimport memcmp, memcpy
 import numpy as np
 
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.parts cimport CONE, blocks_t
+from lavender_ext.core.parts cimport CONE, FRICTIONS, blocks_t, frictions_of, lay_frictions
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
@@ -195,7 +195,6 @@ cdef class Bounded(Small):
 
 cdef enum:                      # numbers of an island's
     OF_ROW = 7                  # rows: lower, upper, b, d, nu, step, where it starts
-    OF_BLOCK = 3                # blocks: mu, patch_radius, rolling
     OF_JOINT = 24               # rows of joints: J, M^-1 J^T
     OF_TURN = 6                 # rows of contacts: swing
     OF_CONTACT = 17             # contacts: normal, tangent, arm_a, arm_b, coupling
@@ -232,7 +231,7 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* marks, const int32_t
     p.n_blocks, p.n_rows = k, m
     p.lower, p.upper, p.b = after(&numbers, m), after(&numbers, m), after(&numbers, m)
     p.d, p.nu, p.step, x.s.lam = after(&numbers, m), after(&numbers, m), after(&numbers, m), after(&numbers, m)
-    p.mu, p.patch_radius, p.rolling = after(&numbers, k), after(&numbers, k), after(&numbers, k)
+    lay_frictions(p, after(&numbers, FRICTIONS * k), k)
     p.ptr, p.kind = marks, marks + k + 1
     marks += 2 * k + 1
     x.s.v.a = x.s.v.r = x.s.v.g = NULL
@@ -257,19 +256,19 @@ cdef inline void lay(island_t* x, double* numbers, int32_t* marks, const int32_t
 cdef inline void cut(island_t* x, const blocks_t* p, const int32_t* block, const double* lam, int32_t* place) noexcept nogil:
     """The blocks `block` of the whole; place (rows of the whole) gets the numbers that its rows have here."""
     cdef const double* of_row[OF_ROW]
-    cdef const double* of_block[OF_BLOCK]
+    cdef const double* of_block[FRICTIONS]
     cdef blocks_t* own = &x.s.v.p
     cdef int32_t i, j, k, q, row, n = 0
     cdef int32_t* ptr = <int32_t*>own.ptr
     of_row[0], of_row[1], of_row[2], of_row[3], of_row[4], of_row[5] = p.lower, p.upper, p.b, p.d, p.nu, p.step
     of_row[6] = lam
-    of_block[0], of_block[1], of_block[2] = p.mu, p.patch_radius, p.rolling
+    frictions_of(p, of_block)
     own.law = p.law
     ptr[0] = 0
     for k in range(own.n_blocks):
         i = block[k]
         (<int32_t*>own.kind)[k] = p.kind[i]
-        for q in range(OF_BLOCK):
+        for q in range(FRICTIONS):
             x.numbers[OF_ROW * own.n_rows + q * own.n_blocks + k] = of_block[q][i]
         j = p.ptr[i]
         for q in range(OF_ROW):
@@ -448,7 +447,7 @@ cdef class Friction(Small):
         cdef island_t* last
         cdef bint good = True
         m, k, q, _, _ = self.size.max(axis=0)
-        cdef int64_t each = (OF_ROW + 1) * <int64_t>m + OF_BLOCK * k + q, whole = 4 * k + m + 2 + q
+        cdef int64_t each = (OF_ROW + 1) * <int64_t>m + FRICTIONS * k + q, whole = 4 * k + m + 2 + q
         if over_bodies:
             n = min(2 * k, n_bodies)
             each += (OF_JOINT + OF_TURN + 1) * <int64_t>m + OF_CONTACT * k + OF_BODY * n

@@ -10,7 +10,7 @@ from libc.string cimport memcmp, memcpy
 from lavender_ext.core.door cimport first_outside, first_unsized, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
-from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
 from lavender_ext.driver.driver cimport room_t
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
@@ -252,8 +252,8 @@ cdef inline void lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, i
     p.n_rows, p.n_blocks = <int32_t>at[ROWS], <int32_t>at[BLOCKS]
     for k in range(p.n_blocks + 1):
         ptr[k] = all.ptr[block + k] - first
-    p.ptr, p.kind, p.lower, p.upper = ptr, all.kind + block, all.lower + first, all.upper + first
-    p.mu, p.patch_radius, p.rolling = all.mu + block, all.patch_radius + block, all.rolling + block
+    p.ptr, p.lower, p.upper = ptr, all.lower + first, all.upper + first
+    from_block(p, all, block)
     if w.array[5] != NULL:
         widen(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu

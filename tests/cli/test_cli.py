@@ -6,18 +6,14 @@ import re
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from calls import LAWS, free, on_rows, robot
-from click.testing import CliRunner
-from random_problems import as_matrix
+from calls import robot
 from stacks import stack
 
 import lavender as lv
 from lavender import bench, cli, io, registry
-from lavender.cli import main
 from lavender.lab.bench.record import Skip, to_json
 
 QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
@@ -32,15 +28,6 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     code, out, _ = lavender("check", path, "--solvers", "liar")
     assert code == 1
     assert "claim contradicted" in out and "1 claims are contradicted" in out
-
-
-def test_check_fails_on_a_file_it_cannot_read(lavender, path):
-    broken = path.parent / "broken.npz"
-    broken.write_bytes(path.read_bytes()[:100])
-    code, out, _ = lavender("check", broken, path, "--solvers", "direct")
-    assert code == cli.EXIT_BAD_INPUT
-    assert "broken" in out
-    assert "agrees" in out  # what can be read is checked all the same
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")
@@ -92,21 +79,15 @@ def test_solvers_lists_all_with_reasons(lavender):
     ("words", "sign"),
     [
         (("report", "--solvers", "pgz"), "did you mean 'pgs'"),
-        (("report", "stack(n=8)", "--solvers", "auto", "pgz"), "unknown solver 'pgz'; did you mean 'pgs'"),
-        (("report", "--solvers", "pgs", "stak(n=8)"), "unknown case 'stak'"),
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
         (("report", "--levels", "0"), "level is 0;"),
         (("report", "--budgets", "-4"), "budget is -4"),
-        (("report", "--repeats", "0"), "repeats is 0"),
-        (("report", "--time-limit", "-1"), "time_limit is -1"),
         (("report", "--orders", "sideways"), "sideways"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
         (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
-        (("solve", "stack(n=4)", "--solver", "PGS"), "did you mean 'pgs'"),
         (("solve", "stack(n=4)", "--solver", "pgs", "--tol", "-1"), "tol"),
-        (("solve", "stack(n=4)", "--solver", "pgs", "--max-iter", "-1"), "max_iter"),
         (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
@@ -133,24 +114,19 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
-        (("check", "stack(n=4)", "--solvers", "pgs", "--tol", "nan"), "tol is"),
-        (("check", "stack(n=4)", "--solvers", "pgs", "--tol", "inf"), "tol is"),
         (("check", "stack(n=4)", "--solvers", "pgs", "--tol=-1"), "tol is"),
         (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
         (("explain", "stack(n=4)", "--tol", "0"), "tol"),
         (("prove", "stack(n=2)", "--solver", "foo"), "unknown solver 'foo'"),
-        (("cases", "nosuchthing"), "nosuchthing"),
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),
         (("run", "stack", "--iterations", "3"), "solver_iterations"),
         (("run", "stack", "--solver", "newtn"), "did you mean 'newton'"),
-        (("run", "stack", "--order", "up"), "order"),
         (("run", "stack", "--solver", "newton", "--order", "bottom_up"), "order"),
         (("run", "stack", "--order", "given", "--set", "order=reverse"), "order"),
         (("run", "stack", "--stepper", "xpbd", "--solver", "newton"), "xpbd"),
         (("phenomena", "nothing"), "unknown phenomenon"),
         (("phenomena", "stick", "--set", "slope=3"), "0 to 0.99 is needed"),
-        (("phenomena", "stick", "--set", "speed=3"), "speed"),
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
         (("phenomena", "stick", "--steppers", "fast"), "unknown stepper"),
         (("phenomena", "stick", "--engines", "fast"), "unknown engine"),
@@ -437,66 +413,20 @@ def test_files_are_written_whoever_reads(path, tmp_path):
     assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
 
 
-FORMS = {"generalized": free, "matrix": lambda *a, **k: as_matrix(free(*a, **k)), "rows": on_rows}
-
-
-@pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("law", LAWS)
-def test_every_door_gives_the_same(form, law, tmp_path):
-    problem = FORMS[form](1, friction=law)
-    found = lv.solve(problem, tol=1e-9)
-    assert found.success
-    assert lv.solve_many([problem, problem], tol=1e-9)[1].impulse.tobytes() == found.impulse.tobytes()
-    prepared = lv.prepare(problem, "newton")
-    first = prepared.solve(tol=1e-9).impulse
-    again = prepared.solve(replace(problem, name="again"), impulse=first, tol=1e-8)
-    assert again.success
-    np.testing.assert_allclose(again.impulse, first, rtol=1e-6, atol=1e-9)
-    assert lv.solve(problem, "newton", impulse=found.impulse, tol=1e-8, max_iter=1).success
-    path = tmp_path / "ellipse.npz"
-    problem.save(path)
-    back = lv.load(path)
-    assert back == problem
-    assert (
-        lv.residual(back, found.impulse).relative == found.residual.relative
-    )  # of the numbers that were handed out
-    with pytest.raises(SystemExit) as ended:
-        main(["reference", str(path)])
-    assert ended.value.code in (0, None)
-    best = lv.solve(problem, tol=1e-12)
-    assert best.motion_error(best).rows == 0.0
-    error = lv.motion_error(problem, 1.1 * found.impulse)
-    assert error.rows > 1e-3
-    near = lv.motion_error(problem, found.impulse)
-    assert near.rows < 1e-6
-    if law == "cone":
-        assert near.bound < 1e-6 * error.bound
-        assert lv.cross_check(problem, ["newton", "admm", "anderson"]).ok
-    np.testing.assert_array_equal(problem.carry(found), found.impulse)
-    single = np.float32(found.impulse)
-    assert lv.residual(problem, single, "float32").verdict == "at its floor"
-    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
-    assert str(lv.explain(problem))
-
-
-def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(tmp_path):
+def test_check_judges_a_stored_answer_for_the_precision_it_was_made_in(lavender, tmp_path):
     problem = robot(2)
     exact = lv.solve(problem, tol=1e-11).impulse
-    for name, impulse in (("done", exact.astype(np.float32)), ("early", 0.9 * exact)):
+    for name, impulse in (("done", exact.astype(np.float32)), ("early", 0.9 * exact), ("none", None)):
         lv.io.save(problem, tmp_path / f"{name}.npz", impulse=impulse)
-    told = ["--solvers", "pgs", "--precision", "float32"]
-    done = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "done.npz"), *told])
-    assert done.exit_code == 0, done.output
-    assert "stored answer: at its floor of float32" in " ".join(done.output.split())
-    early = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "early.npz"), *told])
-    assert early.exit_code == 1
-    assert "stored answer: stopped early, " in early.output
+    told = ("--solvers", "pgs", "--precision", "float32")
+    code, out, err = lavender("check", tmp_path / "done.npz", *told)
+    assert code == 0, out + err
+    assert "stored answer: at its floor of float32" in " ".join(out.split())
+    code, out, _ = lavender("check", tmp_path / "early.npz", *told)
+    assert code == 1 and "stored answer: stopped early, " in out
     # Without the option the precision is the problem's, and the exit code that of the claims.
-    assert CliRunner().invoke(cli.cli, ["check", str(tmp_path / "early.npz"), *told[:2]]).exit_code == 0
-    lv.io.save(problem, tmp_path / "none.npz")
-    none = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "none.npz"), *told])
-    assert isinstance(none.exception, lv.InputError)
-    assert "no file holds an answer" in str(none.exception)
-    other = CliRunner().invoke(cli.cli, ["check", str(tmp_path / "done.npz"), "--precision", "half"])
-    assert other.exit_code == 2
-    assert "'half' is not one of 'float64', 'float32'" in other.output
+    assert lavender("check", tmp_path / "early.npz", *told[:2])[0] == 0
+    code, _, err = lavender("check", tmp_path / "none.npz", *told)
+    assert code == cli.EXIT_BAD_INPUT and "no file holds an answer" in err
+    code, _, err = lavender("check", tmp_path / "done.npz", "--precision", "half")
+    assert code == cli.EXIT_BAD_INPUT and "'half' is not one of 'float64', 'float32'" in err

@@ -4,16 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from mujoco_scene import mj, scene
 
 import lavender as lv
-from lavender.cli import cli
+from lavender.cli import EXIT_BAD_INPUT, cli
 
 PGS = 1e-6  # as in test_io_mujoco.py
 
 
-def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(tmp_path):
+def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_users(lavender, tmp_path):
     """All but exact answers are above the floor of float64, which rounding alone sets."""
     model = mj.MjModel.from_xml_string(scene(solver="PGS").replace('"1e-15"', '"1e-12"'))
     found = lv.io.record(model, mj.MjData(model), tmp_path / "a", 30)
@@ -37,11 +36,10 @@ def test_what_a_robot_does_not_feel_is_close_enough_and_the_threshold_is_the_use
             lv.residual(stored.problem, stored.impulse, threshold=wrong)
         with pytest.raises(lv.InputError, match="threshold"):
             lv.io.record(model, mj.MjData(model), tmp_path / "c", 1, threshold=wrong)
-    words = ["check", str(tmp_path / "a" / at["file"]), "--solvers", "auto", "--threshold"]
-    near, strict = (CliRunner().invoke(cli, [*words, x]) for x in ("1e-6", "0"))
-    assert (near.exit_code, strict.exit_code) == (0, 1)
-    assert "1 of 1 above their floor, 0 also more than 1e-06 m/s off" in near.output
-    assert "1 of 1 above their floor, 1 also more than 0 m/s off" in strict.output
+    words = ("check", tmp_path / "a" / at["file"], "--solvers", "auto", "--threshold")
+    for threshold, status, told in (("1e-6", 0, "0 also more than 1e-06"), ("0", 1, "1 also more than 0")):
+        code, out, _ = lavender(*words, threshold)
+        assert code == status and f"1 of 1 above their floor, {told} m/s off" in " ".join(out.split())
 
 
 def test_record_and_report_take_the_same_options_with_the_same_defaults():
@@ -52,37 +50,19 @@ def test_record_and_report_take_the_same_options_with_the_same_defaults():
         assert (one.opts, one.default, one.type) == (two.opts, two.default, two.type)
 
 
-def test_record_then_report_from_the_command_line(tmp_path):
-    model = tmp_path / "scene.xml"
+def test_record_then_report_from_the_command_line(lavender, tmp_path):
+    model, out, page = (tmp_path / name for name in ("scene.xml", "steps", "report"))
     model.write_text(scene())
-    out = tmp_path / "steps"
-    done = CliRunner().invoke(
-        cli, ["record", str(model), "--steps", "30", "--every", "15", "--out", str(out)]
-    )
-    assert done.exit_code == 0, done.output
-    assert "2 problems" in done.output
+    code, told, _ = lavender("record", model, "--steps", 30, "--every", 15, "--out", out)
+    assert code == 0 and "2 problems" in told
     assert len(list(out.glob("*.npz"))) == 2
-    wrong = CliRunner().invoke(
-        cli, ["record", str(model), "--controls", "no.npy", "--out", str(tmp_path / "o")]
-    )
-    page = tmp_path / "report"
-    words = [
-        "report",
-        str(model),
-        "--steps",
-        "30",
-        "--every",
-        "10",
-        "--controls",
-        "zero",
-        "--solvers",
-        "auto,newton",
-    ]
+    assert lavender("record", model, "--controls", "no.npy", "--out", tmp_path / "o")[0] == EXIT_BAD_INPUT
+    assert lavender("report", tmp_path / "none.xml", "--out", page)[0] == EXIT_BAD_INPUT
+    words = ("report", model, "--steps", 30, "--every", 10, "--controls", "zero", "--solvers", "auto,newton")
     for again in range(2):  # the second time nothing is recorded anew
-        shown = CliRunner().invoke(cli, [*words, "--no-figures", "--tables", "--out", str(page)])
-        assert shown.exit_code == 0, shown.output
-        assert ("3 problems" in shown.output) == (again == 0)
-        assert "Newton (inside the engine)" in shown.output
+        code, told, _ = lavender(*words, "--no-figures", "--tables", "--out", page)
+        assert code == 0 and ("3 problems" in told) == (again == 0)
+        assert "Newton" in told and "engine" in told  # in a row of its own, folded
     (own,) = (page / "recorded").glob("*-scene/engine.jsonl")
     lines = [json.loads(line) for line in own.read_text().splitlines()]
     assert len(lines) == 3
@@ -90,6 +70,3 @@ def test_record_then_report_from_the_command_line(tmp_path):
         row = text[text.index("Newton (inside the engine)") :][:400]
         assert "auto" in row or "newton" in row
     assert f"{max(line['relative'] for line in lines):.1e}" in (page / "summary.md").read_text()
-    missing = CliRunner().invoke(cli, ["report", str(tmp_path / "none.xml"), "--out", str(page)])
-    assert isinstance(missing.exception, lv.errors.InputError)
-    assert wrong.exit_code != 0

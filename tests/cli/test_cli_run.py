@@ -9,22 +9,18 @@ from click.testing import CliRunner
 
 from lavender.base.errors import LavenderError
 from lavender.cli import cli
+from lavender.io import load
 from lavender.sim.engine import Film
 from lavender.sim.web import pages
 
 
-def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsys):
-    from lavender.cli import main
-    from lavender.io import load
-
+def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_path):
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
     words = ["run", "stack", "--iterations", "8", "--no-warm-start", "--steps", "12", "--set", "n=2"]
     words += ["--order", "top_down", "--residual"]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
-    with pytest.raises(SystemExit) as code:
-        main([*words, *map(str, files)])
-    assert not code.value.code
-    printed = capsys.readouterr().out
+    code, printed, _ = lavender(*words, *files)
+    assert not code
     assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
     assert "order top_down" in printed.splitlines()[-1]
     table = np.genfromtxt(paths[0], delimiter=",", names=True, dtype=None, encoding="utf-8")
@@ -43,42 +39,28 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(tmp_path, capsy
         (["--stepper", "xpbd", "--order", "reverse"], "order reverse, "),
     ],
 )
-def test_the_last_line_says_solver_and_order(words, last, capsys):
-    from lavender.cli import main
-
-    with pytest.raises(SystemExit) as code:
-        main(["run", "stack", "--set", "n=2", "--steps", "3", *words])
-    assert not code.value.code
-    assert f" s, {last}" in capsys.readouterr().out.splitlines()[-1]
+def test_the_last_line_says_solver_and_order(words, last, lavender):
+    code, out, _ = lavender("run", "stack", "--set", "n=2", "--steps", "3", *words)
+    assert not code and f" s, {last}" in out.splitlines()[-1]
 
 
-def test_lavender_run_writes_films_and_pictures(tmp_path, capsys):
-    from lavender.cli import main
-
+def test_lavender_run_writes_films_and_pictures(lavender, tmp_path):
     for name in ("a.film", "a.gif"):
-        with pytest.raises(SystemExit) as code:
-            main(["run", "spinner", "--steps", "5", "--film", str(tmp_path / name)])
-        assert not code.value.code
-        assert name in capsys.readouterr().out
+        code, out, _ = lavender("run", "spinner", "--steps", "5", "--film", tmp_path / name)
+        assert not code and name in out
     assert len(Film.load(tmp_path / "a.film")) == 6
-    with pytest.raises(SystemExit) as code:
-        main(["view", str(tmp_path / "a.gif")])
-    assert code.value.code == 2
-    assert "no film" in capsys.readouterr().err
+    code, _, err = lavender("view", tmp_path / "a.gif")
+    assert code == 2 and "no film" in err
 
 
-def test_lavender_run_shows_itself_until_ctrl_c(monkeypatch, capsys):
-    from lavender.cli import main
+def test_lavender_run_shows_itself_until_ctrl_c(lavender, monkeypatch):
     from lavender.sim.web import view
 
     opened, waited = [], []
     monkeypatch.setattr("webbrowser.open", opened.append)
     monkeypatch.setattr(view.Viewer, "wait", lambda self: waited.append(len(self.film)))
-    with pytest.raises(SystemExit) as code:
-        main(["run", "spinner", "--steps", "4", "--view"])
-    assert not code.value.code
-    assert waited == [5]
-    assert opened[0] in capsys.readouterr().out
+    code, out, _ = lavender("run", "spinner", "--steps", "4", "--view")
+    assert not code and waited == [5] and opened[0] in out
 
 
 HERE = Path(__file__).resolve().parent

@@ -123,29 +123,25 @@ def test_long_names_that_differ_at_the_end_keep_files_of_their_own():
     assert len({file_name(item.name).lower() for item in items}) == len(items)
 
 
-def test_what_a_reader_raises_costs_its_own_case(lavender, tmp_path, monkeypatch):
-    for name in ("bad", "good"):
-        io.save(stack(), tmp_path / f"{name}.npz")
-    load = io.load
+@POSIX
+@pytest.mark.parametrize("bad", ["a reader that raises", "a pipe"])
+def test_what_cannot_be_read_costs_its_own_case_and_is_not_waited_for(bad, tmp_path, monkeypatch):
+    load, told = io.load, {"a reader that raises": "RecursionError: [/x]", "a pipe": "is no file"}[bad]
+    io.save(stack(), tmp_path / "good.npz")
+    if bad == "a pipe":
+        os.mkfifo(tmp_path / "bad.npz")
+    else:
+        io.save(stack(), tmp_path / "bad.npz")
 
     def broken(path, **more):
-        if "bad" in str(path):
+        if "bad" in str(path) and bad != "a pipe":
             raise RecursionError("[/x]")
         return load(path, **more)
 
     monkeypatch.setattr(io, "load", broken)
     records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
     assert {r.case for r in records} == {"good"}
-    assert ["RecursionError: [/x]" in s.reason for s in records.skips] == [True]
-
-
-@POSIX
-def test_a_pipe_among_the_problems_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "pipe.npz")
-    io.save(stack(), tmp_path / "good.npz")
-    records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
-    assert {r.case for r in records} == {"good"}
-    assert ["is no file" in s.reason for s in records.skips] == [True]
+    assert [told in s.reason for s in records.skips] == [True]
     os.mkfifo(tmp_path / "records.jsonl")
     with pytest.raises(lv.InputError, match="is no file"):
         bench.read(tmp_path)

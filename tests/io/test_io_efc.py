@@ -121,6 +121,20 @@ def test_arrays_in_float32_are_judged_by_their_own_floor(cone, condim):
     assert lv.solve_many(rough.batch, tol=1e-6).success.all()
 
 
+def test_a_triangle_of_the_mass_and_the_time_step_in_an_array_make_the_same_worlds():
+    model = mj.MjModel.from_xml_string(scene())
+    given = stacked(model, states_of(model, 3), np.float32)
+    ptr = np.append(model.M_rowadr, len(model.M_colind))
+    row = np.repeat(np.arange(model.nv), model.M_rownnz)
+    triangle = given["M"][:, row, model.M_colind], model.M_colind, ptr
+    whole = lv.io.from_efc(**given)
+    other = lv.io.from_efc(**given | {"M": triangle, "timestep": np.array([given["timestep"]])})
+    assert all(whole.batch[i] == other.batch[i] for i in range(3))
+    np.testing.assert_array_equal(whole.impulse, other.impulse)
+    with pytest.raises(lv.InputError, match="timestep"):
+        lv.io.from_efc(**given | {"timestep": np.array([0.1, 0.2])})
+
+
 def test_arrays_that_do_not_fit_say_so():
     model = mj.MjModel.from_xml_string(scene())
     given = stacked(model, states_of(model, 3), np.float32)

@@ -302,6 +302,7 @@ def test_what_fclib_cannot_hold_is_named(tmp_path):
         (heavy, {}, ["infinite mass"]),
         (pinned, {}, ["infinite inertia"]),
         (local_problem(), {"form": "global"}, ["given as a matrix"]),
+        (as_matrix(dragged(3, 4, shape="box")), {}, ["box"]),
     ]
     for problem, options, signs in cases:
         for sign in signs:
@@ -519,13 +520,3 @@ def test_without_h5py_the_extra_is_named(tmp_path, monkeypatch):
     ):
         with pytest.raises(lv.InputError, match=r"lavender-contact\[fclib\]"):
             act()
-
-
-def free(seed, contacts=4, friction="coulomb", mu=None):
-    return dragged(seed, contacts, mu, "box", friction)
-
-
-def test_fclib_has_no_boxes(tmp_path):
-    pytest.importorskip("h5py")
-    with pytest.raises(lv.LavenderError, match="box"):
-        as_matrix(free(3)).save(tmp_path / "box.hdf5")

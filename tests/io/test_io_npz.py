@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
-from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds
+from random_problems import CONTACTS, FORMS, random_contact_problem, random_lcp, seeds, touching
 from random_trees import random_general
 
 import lavender as lv
@@ -423,16 +423,13 @@ def test_a_broken_compressed_matrix_is_refused_in_memory_too(indices, indptr):
 
 
 def boxes(number):
-    """One box on four corners, turned."""
-    c, s = np.cos(0.3), np.sin(0.3)
-    given = {
-        "inv_mass": [0.5], "inv_inertia": [0.7 * np.eye(3)], "v_free": [[0.1, 0.0, -0.2, 0.0, 0.3, 0.0]],
-        "normal": np.tile([s, 0.0, c], (4, 1)), "tangent": np.tile([c, 0.0, -s], (4, 1)),
-        "arm_a": np.zeros((4, 3)),
-        "arm_b": [(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)],
-    }  # fmt: skip
-    given = {name: np.asarray(x, number) for name, x in given.items()}
-    return lv.Rows(contact_body=np.tile([-1, 0], (4, 1)), **given)
+    """One box on four corners."""
+    arms = np.array([(x, y, -0.5) for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
+    made = touching(
+        [[-1, 0]] * 4, arm_b=arms, v_free=[[0.1, 0.0, -0.2, 0.0, 0.3, 0.0]], inv_inertia=[0.7 * np.eye(3)]
+    )
+    whole = {f.name: np.asarray(getattr(made, f.name)) for f in dataclasses.fields(made) if f.name != "copy"}
+    return lv.Rows(**{k: x.astype(number) if x.dtype == float else x for k, x in whole.items()})
 
 
 def test_rows_in_float32_keep_their_precision_in_their_problem_and_its_file(tmp_path):

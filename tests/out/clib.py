@@ -10,6 +10,7 @@ from lavender.out import HEADER
 from lavender.out.header import struct_fields
 from lavender.out.view import METHODS, view
 
+SWEEPS = ("sequential_impulses", "pgs", "block_gauss_seidel", "anderson", "nncg")  # under friction too
 COUNTS = (
     "form",
     "law",
@@ -76,11 +77,16 @@ class Library:
             setattr(made, key, None if values is None or not values.size else values.ctypes.data)
         return made
 
-    def open(self, problem, options, extra=0):
+    def room(self, problem, options):
+        """Bytes that a solver asks for."""
         room = ct.c_uint64()
         code = self.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room))
         if code:
             raise Refused(self, code)
+        return room
+
+    def open(self, problem, options, extra=0):
+        room = self.room(problem, options)
         while True:
             memory = (ct.c_double * ((room.value + extra) // 8 + 2))()
             solver = ct.c_void_p()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from clib import Options, Problem, Result, Verdict
+from clib import COUNTS, SWEEPS, Options, Problem, Result, Verdict
 from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
@@ -46,9 +46,7 @@ class Guarded:
 
 def opened(library, method="sequential_impulses"):
     problem, options = library.problem(self_test_problem()), library.options(method)
-    room = ct.c_uint64()
-    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-    solver = Guarded(library, problem, options, room.value)
+    solver = Guarded(library, problem, options, library.room(problem, options).value)
     assert solver.code == 0
     return solver, problem
 
@@ -177,10 +175,9 @@ def test_null_and_no_solver_are_told_apart(library):
     "method", ["sequential_impulses", "block_gauss_seidel", "anderson", "nncg", "newton", "admm"]
 )
 def test_too_little_room_is_said_and_nothing_is_written_behind_it(library, method):
-    problem, options, room = library.problem(self_test_problem()), library.options(method), ct.c_uint64()
-    seen = set()
-    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-    for bytes_ in [*range(0, room.value, room.value // 40), room.value]:
+    problem, options = library.problem(self_test_problem()), library.options(method)
+    seen, room = set(), library.room(problem, options).value
+    for bytes_ in [*range(0, room, room // 40), room]:
         solver = Guarded(library, problem, options, bytes_)
         if solver.code == 0:
             code = library.c.lav_set(solver.at, ct.byref(problem))
@@ -222,7 +219,7 @@ def test_memory_alone_binds_and_needed_suffices_wherever_nothing_is_guessed(libr
             assert c.lav_move(solver.at, memory, ct.c_uint64(needed), ct.byref(at)) == 0
             solver.at, solver.memory, asked = at, memory, asked + 1
             code = solver.set(problems[1])
-        assert code == 0 and asked <= (1 if method in SWEEPS else 3)
+        assert code == 0 and asked <= (1 if method in (*SWEEPS, "sor", "gauss_seidel", "jacobi") else 3)
         grown += asked
         same = int(np.searchsorted(many.cones.ptr, few.m, side="right")) - 1  # blocks of the same keys
         if np.array_equal(many.cones.kind[:same], few.cones.kind[:same]) and same == few.n_blocks:
@@ -265,7 +262,7 @@ def test_a_second_caller_in_one_solver_is_turned_away(library):
 @pytest.mark.parametrize("form, method", [(1, "direct"), (2, "anderson"), (3, "newton")])
 def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, method):
     # Addresses that nothing may be read from: whoever does ends this process.
-    problem, options, room = Problem(), library.options(method), ct.c_uint64()
+    problem, options = Problem(), library.options(method)
     ptr = np.arange(0, 39, 3, dtype=np.int32)
     library.c.lav_default_problem(form, ct.byref(problem))
     for key, kind in Problem._fields_:
@@ -273,8 +270,7 @@ def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, me
             setattr(problem, key, ptr.ctypes.data if (form, key) == (2, "block_ptr") else 8)
     problem.n_rows, problem.n_blocks, problem.n_bodies, problem.n_joints = 30, 12, 5, 2
     problem.n_velocities, problem.n_entries, problem.n_mass_entries = 30, 60, 40
-    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-    assert Guarded(library, problem, options, room.value).code == 0
+    assert Guarded(library, problem, options, library.room(problem, options).value).code == 0
 
 
 SCRIPT = """
@@ -338,16 +334,6 @@ def stack_of(n):
     return lv.Problem.from_rows(rows, mu=0.5, tangents=2)
 
 
-SWEEPS = (
-    "sequential_impulses",
-    "pgs",
-    "sor",
-    "gauss_seidel",
-    "jacobi",
-    "block_gauss_seidel",
-    "anderson",
-    "nncg",
-)
 SMALL = st.integers(-2, 9)
 WHOLE = st.lists(st.integers(-3, 12), min_size=0, max_size=12)
 REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_size=12)
@@ -359,16 +345,7 @@ def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, 
     problem, keep = Problem(), []
     form, method = data.draw(st.integers(1, 3)), data.draw(st.integers(1, 12))
     library.c.lav_default_problem(form, ct.byref(problem))
-    for key in (
-        "law",
-        "n_blocks",
-        "n_rows",
-        "n_entries",
-        "n_bodies",
-        "n_joints",
-        "n_velocities",
-        "n_mass_entries",
-    ):
+    for key in COUNTS[1:]:
         setattr(problem, key, data.draw(SMALL))
     for key, _ in Problem._fields_[10:]:
         if data.draw(st.booleans()):
@@ -413,11 +390,10 @@ def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, 
 def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, method, iterations, tol):
     bodies = random_contact_problem(seed, "cone" if seed % 2 else "coulomb", bodies=4, contacts=6, joints=1)
     for given in (bodies, as_matrix(bodies), random_lcp(seed, m=9)):
-        problem, options, room = library.problem(given), library.options(method), ct.c_uint64()
+        problem, options = library.problem(given), library.options(method)
         if library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
-        assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-        code = -10
+        room, code = library.room(problem, options), -10
         while code == -10:  # what a factor fills is known with the numbers
             solver = Guarded(library, problem, options, room.value)
             code = library.c.lav_set(solver.at, ct.byref(problem))

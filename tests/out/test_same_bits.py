@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 import random_problems as rp
-from clib import METHODS, Motion, Refused, run
+from clib import METHODS, SWEEPS, Motion, Refused, run
 from tower import self_test_hash, self_test_problem
 
 import lavender as lv
@@ -121,9 +121,6 @@ def test_every_method_has_the_bits_of_the_package(library, at):
     assert ran >= 4
 
 
-SWEEPS = ("pgs", "sequential_impulses", "block_gauss_seidel", "anderson", "nncg")
-
-
 def dense_velocities():
     """J and a full M, so few velocities that sweeps over A cost less: the package forms it."""
     for seed, friction in itertools.product(range(4), ("coulomb", "cone")):
@@ -198,13 +195,12 @@ def test_orders_of_a_sweep(library, order):
 def test_room_is_what_a_method_takes_where_nothing_is_guessed(library, method):
     looked = 0
     for given in GIVEN:
-        problem, options, room = library.problem(given), library.options(method), ct.c_uint64()
+        problem, options = library.problem(given), library.options(method)
         if given.generalized is not None or library.c.lav_takes(ct.byref(problem), ct.byref(options)):
             continue
-        assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-        solver = library.open(problem, options)
+        room, solver = library.room(problem, options).value, library.open(problem, options)
         needed = library.c.lav_needed(solver.at)
-        assert needed <= room.value <= 1.05 * needed + 8192, (given.m, given.n_blocks)
+        assert needed <= room <= 1.05 * needed + 8192, (given.m, given.n_blocks)
         looked += 1
     assert looked >= 3
 
@@ -217,9 +213,8 @@ def test_room_of_pivots_counts_the_bodies_that_no_row_moves(library, method, n_b
         jac=np.tile(np.eye(12)[6], (2, 1)), joint_ptr=[0, 1, 2], joint_body=[[-1, 0], [-1, 1]],
     )  # fmt: skip
     problem = library.problem(lv.Problem.from_rows(rows, target=2.0, lower=0.0))
-    options, room = library.options(method), ct.c_uint64()
-    assert library.c.lav_room(ct.byref(problem), ct.byref(options), ct.byref(room)) == 0
-    assert library.c.lav_needed(library.open(problem, options).at) <= room.value
+    options = library.options(method)
+    assert library.c.lav_needed(library.open(problem, options).at) <= library.room(problem, options).value
 
 
 @pytest.mark.parametrize("options", [{"memory": 2}, {"sweep": 2}, {"convex": 5}])

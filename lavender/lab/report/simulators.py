@@ -14,6 +14,7 @@ __all__ = ["table", "warm_table"]
 
 S = TypeVar("S", bound=WarmStep)
 PARTS = ("ours", "many", "kernel", "prepare", "judge")  # of one call, over MuJoCo's time
+OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
 CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
 
 
@@ -72,7 +73,10 @@ def table(steps: Sequence[Step]) -> str:
     errors = Table(
         ["next step, relative error", "MuJoCo, median", "worst", "ours, median", "worst"], next_step
     )
-    return "\n".join([*markdown(Table(heads, rows)), "", told, "", *markdown(errors)])
+    start = (
+        f"Cold, both sides from nothing, to a judged residual of {TARGET:.0e}. From `one call` on: {OVER}."
+    )
+    return "\n".join([start, "", *markdown(Table(heads, rows)), "", told, "", *markdown(errors)])
 
 
 def warm_table(steps: Sequence[WarmStep]) -> str:
@@ -88,6 +92,9 @@ def warm_table(steps: Sequence[WarmStep]) -> str:
         for name, part in _by_class(steps)
     ]
     residuals = ["MuJoCo's residual, median", "worst", "ours, median", "worst"]
-    return "\n".join(
-        markdown(Table(["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals], rows))
+    start = (
+        "Warm, each side from its own last step, MuJoCo at the model's tolerance, lavender to "
+        f"{TARGET:.0e}. `one call`: {OVER}."
     )
+    heads = ["rows", "models", "steps", "MuJoCo [µs]", "one call", *residuals]
+    return "\n".join([start, "", *markdown(Table(heads, rows))])

@@ -11,7 +11,6 @@ from lavender import registry
 from lavender.judge.certificates import check_certificate, prove
 
 OURS = lv.available(external=False)
-OPEN = lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
 
 
 def opposed(eps):

@@ -5,13 +5,14 @@ their bits.
 """
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from random_problems import CONTACTS, FORMS, seeds
+from random_problems import CONTACTS, FORMS, random_contact_problem, seeds
 
 import lavender as lv
 
@@ -20,10 +21,21 @@ exponents = st.tuples(*[st.integers(-110, 110)] * 3)
 near = st.tuples(*[st.integers(-40, 40)] * 3)
 
 
+def joints(seed, friction, free=False, **sizes):
+    """Rows of joints alone, bounded or free."""
+    made = random_contact_problem(seed, friction, bodies=4, joints=4, contacts=0)
+    ends = np.full(made.m, np.inf)
+    cones = replace(made.cones, lower=-ends, upper=ends) if free else made.cones
+    return replace(made, cones=cones, compliance=made.compliance + 0.1)
+
+
+KINDS = CONTACTS | {"bounded rows": joints, "free rows": partial(joints, free=True)}
+
+
 def drawn(kind, form, seed):
     """A problem given in this form, and which of its rows turn: their speeds are angular."""
     friction = ("coulomb", "cone")[seed % 2]
-    rows = CONTACTS[kind](seed, friction, bodies=3, joints=1, contacts=3)
+    rows = KINDS[kind](seed, friction, bodies=3, joints=1, contacts=3)
     turns = np.zeros(rows.m, bool)
     turns[rows.cones.spin_rows[rows.cones.spin_rows >= 0]] = True
     for k in (0, 1):
@@ -111,7 +123,7 @@ def fits(numbers, sizes):
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("kind", CONTACTS)
+@pytest.mark.parametrize("kind", KINDS)
 @given(seed=seeds, exponent=exponents | near)
 @settings(max_examples=25)
 def test_a_problem_in_any_units_is_refused_by_name_or_judged_alike(kind, form, seed, exponent):
@@ -130,7 +142,7 @@ def test_a_problem_in_any_units_is_refused_by_name_or_judged_alike(kind, form, s
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("kind", CONTACTS)
+@pytest.mark.parametrize("kind", KINDS)
 @given(seed=seeds, exponent=near)
 @settings(max_examples=3)
 def test_every_solver_solves_a_problem_in_any_units_alike(kind, form, seed, exponent):

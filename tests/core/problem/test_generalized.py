@@ -239,14 +239,7 @@ def test_a_round_cone_is_one_cone(tangents):
     problem = random_general(13, "cone", tangents=tangents)
     solution = lv.solve(problem, "newton", tol=1e-11)
     assert solution.residual.relative <= max(1e-11, 2 * solution.residual.floor)
-    lam, w, c = solution.impulse, solution.slack, problem.cones
-    for i in np.flatnonzero(c.kind == lv.ROUND):
-        j, end = c.ptr[i], c.ptr[i + 1]
-        # In the cone, in its dual, and at right angles: what (de)fines the solution, without any metric.
-        assert np.linalg.norm(lam[j + 1 : end]) <= c.mu[i] * lam[j] * (1 + 1e-8) + 1e-9
-        assert c.mu[i] * np.linalg.norm(w[j + 1 : end]) <= w[j] * (1 + 1e-8) + 1e-9
-        assert abs(lam[j:end] @ w[j:end]) < 1e-8
-    assert problem.row_name(int(c.ptr[4]) + 3).endswith("spin")
+    assert problem.row_name(int(problem.cones.ptr[4]) + 3).endswith("spin")
     with pytest.raises(lv.InputError, match="no Coulomb law"):
         problem.relaxed("coulomb")
     takes = {name for name, spec in registry.specs().items() if spec.round_cones}
@@ -254,28 +247,6 @@ def test_a_round_cone_is_one_cone(tangents):
     for name, reason in lv.known(problem).items():
         if "cone" in registry.specs()[name].laws and name not in takes:
             assert reason and ("round cones" in reason or "pip install" in reason)
-
-
-# -- many at once -------------------------------------------------------------------------------------
-
-
-def test_many_start_where_they_are_told():
-    problem = random_general(4, "cone")
-    cold = lv.solve(problem, tol=1e-9)
-    warm = lv.solve_many([problem, problem], impulses=[cold.impulse, None], tol=1e-8)
-    assert warm[0].iterations == 0
-    assert warm[1].iterations > 0
-    with pytest.raises(lv.InputError, match="one Problem; a list"):
-        lv.solve_many(problem)
-    with pytest.raises(lv.InputError, match="1 impulses for 2"):
-        lv.solve_many([problem, problem], impulses=[None])
-    with pytest.raises(lv.InputError, match="threads is 0"):
-        lv.solve_many([problem], threads=0)
-    with pytest.raises(lv.UnknownName):
-        lv.solve_many([problem], "pgss")
-    with pytest.raises(lv.InputError):
-        lv.solve_many([3])
-    assert len(lv.solve_many([])) == 0
 
 
 def test_updated_is_the_same_structure_with_new_numbers():
@@ -299,13 +270,14 @@ def test_updated_is_the_same_structure_with_new_numbers():
         problem.updated(J=jac[:, 1:], target=0.0)
 
 
-def test_nothing_of_the_judge_forms_a():
+def test_nothing_of_the_judge_forms_a(monkeypatch):
     problem = random_general(6, "cone")
+    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
     solution = lv.solve(problem, tol=1e-8)
     lv.residual(problem, solution.impulse)
     problem.velocity(solution.impulse)
-    assert "csr_data" not in problem.__dict__
-    assert "_compressed" not in problem.__dict__
+    with pytest.raises(TypeError):
+        _ = problem.csr
 
 
 @given(seed=seeds)

@@ -158,6 +158,8 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
     assert replace(now, key=None).carry((before, impulse), keys=[9, 5, 7, 2]).tolist() == wanted
     solution = lv.solve(before, tol=1e-9)
     assert np.array_equal(before.carry(solution), solution.impulse)
+    three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
+    assert three.carry((three, np.ones(3))).all() and not four.carry((three, np.ones(3))).any()
     assert np.array_equal(replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (
         (np.zeros(7), None, "a Solution"),

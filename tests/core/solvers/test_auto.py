@@ -184,25 +184,6 @@ def test_the_result_is_not_judged_twice(solver, monkeypatch):
     assert not found  # what the solver had judged last is what it hands over
 
 
-def test_an_impulse_beside_which_float64_loses_b_is_no_solution():
-    """Two contacts that no impulse serves: sweeps run away along A's null space until A lambda - b rounds to 0."""
-    row = np.array([-0.1, 2.6, 0.7, 1.4])
-    problem = lv.Problem.contact(np.outer(row, row), [1.5, 0.0, -1.6, -0.1], [0.8, 0.5])
-    swept = lv.solve(problem, "anderson")
-    assert not swept.success and not swept.contradicted
-    found = lv.solve(problem)
-    assert found.status is lv.Status.INFEASIBLE and not found.contradicted
-
-
-def test_a_budget_that_was_used_up_in_vain_still_asks_for_a_certificate():
-    row = np.array([-0.1, 2.6, 0.7, 1.4])
-    problem = lv.Problem.contact(np.outer(row, row), [1.5, 0.0, -1.6, -0.1], [0.8, 0.5])
-    found = lv.solve(problem, max_iter=20_000)
-    assert found.iterations <= 20_000
-    assert found.status is lv.Status.INFEASIBLE
-    assert found.turns[-1].solver == "linear program"
-
-
 @pytest.mark.parametrize("budget", [1, 2, 3, 5, 10])
 def test_a_turn_of_newton_takes_no_step_more_than_is_left(budget):
     # A step is two factorisations here, the first of which fails; drawn, and made smaller.

@@ -192,6 +192,8 @@ def test_what_late_worlds_take_is_counted_by_their_size(stacked, clock):
         worlds = lv.Batch(jac, mass, free, cones=worlds[0].cones)
     within, without = (lv.solve_many(worlds, time_limit=limit) for limit in (5e-4, 10.0))
     assert not within.iterations.any() and all(status is lv.Status.TIME_LIMIT for status in within.status)
+    for i in (0, 9):  # the start, and doing nothing is not better than it is
+        assert not within[i].impulse.any() and within[i].residual.relative == within.relative[i] == 1.0
     assert without.success.all()
 
 
@@ -276,5 +278,5 @@ def test_auto_forms_no_dense_a_beyond_its_limit(contacts, velocities, monkeypatc
         jac, mass, 2.0 * rng.normal(size=velocities), cones=lv.Cones.contacts(0.5, count=contacts)
     )
     limit = residuals.setup_time(problem) + judging_time(problem) + 0.5 * forming(problem)
-    lv.solve(problem, time_limit=limit)
-    assert "_compressed" not in vars(problem)
+    monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by
+    assert lv.solve(problem, time_limit=limit).residual.relative <= 1.0

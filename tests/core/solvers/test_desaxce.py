@@ -11,7 +11,6 @@ from twins import block_diagonal
 
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
-from lavender_ext.core.problem import LAWS
 
 
 def dense_h(system):
@@ -78,22 +77,3 @@ def test_the_system_of_a_step_is_solved(form, compliant, seed):
         # W holds entries up to 1e10 of delta's reciprocal beside 1: what the dense inverse keeps of 16 digits.
         np.testing.assert_allclose(x, expected, rtol=0, atol=2e-5 * np.abs(expected).max())
         assert solve.advance()[0]
-
-
-@pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
-@given(seed=seeds)
-@settings(max_examples=15)
-def test_augmented_system_is_the_same_newton_system(law, seed):
-    problem = problem_of(seed, True, "cone" if law == LAWS["cone"] else "coulomb")
-    system = make_system(problem, "velocity")
-    solve = system.solve
-    m = solve.m
-    rng = np.random.default_rng(seed)
-    z, r = rng.normal(size=m), rng.normal(size=m)
-    solve.natural(z, solve.times(z) - system.solve.g, law, 1e-3)
-    assert solve.factor("natural", 1e-3, augmented=True)
-    p = block_diagonal(system, solve.p)
-    matrix = np.eye(m) - p + p @ (dense_h(system) + 1e-3 * np.eye(m))
-    x = solve.solve("natural", r)
-    # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
-    np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))

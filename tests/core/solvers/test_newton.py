@@ -68,14 +68,14 @@ def test_a_problem_is_scaled_by_its_definition(form, seed):
 
 
 @pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
+@pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
 @settings(max_examples=20)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(
         seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10
     )
-    system = system_in(problem, form)
+    system = system_in(problem, "velocity" if form == "augmented" else form)
     solve = system.solve
     m, g, eps = solve.m, solve.g, 1e-3
     rng = np.random.default_rng(seed)
@@ -95,7 +95,7 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
         # Central differences: third derivatives near the tip of a cone times step^2, rounding over step.
         np.testing.assert_allclose(difference, slope, rtol=0, atol=1e-5 * (1.0 + np.abs(slope).max()))
     solve.natural(z, solve.times(z) - g, law, eps)
-    assert solve.factor("natural", eps)
+    assert solve.factor("natural", eps, augmented=form == "augmented")
     r = rng.normal(size=m)
     x = solve.solve("natural", r)
     matrix = np.eye(m) + block_diagonal(system, solve.p) @ (
@@ -343,12 +343,6 @@ def test_a_chain_of_bodies_does_not_fill_in():
     body[5::9, 0] = -1
     layout = Layout(np.ascontiguousarray(body, np.int32), n, 1)
     assert layout.lptr[n] == layout.nptr[n] - n
-
-
-# -- answers ------------------------------------------------------------------------------------------
-
-
-# -- claims -------------------------------------------------------------------------------------------
 
 
 def sparse_rows(seed, m=500, even=True, near=3):

@@ -26,6 +26,15 @@ REFUSED = {
     "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
     "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
     "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
+    "a start too few": (
+        lambda: lv.solve_many([TINY] * 2, impulses=[None]),
+        lv.InputError,
+        "1 impulses for 2",
+    ),
+    "one for many": (lambda: lv.solve_many(TINY), lv.InputError, "one Problem; a list"),
+    "many of a name": (lambda: lv.solve_many([TINY], "pgss"), lv.UnknownName, "pgs"),
+    "many numbers": (lambda: lv.solve_many([3]), lv.InputError, "Problem"),
+    "many by no thread": (lambda: lv.solve_many([TINY], threads=0), lv.InputError, "threads is 0"),
     "threads without colours": (lambda: lv.solve(TINY, "pgs", threads=2), lv.InputError, "colored"),
     "no thread": (
         lambda: lv.solve(TINY, "pgs", order="colored", threads=0),

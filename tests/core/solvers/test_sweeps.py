@@ -1,5 +1,6 @@
 """Sweep solvers against a dense slow twin, each other, and closed forms."""
 
+import judge_twin
 import numpy as np
 import pytest
 import twins
@@ -15,9 +16,9 @@ from lavender.problem.ordering import ORDERS
 @given(seed=seeds)
 def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
     problem = CONTACTS[kind](seed)
-    lam, a = problem.start(), problem.dense()
+    lam, twin = problem.start(), judge_twin.Problem(judge_twin.spec_of(problem))
     for _ in range(5):
-        twins.sweep(problem, a, lam, range(problem.n_blocks))
+        twins.sweep(problem, twin, lam, range(problem.n_blocks))
     # 1e-12 of the largest impulse: a few hundred roundings, none amplified; of J and M those of their inverses.
     size = np.abs(lam).max()
     if lv.get("sequential_impulses").refuses(problem) is None:

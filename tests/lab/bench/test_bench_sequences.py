@@ -10,19 +10,6 @@ from lavender.lab.bench.running import runner
 from lavender.lab.report import contents, tables
 
 
-def test_impulses_travel_by_key():
-    a = np.diag([1.0, 2.0, 3.0, 4.0])
-    before = lv.Problem.contact(a, np.ones(4), np.full(2, 0.5), key=np.array([7, 9], np.uint64))
-    after = lv.Problem.contact(np.eye(6), np.ones(6), np.full(3, 0.5), key=np.array([9, 8, 7], np.uint64))
-    out = bench.carry(before, np.array([1.0, 2.0, 3.0, 4.0]), after)
-    np.testing.assert_array_equal(out, [3.0, 4.0, 0.0, 0.0, 1.0, 2.0])
-    # A contact that gained a row starts anew; without keys, the same blocks keep their places.
-    grown = lv.Problem.contact(np.eye(3), np.ones(3), np.full(1, 0.5), key=np.array([7], np.uint64))
-    np.testing.assert_array_equal(bench.carry(before, np.ones(4), grown), np.zeros(3))
-    np.testing.assert_array_equal(bench.carry(stack(3), np.ones(3), stack(3)), np.ones(3))
-    np.testing.assert_array_equal(bench.carry(stack(3), np.ones(3), stack(4)), np.zeros(4))
-
-
 def test_a_sequence_carries_each_solvers_own_impulses():
     problems = moving_stack(5)
     plan = bench.Plan(levels=(1e-6,), budgets=(6,), repeats=1)

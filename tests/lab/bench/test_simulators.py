@@ -7,20 +7,12 @@ from lavender.lab.report import simulators as tables
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
 
-MODEL = """<mujoco><option timestep="0.004"/><worldbody><geom type="plane" size="0 0 1"/>
-  <body pos="0 0 .1"><freejoint/><geom type="box" size=".1 .1 .1"/>
-    <body><joint name="arm" range="-30 30" limited="true"/>
-      <geom type="capsule" fromto="0 0 .1 .3 0 .1" size=".03"/></body>
-  </body></worldbody><actuator><motor joint="arm" gear="2"/></actuator></mujoco>"""
 
-
-def test_both_sides_solve_every_step_to_the_same_residual(tmp_path):
-    model = tmp_path / "arm.xml"
-    model.write_text(MODEL)
-    steps = simulators.measure(mj, model, 3, 10)
+def test_both_sides_solve_every_step_to_the_same_residual(boxes):
+    steps = simulators.measure(mj, boxes(), 3, 10)
     assert len(steps) == 3
     for s in steps:
-        assert s.model == "arm"
+        assert s.model == "boxes"
         assert s.rows > 0
         assert max(s.residual, s.engine_residual) <= simulators.TARGET
         assert s.strict <= simulators.STRICT

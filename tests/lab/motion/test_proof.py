@@ -13,76 +13,20 @@ from lavender.lab.proof import island, operator, search
 from lavender.lab.proof.numbers import Balls
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
-from tests.random_problems import random_contact_problem
+from tests.kkt_truth import Exact
+from tests.random_problems import general, random_contact_problem
 
 flint = pytest.importorskip("flint", reason="python-flint (extra proof) is not installed")
-
-
-def planted(seed, friction="coulomb"):
-    """(problem, exact solution): whole numbers throughout, so that b = A x - w is exact; slides go along (3, 4) / 5."""
-    rng = np.random.default_rng(seed)
-    contacts, bounded = int(rng.integers(1, 4)), int(rng.integers(0, 4))
-    m = bounded + 3 * contacts
-    root = rng.integers(-3, 4, (m, m)).astype(float)
-    a = root @ root.T + np.eye(m) * 4.0
-    x, w = np.zeros(m), np.zeros(m)
-    lower, upper = np.zeros(bounded), np.full(bounded, 64.0)
-    for i in range(bounded):
-        case = rng.integers(0, 3)
-        x[i] = (float(rng.integers(1, 60)), 0.0, 64.0)[case]
-        w[i] = (0.0, 1.0, -1.0)[case] * rng.integers(1, 9)
-    for i in range(bounded, m, 3):
-        case = rng.integers(0, 3)
-        if case == 0:  # open
-            w[i : i + 3] = rng.integers(8, 16), *rng.integers(-3, 4, 2)
-        elif case == 1:  # sticks
-            x[i : i + 3] = rng.integers(20, 40), *rng.integers(-5, 6, 2)
-        else:  # slides: |x_t| = x_n / 2 against w_t
-            size, speed = 10.0 * rng.integers(1, 5), 5.0 * rng.integers(1, 5)
-            turn = np.array([3.0, 4.0]) * rng.choice([-1, 1], 2)
-            x[i], x[i + 1 : i + 3] = size, -0.5 * size * turn / 5.0
-            w[i], w[i + 1 : i + 3] = (0.5 * speed if friction == "cone" else 0.0), speed * turn / 5.0
-    cones = lv.Cones.bounded(lower, upper) + lv.Cones.contacts(0.5, count=contacts)
-    return lv.Problem(a @ x - w, cones, a, friction=friction), x
-
-
-@pytest.mark.parametrize("friction", ["coulomb", "cone"])
-def test_a_planted_solution_lies_inside(friction):
-    """And no answer that is off by s is proven with a radius below s."""
-    proven = 0
-    for seed in range(150):
-        problem, exact = planted(seed, friction)
-        rng = np.random.default_rng(seed)
-        given = exact.copy()
-        given[rng.integers(problem.m)] += 10.0 ** rng.integers(-12, -3)
-        off = abs(given - exact).max()  # exact: they are near each other
-        found = lv.prove(problem, given)
-        if found.proven:
-            proven += 1
-            # Coulomb's law may have another solution nearer: then this one is outside, and the radius is still true.
-            if friction == "cone" or found.unique or np.allclose(found.impulse, exact, atol=1e-6):
-                assert off <= found.impulse_radius <= off * (1 + 1e-9) + 1e-30
-                assert np.allclose(found.impulse, exact, rtol=1e-15, atol=1e-25)
-        else:
-            assert found.impulse_radius == np.inf and found.reason
-    assert proven >= 148
 
 
 def test_a_linear_problem_beside_rational_numbers():
     """lambda = A^-1 b by fractions is within what was proven, for well and badly conditioned A."""
     for condition in ("10", "1e6", "1e12"):
         problem = suite.case(f"random_spd(n=12, condition={condition})").problem
-        a = [[Fraction(x) for x in row] for row in problem.dense().tolist()]
-        b = [Fraction(x) for x in problem.b.tolist()]
-        for k in range(12):  # Gauss-Jordan
-            scale = 1 / a[k][k]
-            a[k], b[k] = [x * scale for x in a[k]], b[k] * scale
-            for i in set(range(12)) - {k}:
-                f = a[i][k]
-                a[i], b[i] = [x - f * y for x, y in zip(a[i], a[k], strict=True)], b[i] - f * b[k]
+        exact = Exact.solve(Exact.array(problem.dense()), Exact.array(problem.b))
         solution = lv.solve(problem, "direct", tol=1e-12)
         found = lv.prove(problem, solution)
-        off = max(abs(Fraction(x) - y) for x, y in zip(solution.impulse.tolist(), b, strict=True))
+        off = max(abs(Fraction(x) - y) for x, y in zip(solution.impulse.tolist(), exact, strict=True))
         assert found.proven and off <= Fraction(found.impulse_radius) <= off * 2 + Fraction(1, 10**25)
 
 
@@ -117,31 +61,11 @@ def test_every_kind_of_contact_and_form(friction, rolling):
         assert found.velocity_radius <= 1e-9
         dense = lv.Problem(problem.b, problem.cones, problem.dense(), friction=friction)
         csr = lv.Problem(problem.b, problem.cones, sp.csr_array(problem.dense()), friction=friction)
-        for other in (dense, csr):
+        for other in (dense, csr, general(problem)):
             again = lv.prove(other, solution)
             # A was rounded: another problem, whose solution is off by some 1e-16 times the condition.
             assert again.proven and np.allclose(again.impulse, found.impulse, atol=1e-9)
     assert proven >= 10
-
-
-@pytest.mark.parametrize("shape", ["box", "disk"])
-def test_ellipses_and_boxes(shape):
-    cones = lv.Cones.contacts([(0.2, 0.7)] * 2, shape=shape)
-    a = np.eye(6) * 2.0 + 0.25
-    for friction in ("coulomb", "cone"):
-        for b in ([3.0, 1.0, 4.0, 2.0, 0.1, 0.1], [3.0, -5.0, 4.0, -2.0, 0.3, 0.0]):
-            problem = lv.Problem(b, cones, a, friction=friction)
-            found = lv.prove(problem, lv.solve(problem, tol=1e-13))
-            assert found.proven and found.velocity_radius < 1e-11, found
-            assert lv.residual(problem, found.impulse).relative < 1e-14
-
-
-def test_generalised_coordinates():
-    rng = np.random.default_rng(0)
-    j, m = rng.normal(size=(9, 12)), np.eye(12) * 3.0 + 0.5
-    problem = lv.Problem.from_jacobian(j, m, rng.normal(size=12), cones=lv.Cones.contacts(0.5, count=3))
-    found = lv.prove(problem, lv.solve(problem, tol=1e-13))
-    assert found.proven and found.velocity_radius < 1e-12
 
 
 def test_a_border_is_named():
@@ -175,7 +99,7 @@ def test_a_twin_in_rational_numbers_finds_nothing_false(first):
     tried = [proof_twin.attack(seed) for seed in range(first, first + 50)]
     assert not [wrong for _, _, wrong in tried if wrong]
     near = [held for label, held, _ in tried if label in ("strict exact", "strict near", "strict noise")]
-    assert sum(near) >= 0.9 * len(near) > 0
+    assert sum(near) >= 0.95 * len(near) > 0
 
 
 def test_sparse_numbers_prove_nothing_false_either(monkeypatch):

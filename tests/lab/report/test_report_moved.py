@@ -3,12 +3,11 @@
 import csv
 import json
 import math
-import os
-import shutil
 from dataclasses import replace
 
 import pytest
 from stacks import idle_problem
+from worked import chromium
 
 import lavender as lv
 from lavender import bench, report
@@ -177,11 +176,7 @@ def test_figures_by_motion_error_hold_the_speeds_of_the_records(records):
 def test_one_switch_changes_the_axes_of_all_charts(records, tmp_path, script):
     """In a real browser, also without JavaScript, and as it is printed."""
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    found = os.environ.get("CHROMIUM") or next(
-        filter(None, map(shutil.which, ("chromium", "google-chrome"))), None
-    )
-    if found is None:
-        pytest.skip("no Chromium is installed, and CHROMIUM names no browser")
+    found = chromium()
     index = write(records, tmp_path, figures=False)
     with playwright.sync_playwright() as p:
         browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"])

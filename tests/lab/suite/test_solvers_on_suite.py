@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from calls import SHORT, SPENT, STUCK, check, driven, says
-from random_problems import CONTACTS, FORMS, as_matrix
+from random_problems import CONTACTS, GIVEN, as_matrix
 from scipy.linalg import block_diag
 
 import lavender as lv
@@ -17,10 +17,6 @@ from lavender.lab.suite.families import granular
 from lavender.solvers.auto import Auto
 from lavender.solvers.jacobi import Jacobi
 from lavender.solvers.registry import SMALL_ROWS
-
-GIVEN = FORMS | {
-    "dense": lambda p: lv.Problem(p.b, p.cones, p.dense(), friction=p.friction, guess=np.zeros(p.m))
-}
 
 
 @pytest.mark.parametrize("form", GIVEN)

@@ -141,24 +141,3 @@ def test_sweeps_per_decade_is_nan_where_it_has_no_meaning():
     nothing = [lv.solve(problem, "pgs", tol=0.0, max_iter=9), lv.solve(problem, "newton"), lv.solve(problem)]
     nothing.append(lv.solve(suite.case("infeasible(kind=squeeze)").problem, "pgs"))
     assert all(math.isnan(solution.sweeps_per_decade) for solution in nothing)
-
-
-@pytest.mark.parametrize("name", ["pgs", "jacobi", "anderson", "nncg"])
-@pytest.mark.parametrize("text", ["infeasible(kind=squeeze)", "anisotropic(ratio=1e6, speed=3)"])
-def test_where_it_stalls_depends_on_no_cut(name, text):
-    """Cut into runs of seven sweeps, a run ends at the same sweep with the same claim and the same bits."""
-    problem = suite.case(text).problem
-    if registry.get(name).refuses(problem):
-        pytest.skip("not of this solver")
-    whole = lv.solve(problem, name)
-    solver = registry.get(name).load()()
-    state, impulse, done = solver.prepare(problem), problem.start(), 0
-    while True:
-        claim = solver.run(state, impulse, min(7, 1000 - done), 1e-6, None)
-        done += claim.iterations
-        if claim.status is not lv.Status.MAX_ITERATIONS or done == 1000:
-            break
-    assert done == whole.iterations
-    if not whole.success:
-        assert claim.status is whole.status
-        np.testing.assert_array_equal(impulse, whole.impulse)

@@ -232,30 +232,14 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
         sim.step()
     assert sim.steps == 3
     assert sim.last_solution is None
-    for name in CARRIED:
-        np.testing.assert_array_equal(sim.state.a[name], before.a[name], err_msg=name)
+    before.head[HEAD["solved"]] = 0
+    for name in before.a if at > 1 else CARRIED:  # the first substep forms its problem anew
+        assert sim.state.a[name].tobytes() == before.a[name].tobytes(), name
     with pytest.raises(lv.InputError, match="stopped"):
         sim.residual()
     assert trajectory(sim, 4) == trajectory(twin, 4)
     for name in CARRIED:
         np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
-
-
-def test_a_stopped_step_leaves_every_number_of_the_state_as_it_was(caller):
-    caller(lambda: None, 0)
-    scene = lv.Scene(rolling_radius=0.02, solver="caller", substeps=2)
-    scene.add_plane()
-    scene.add_sphere(0.5, position=(0.0, 0.0, 0.5), velocity=(1.0, 0.0, 0.0))
-    sim = lv.Simulation(scene)
-    trajectory(sim, 3)
-    before = sim.state.copy()
-    solver = sim_solver(scene)
-    solver.now, solver.at = staticmethod(stop), solver.runs + 2
-    with pytest.raises(KeyboardInterrupt):
-        sim.step()
-    before.head[HEAD["solved"]] = 0
-    for name, x in before.a.items():
-        assert sim.state.a[name].tobytes() == x.tobytes(), name
 
 
 def sim_solver(scene):

@@ -93,17 +93,6 @@ def test_what_was_left_to_its_default_follows_the_rest():
     assert scene.with_parameters(solver="sequential_impulses").parameters.substeps == 8
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf, "1/240", True])
-def test_a_longest_substep_that_is_none_is_refused(value):
-    with pytest.raises(lv.InputError, match="max_substep"):
-        lv.Scene("stack", max_substep=value)
-
-
-def test_more_substeps_than_can_be_counted_are_refused():
-    with pytest.raises(lv.InputError, match="substeps"):
-        lv.Scene("stack", max_substep=1e-60)
-
-
 def test_contacts_of_an_alternating_scene_turn_round_every_substep():
     sim = lv.Simulation(lv.Scene("pyramid", base=3, substeps=1))
     seen = []

@@ -350,13 +350,6 @@ def test_the_unit_of_mass_changes_no_bit_of_the_motion(name, scene):
         assert (unit * seen["joint_impulses"]).tobytes() == scaled["joint_impulses"].tobytes()
 
 
-@pytest.mark.parametrize("name", OTHERS)
-def test_a_snapshot_of_another_stepper_is_refused(name):
-    state = lv.Simulation("stack").snapshot()
-    with pytest.raises(lv.InputError, match="another scene"):
-        lv.Simulation("stack", stepper=name).restore(state)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_stages_one_by_one_are_the_substep(name):
     sim = after(20, "pyramid", base=4, stepper=name, substeps=1, solver_iterations=8)

@@ -1,10 +1,9 @@
 """A browser without a window, the page served to it, and visits that must end without a complaint."""
 
-import os
-import shutil
 import threading
 
 import pytest
+from worked import chromium
 
 from lavender.base.errors import LavenderError
 from lavender.sim.engine import SOLVER_FIELDS
@@ -32,10 +31,7 @@ def address(tmp_path_factory):
 @pytest.fixture(scope="module")
 def browser():
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed (extra: dev)")
-    names = ("chromium", "chromium-browser", "google-chrome")
-    found = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
-    if found is None:
-        pytest.skip(f"none of {', '.join(names)} is installed, and CHROMIUM names no browser")
+    found = chromium()
     with playwright.sync_playwright() as p:
         # Containers and root have no user namespaces to build the sandbox from.
         browser = p.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=PATIENCE)
