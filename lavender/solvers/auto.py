@@ -325,7 +325,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
     steps: dict[str, Step] = {}
     if sweeps is not None:
         sweeps.begin(log)
-        finish(log, tree, steps, sweeps)
+        sweeps.finish()
         return
     idle = 0  # lines in a row that had nothing to do
     lines = iter(tree)
@@ -338,11 +338,13 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
             if isinstance(step, Sweeps) and not tree_goes_on(log, tree, steps, stage.cost):
-                finish(log, tree, steps, step)
+                step.finish()
                 return
             if isinstance(step, Newton | Direct):
                 set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
                 step.over = log.ends_late(set_up + SURE * once(stage))
+            elif isinstance(step, Iterations):
+                step.over = step.state is None and not sets_up_in_time(stage.solver, log)
         idle = idle + 1 if step.over else 0
         if step.over:
             tree.left += stage.cost
@@ -353,19 +355,9 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         certify(log)
 
 
-def finish(log: SolveLog, tree: Tree, steps: dict[str, Step], sweeps: Sweeps) -> None:
-    """All of the time left for sweeps, where nobody who factors would end; half of it for `nncg` where they stagnate."""
-    quarter, after = 0.25 * log.deadline.nanoseconds(), list[float]()
-    if quarter > FEW * tree.sweep:
-        for _ in range(2):
-            sweeps.least, sweeps.cost = inf, quarter
-            sweeps.run(quarter / tree.sweep)
-            after.append(sweeps.relative)
-        if after[1] > 0.5 * after[0] and not log.done():
-            name = tree.gradients(quarter, "").solver
-            (steps.get(name) or make(name, log, tree)).run(inf)
-    if not log.done():
-        sweeps.finish()
+def sets_up_in_time(name: str, log: SolveLog) -> bool:
+    """Whether what is set up takes a small part of the time that is left."""
+    return not log.deadline.passed(SURE * setup_time(name, log.problem))
 
 
 def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:
