@@ -245,25 +245,21 @@ def cost(source: str, problem: lv.Problem, repeats: int = 3) -> Cost | None:
     return Cost(source, problem.law, problem.operator, problem.m, *best.tolist())
 
 
-def batch(source: str, problems: list[lv.Problem], repeats: int = 5) -> Cost:
-    """The same of many at once, by `solve_many`, the answers read."""
+def batch(source: str, problems: list[lv.Problem], repeats: int = 20) -> Cost:
+    """The same of many at once, from `solve_many` to arrays of all problems."""
     best = np.full(3, np.inf)
     for _ in range(repeats):
         own = [fresh(p) for p in problems]
-
-        def solved_all(own: list[lv.Problem] = own) -> list[Any]:
-            return [s.impulse for s in lv.solve_many(own, "newton", tol=1e-10)]
-
-        solve, answers = took(solved_all)
+        solve, solutions = took(lambda own=own: lv.solve_many(own, "newton", tol=1e-10))  # type: ignore[misc]
         ones = [np.ones(p.generalized.nv) for p in own]  # type: ignore[union-attr]
 
-        def both(own: Any = own, answers: Any = answers, ones: Any = ones) -> Any:
-            d = lv.derivatives(own, answers)
-            d.vjp(velocity=ones)
+        def both(own: Any = own, solutions: Any = solutions, ones: Any = ones) -> Any:
+            d = lv.derivatives(own, solutions)
+            d.vjp(velocity=ones).b  # noqa: B018 - read
             return d
 
         first, d = took(both)
-        more, _ = took(lambda d=d, ones=ones: [d.vjp(velocity=ones) for _ in range(AGAIN)])  # type: ignore[misc]
+        more, _ = took(lambda d=d, ones=ones: [d.vjp(velocity=ones).b for _ in range(AGAIN)])  # type: ignore[misc]
         best = np.minimum(best, (solve, first, more / AGAIN))
     first_of = problems[0]
     return Cost(source, first_of.law, first_of.operator, sum(p.m for p in problems), *best.tolist())

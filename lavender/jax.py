@@ -76,7 +76,7 @@ def solve(
         Also where 64-bit numbers are not switched on.
     """
     given = [jnp.asarray(x) for x in (J, M, v_free, mu)]
-    none = jnp.zeros(given[0].shape[-2], given[0].dtype)
+    none = jnp.zeros(given[0].shape[-2:-1], given[0].dtype)
     given += [none if x is None else jnp.asarray(x) for x in (target, compliance)]
     for name, x in zip(NAMES, given, strict=True):
         if x.dtype != jnp.float64:

@@ -129,14 +129,17 @@ def solve(
     CapabilityError
         In the backward pass, where impulses that are not unique are differentiated.
     """
-    m = J.shape[-2]
     given = [J, M, v_free, mu, target, compliance]
-    given = [torch.zeros(m, dtype=torch.float64) if x is None else x for x in given]
-    for name, x in zip(NAMES, given, strict=True):
-        if not isinstance(x, torch.Tensor) or x.dtype != torch.float64 or x.device.type != "cpu":
-            kind = f"{x.dtype} on {x.device}" if isinstance(x, torch.Tensor) else type(x).__name__
+    for i, (name, x) in enumerate(zip(NAMES, given, strict=True)):
+        if x is None and i > 3:
+            given[i] = torch.zeros(J.shape[-2:-1], dtype=torch.float64)
+        elif not isinstance(x, torch.Tensor):
             raise InputError(
-                f"{name} is {kind}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
+                f"{name} is {type(x).__name__}; a tensor of float64 is needed: torch.as_tensor({name})"
+            )
+        elif x.dtype != torch.float64 or x.device.type != "cpu":
+            raise InputError(
+                f"{name} is {x.dtype} on {x.device}; a tensor of float64 on the CPU is needed: {name}.double().cpu()"
             )
     shapes(given)
     given[1] = 0.5 * (given[1] + given[1].transpose(-1, -2))

@@ -143,15 +143,16 @@ MORE, REACHED, STUCK, CERTIFICATE, SPENT = 0, 1, 3, 4, 5
 def driven(problem, tol=1e-9, budget=1500, work=10**6):
     """(how it ended, factorisations, residual as the driver has it, impulse); None where it is not taken."""
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
-    driver, impulse = Driver(problem.metric, tol, budget), problem.start().copy()
-    if not driver.start(impulse):
+    driver, impulse = Driver(problem.metric), problem.start().copy()
+    if not driver.fits:
         return None
+    driver.start(impulse, tol, budget)
     how = MORE
     while how in (MORE, CERTIFICATE):
-        how, done, relative, proof = driver.step(work, impulse)
+        how, proof = driver.step(work, impulse), driver.direction
         if proof is not None and check_certificate(problem, proof) is None:
             driver.prove()
-    return how, done, relative, impulse
+    return how, driver.counts[1], driver.relative, impulse
 
 
 LAWS = ("coulomb", "cone")

@@ -12,7 +12,7 @@ from lavender.base.arrays import FloatArray, as_array, as_csr
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import above, issparse
 from lavender.gradient.chains import Bodies, Parts
-from lavender.gradient.result import BODIES, INPUTS, Gradient
+from lavender.gradient.result import BODIES, INPUTS, MATRICES, Gradient
 from lavender.gradient.system import SMALL, System, prepared
 from lavender.judge.residuals import at_floor, residual
 from lavender.judge.states import States, linear_of
@@ -85,16 +85,28 @@ class Derivative:
     Made by `lavender.derivative`.
     """
 
-    def __init__(self, problem: Problem, impulse: FloatArray, linear: Linear) -> None:
-        self.problem, self._impulse, self._linear = problem, impulse, linear
-        disk, general = problem.disk, problem.generalized
-        regular = prepared(disk, linear) if linear.rows <= SMALL else self._system.of_kernel
+    def __init__(self, problem: Problem, linear: Linear) -> None:
+        self.problem, self._linear, self.m = problem, linear, problem.m
+        if not linear.tried and linear.rows <= SMALL:
+            prepared(problem.disk, linear)
+        regular = linear.regular if linear.rows <= SMALL else self._system.of_kernel
+        general = problem.generalized
         # The kernel has all that `vjp` needs, in the order given.
-        self._plain = regular and disk is problem and (general is None or general.order is None)
+        self._plain = regular and not problem.cones.has_ellipse and (general is None or general.order is None)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the data that this problem has, by which there are gradients."""
+        return tuple(name for name, of in INPUTS.items() if self.problem.operator in of)
 
     @cached_property
     def _system(self) -> System:
         return System(self.problem.disk, self._linear)
+
+    @cached_property
+    def _impulse(self) -> FloatArray:
+        impulse: FloatArray = self._linear.impulse
+        return impulse * self.problem.cones.stretch if self.problem.cones.has_ellipse else impulse
 
     @cached_property
     def _root(self) -> FloatArray:
@@ -263,7 +275,7 @@ class Derivative:
         return Gradient(self, (self._linear.adjoint if self._plain else self._adjoint)(y, c, x))
 
     def _adjoint(self, y: FloatArray | None, c: FloatArray, x: FloatArray | None) -> FloatArray:
-        """(q, s (m), f, p (nv), c (m)) of (4), end to end, with f = y - J^T s; no f and p of a matrix."""
+        """(q, s (m), f (nv), c (m)) of (4), end to end, with f = y - J^T s; no f of a matrix."""
         p, right = self.problem, c.copy()
         if x is not None:
             right += self._a(x, True)
@@ -279,8 +291,7 @@ class Derivative:
             s -= x
         if p.matrix is not None:
             return np.concatenate([q, s, c])
-        f = (0.0 if y is None else y) - self._wrench(s)
-        return np.concatenate([q, s, f, self._through_mass(f), c])
+        return np.concatenate([q, s, (0.0 if y is None else y) - self._wrench(s), c])
 
     def _refuse_undetermined(self, c: FloatArray) -> None:
         if not self._system.singular:
@@ -365,13 +376,13 @@ class Derivative:
 
     def _checked(self, changes: dict[str, Any]) -> dict[str, Any]:
         p, out = self.problem, {}
-        known = [name for name, of in INPUTS.items() if p.operator in of and name != "coefficients"]
+        known = [name for name in self.inputs if name != "coefficients"]
         for name, value in changes.items():
             if name not in known:
                 raise InputError(
                     f"{name!r} is no data of this problem ({p.operator}): there are {', '.join(known)}"
                 )
-            if name in ("A", "J", "M"):
+            if name in MATRICES:
                 like = p.matrix if name == "A" else p.jacobian if name == "J" else p.generalized.mass  # type: ignore[union-attr]
                 out[name] = as_csr(name, value) if issparse(value) else as_array(name, value, like.shape)
                 if out[name].shape != like.shape:
@@ -472,6 +483,9 @@ class Derivative:
         """
         return above("lavender.lab.motion").motions_of(self.problem.disk)
 
+    def __repr__(self) -> str:
+        return f"<Derivative of {self.m} rows: {self}>"
+
     def __str__(self) -> str:
         words = [repr(self.states)]
         if self.switching:
@@ -523,7 +537,7 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
     """
     check_problem(problem)
     x = problem.impulse_array(getattr(solution, "impulse", solution))
-    linear = linear_of(problem, x)
+    linear = linear_of(problem, x, SMALL)
     if not (linear.relative <= ACCEPTED or at_floor(linear.relative, linear.floor)):
         found = residual(problem, x, "float64")
         if not (found.nothing_to_do and found.rounds):
@@ -532,4 +546,4 @@ def derivative(problem: Problem, solution: Any) -> Derivative:
                 f"needs {ACCEPTED:g} or the floor ({found.floor:.1e}): solve with tol=1e-10, or give the problem that "
                 "it solves"
             )
-    return Derivative(problem, x, linear)
+    return Derivative(problem, linear)

@@ -14,7 +14,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
-from lavender.gradient import derivative
+from lavender.gradient import derivatives
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.solving.many import solve_many
@@ -64,8 +64,8 @@ class Step:
         others = [
             np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1]) for x in arrays[len(given) :]
         ]
-        for p, x, y, c in zip(self.problems(flat), *others, strict=True):
-            g = derivative(p, x).vjp(velocity=y, impulse=c)
+        problems, (impulses, y, c) = list(self.problems(flat)), others
+        for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
             whole = (g.full("J"), g.full("M"), g.v_free, g.mu[p.cones.is_contact], g.target, g.compliance)
             for to, value in zip(found, whole, strict=True):
                 to.append(value)

@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError
+from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import issparse
 from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
 
-__all__ = ["BODIES", "INPUTS", "Gradient"]
+__all__ = ["BODIES", "INPUTS", "MATRICES", "Gradient"]
 
+MATRICES = ("A", "J", "M")
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.
 INPUTS = {
@@ -40,7 +41,7 @@ class _Input:
     def __get__(self, gradient: Any, owner: Any = None) -> Any:
         if gradient is None:
             return self
-        name, of, kept = self.name, gradient._of, gradient.__dict__
+        name, of = self.name, gradient._of
         if self.operators is not OPERATORS and of.problem.operator not in self.operators:
             raise CapabilityError(
                 f"{name} is of problems given as {' or '.join(self.operators)}, and this one was given as "
@@ -49,10 +50,10 @@ class _Input:
         if self.alone and not of._plain:
             of._refuse_alone(f"no derivative by {name} exists here")
         if self.work_out is None:
-            kept.update(of._bodies.back(gradient))
-        else:
-            kept[name] = self.work_out(gradient)
-        return kept[name]
+            gradient.__dict__.update(of._bodies.back(gradient))
+            return gradient.__dict__[name]
+        found = gradient.__dict__[name] = self.work_out(gradient)
+        return found
 
 
 class Gradient:
@@ -77,37 +78,45 @@ class Gradient:
     """
 
     def __init__(self, of: Any, made: FloatArray) -> None:
-        self._of, self._made = of, made  # q, s (m), f, p (nv), c (m)
+        self._of, self._made = of, made  # q, s (m), f (nv), c (m)
 
     @property
     def _q(self) -> FloatArray:
-        return self._made[: self._of.problem.m]
+        return self._made[: self._of.m]
 
     @property
     def _s(self) -> FloatArray:
-        m = len(self._of._impulse)
+        m = self._of.m
         return self._made[m : 2 * m]
 
+    @property
+    def _f(self) -> FloatArray:
+        # y - J^T s
+        m = self._of.m
+        return self._made[2 * m : len(self._made) - m]
+
     @cached_property
-    def _moved(self) -> FloatArray:
-        # f and p (2, nv) of (4)
-        m = self._of.problem.m
-        return self._made[2 * m : len(self._made) - m].reshape(2, -1)
+    def _p(self) -> FloatArray:
+        return np.asarray(self._of._through_mass(self._f))
 
     @property
     def _c(self) -> FloatArray:
-        return self._made[len(self._made) - self._of.problem.m :]
+        return self._made[len(self._made) - self._of.m :]
+
+    def __repr__(self) -> str:
+        return f"<Gradient of {self._of.m} rows by {', '.join(self._of.inputs)}>"
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(f"a gradient has no {name!r}; it has {', '.join(INPUTS)}")
 
     def _by_b(self) -> FloatArray:
-        return self._s
+        m = self._of.m
+        return self._made[m : 2 * m]
 
     _by_target = _by_b
 
     def _by_v_free(self) -> FloatArray:
-        return self._moved[0].reshape(self._of._velocities())
+        return self._f.reshape(self._of._velocities())
 
     @cached_property
     def _pull(self) -> FloatArray:
@@ -116,7 +125,7 @@ class Gradient:
         if matrix is not None:
             return np.asarray(self._c - matrix.T @ self._s)
         assert compliance is not None
-        return np.asarray(self._c + o._along(self._moved[1]) - compliance * self._s)
+        return np.asarray(self._c + o._along(self._p) - compliance * self._s)
 
     def _by_lower(self) -> FloatArray:
         return self._of._acting[0] * self._pull
@@ -165,7 +174,7 @@ class Gradient:
         o = self._of
         if name == "A":
             return [(-self._s, o._impulse)]
-        p = self._moved[1]
+        p = self._p
         if name == "J":
             return [(o._impulse, p), (-self._s, o._velocity)]
         return [(-0.5 * p, o._change), (-0.5 * o._change, p)]
@@ -180,6 +189,8 @@ class Gradient:
 
     def full(self, name: str) -> FloatArray:
         """The whole of A, J or M, a dense array with entries outside its pattern, too."""
+        if name not in MATRICES:
+            raise InputError(f"full is of {', '.join(MATRICES)}; {name!r} is no matrix with a pattern")
         getattr(self, name)  # refuses what is not there
         return np.asarray(sum(np.outer(u, v) for u, v in self._pairs(name)))
 

@@ -14,7 +14,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.judge.residuals import Residual, reference
 from lavender.problem import Problem
-from lavender_ext.derivative.linear import CASES, Linear
+from lavender_ext.derivative.linear import CASES, Linear, Linears
 
 __all__ = ["State", "States", "linear_of"]
 
@@ -94,12 +94,12 @@ class States(Sequence[State]):
         return ", ".join(f"{names.count(name)} {name}" for name in dict.fromkeys(names)) or "no blocks"
 
 
-def linear_of(problem: Problem, impulse: FloatArray) -> Linear:
-    """An impulse (m,) [N s], judged and linearised, which must not change any more; of ellipses as their disks."""
+def linear_of(problem: Problem, impulse: FloatArray, most: int = 0) -> Linear:
+    """An impulse (m,) [N s], judged and linearised; of ellipses as their disks. With a factor as `Linears` has one."""
     data = problem.disk.metric
     if data.start_energy < 0.0:
         reference(problem.disk)
-    return Linear(data, problem.on_disk(impulse))
+    return Linears([data], [problem.on_disk(impulse)], most).one(0)
 
 
 def states_of(problem: Problem, impulse: FloatArray, found: Residual) -> States:

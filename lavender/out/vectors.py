@@ -29,8 +29,7 @@ from lavender.out.library import HERE
 from lavender.out.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.solvers import registry
 from lavender.solvers.steps import METHODS as CANDIDATES
-from lavender_ext.driver.driver import Driver
-from lavender_ext.newton.solve import OUTCOMES
+from lavender_ext.driver.driver import OUTCOMES, Driver
 
 __all__ = ["Step", "driven", "file_of", "made", "pack", "pack_problem", "steps_of"]
 
@@ -232,12 +231,13 @@ def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, in
     """
     lv.residual(problem, problem.start())  # d, nu and J M^-1 J^T of a problem are known once it is judged
     impulse = (problem.start() if problem.guess is None else problem.guess).copy()
-    driver, done, how = Driver(problem.metric, tol, budget), 0, OUTCOMES["more"]
-    if not driver.start(impulse):
+    driver, how = Driver(problem.metric), OUTCOMES["more"]
+    if not driver.fits:
         raise NotTaken("the compiled driver of newton does not take this problem")
+    driver.start(impulse, tol, budget)
     while how in (OUTCOMES["more"], OUTCOMES["certificate"]):
-        how, done, _, _ = driver.step(10**6, impulse)
-    return impulse, done
+        how = driver.step(10**6, impulse)
+    return impulse, driver.counts[1]
 
 
 def pack_problem(problem: Any) -> bytes:

@@ -263,6 +263,11 @@ class Solutions(_Many, Sequence[Solution]):
         """(n + 1,) first row of each world where `impulse` is flat, then the number of rows."""
         return np.append(self._first, self._impulse.size)
 
+    @property
+    def placed(self) -> tuple[FloatArray, np.ndarray, np.ndarray]:
+        """All impulses [N s], flat; where each world's begin, and how many rows it has."""
+        return self._impulse, self._first, self._sizes
+
     def start(self, i: int) -> Any:
         """The start (m,) [N s] of world i, None of one without."""
         if isinstance(self.problems, Batch):

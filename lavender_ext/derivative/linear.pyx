@@ -2,7 +2,7 @@
 
 With cotangents c of lambda, x of w and y of v (equation (4) of lavender/gradient/__init__.py), of J and M or bodies
 
-    G^T q = D^-1/2 (c + C x + J M^-1 (y + J^T x)),   s = D^-1/2 P^T q - x,   f = y - J^T s,   p = M^-1 f    (1)
+    G^T q = D^-1/2 (c + C x + J M^-1 (y + J^T x)),   s = D^-1/2 P^T q - x,   f = y - J^T s                  (1)
 
 with C the compliance, and of a matrix
 
@@ -11,19 +11,20 @@ with C the compliance, and of a matrix
 from cpython.buffer cimport (PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBUF_WRITABLE, PyBuffer_Release,
                              PyObject_GetBuffer)
 from libc.math cimport fabs
-from libc.stdint cimport int8_t, int32_t
+from libc.stdint cimport int8_t, int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
+from lavender_ext.core.door cimport first_outside
+from lavender_ext.core.generalized cimport generalized_t, jac_push, whitened_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_times
 from lavender_ext.core.velocity cimport rows_wrench, wrenches_to_velocity
 from lavender_ext.core.view cimport view_t
-from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, natural_all,
-                                              natural_t, place_rows, scaled_csr, scaled_general, system_rows)
+from lavender_ext.derivative.natural cimport (CLOSED, FREE, HIGH, LOW, OPEN, SLIDES, STICKS, block_times, linear_t,
+                                              natural_all, natural_t, place_rows, scaled_csr, scaled_general, system_rows)
 from lavender_ext.factor.dense cimport PANEL, dense_lu, dense_lu_solve, dense_lu_solve_back
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
@@ -45,72 +46,74 @@ cdef void push(const view_t* v, const double* lam, double* f) noexcept nogil:
         rows_wrench(&v.p, v.r, lam, f)
 
 
-cdef void through_mass(const view_t* v, int32_t n, const double* f, double* p) noexcept nogil:
-    # p (n) = M^-1 f
-    memcpy(p, f, n * sizeof(double))
-    if v.g != NULL:
-        tree_solve(v.g, p)
-    elif v.r != NULL:
-        wrenches_to_velocity(v.r, p)
+cdef void pull(const linear_t* a, double* f, double* out) noexcept nogil:
+    # out = J M^-1 f on rows of G, of bodies on all; f (n) becomes scratch. With M = L^T D L it is Y D^-1/2 L^-T f
+    cdef const generalized_t* g = a.v.g
+    cdef int32_t k, q, i, b
+    cdef double z
+    if a.v.r != NULL:
+        wrenches_to_velocity(a.v.r, f)
+        rows_times(&a.v.p, a.v.r, f, out)
+        return
+    for k in range(g.n - 1, -1, -1):
+        z = f[k]
+        if z != 0.0:
+            for q in range(g.lptr[k], g.lptr[k + 1]):
+                f[g.lidx[q]] -= g.lval[q] * z
+            f[k] = z * g.root[k]
+    for b in range(g.n_panels):
+        for i in range(g.prow[b], g.prow[b + 1]):
+            if a.place[i] >= 0:
+                out[i] = whitened_dot(g, b, i, f)
 
 
 cdef void turned(const view_t* v, const double* x, double* out) noexcept nogil:
     # out (m) = A^T x of a matrix
     cdef int32_t i, k
-    memset(out, 0, v.p.n_rows * sizeof(double))
     for i in range(v.p.n_rows):
         for k in range(v.a.indptr[i], v.a.indptr[i + 1]):
             out[v.a.indices[k]] += v.a.data[k] * x[i]
 
 
-cdef public void lav_adjoint(const view_t* v, const natural_t* a, int32_t rows, const int32_t* place, const double* lu,
-                             const int32_t* swap, int32_t n, const double* y, const double* c, const double* x,
-                             double* q, double* s, double* f, double* p) noexcept nogil:
+cdef public void lav_adjoint(const linear_t* a, const double* y, const double* c, const double* x, double* q, double* s,
+                             double* f) noexcept nogil:
     """(1) or (2) but for q on rows outside the factor; y (n), c (m) and x (m) may be NULL, for 0."""
+    cdef const view_t* v = &a.v
     cdef int32_t i, m = v.p.n_rows
     cdef const double* soft = NULL
-    if v.a == NULL and v.g != NULL:
-        soft = v.g.compliance
-    elif v.a == NULL:
-        soft = v.r.compliance
+    if v.a == NULL:
+        soft = v.g.compliance if v.g != NULL else v.r.compliance
     memset(q, 0, m * sizeof(double))
     if v.a != NULL and x != NULL:
         turned(v, x, q)
     elif y != NULL or x != NULL:
-        memset(f, 0, n * sizeof(double))
+        memset(f, 0, a.n * sizeof(double))
         if x != NULL:
             push(v, x, f)
         if y != NULL:
-            for i in range(n):
+            for i in range(a.n):
                 f[i] += y[i]
-        through_mass(v, n, f, p)
-        if v.r != NULL:
-            rows_times(&v.p, v.r, p, q)
-        else:
-            for i in range(m):
-                q[i] = jac_row(v.g, i, p)
+        pull(a, f, q)
         if x != NULL:
             for i in range(m):
                 q[i] += soft[i] * x[i]
     for i in range(m):
-        if place[i] >= 0:
-            s[place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.root[i]
-    dense_lu_solve_back(rows, lu, swap, s)
+        if a.place[i] >= 0:
+            s[a.place[i]] = (q[i] + (c[i] if c != NULL else 0.0)) / a.x.root[i]
+    dense_lu_solve_back(a.rows, a.lu, a.swap, s)
     for i in range(m):
-        q[i] = s[place[i]] if place[i] >= 0 else 0.0
-    block_times(a, &v.p, a.p, q, True, s)
+        q[i] = s[a.place[i]] if a.place[i] >= 0 else 0.0
+    block_times(&a.x, &v.p, a.x.p, q, True, s)
     for i in range(m):
-        s[i] = s[i] / a.root[i] - (x[i] if x != NULL else 0.0)
+        s[i] = s[i] / a.x.root[i] - (x[i] if x != NULL else 0.0)
     push(v, s, f)
-    for i in range(n):
+    for i in range(a.n):
         f[i] = (y[i] if y != NULL else 0.0) - f[i]
-    through_mass(v, n, f, p)
 
 
 cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
-    """Whether it is None, `to` NULL then, or an array (n,) of finite numbers that lie together, held by `view`."""
-    cdef double nought = 0.0                            # or becomes NaN
-    cdef Py_ssize_t i
+    """Whether it is None, `to` NULL then, or an array (n,) of numbers that lie together, held by `view`."""
+    to[0] = NULL
     if given is None:
         return True
     if type(given) is not ndarray:
@@ -123,170 +126,224 @@ cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
         return False
     if n:
         to[0] = <const double*>view.buf
-    for i in range(n):
-        nought += 0.0 * to[0][i]
+    return True
+
+
+cdef bint is_finite(const double* x, Py_ssize_t n) noexcept nogil:
+    cdef double nought = 0.0                            # or becomes NaN
+    cdef Py_ssize_t i
+    for i in range(n if x != NULL else 0):
+        nought += 0.0 * x[i]
     return nought == 0.0
 
 
-cdef class Linear:
-    """An impulse (m,) [N s], judged by the data that the judge reads, and linearised.
+cdef void form(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
+    # G of H + shift, A of J and M or in rows; h (rows, rows + n) is scratch
+    cdef int32_t i, n = a.rows
+    if v.g != NULL:
+        scaled_general(v.g, n, a.place, a.x.root, h + <ssize_t>n * n, h)
+    else:
+        scaled_csr(v.a, a.v.p.n_rows, n, a.place, a.x.root, h)
+    for i in range(n):
+        h[<ssize_t>i * n + i] += shift
+    system_rows(&a.x, &a.v.p, n, a.place, h, g)
 
-    `impulse` is kept as it is. The judge's reference must be known to the data. `solve` and `adjoint` are of the factor
-    that `prepare` found.
-    """
-    cdef blocks_t b
-    cdef natural_t x
-    cdef Data judge, data
-    cdef Room room, factor
-    cdef double* w
-    cdef double* e
-    cdef double* lu
-    cdef int32_t* place_
-    cdef int32_t* swap
-    cdef readonly object impulse
-    cdef readonly int rows                              # of G: those with a place
-    cdef readonly bint regular
-    cdef readonly double relative, floor                # of the judge
 
-    def __init__(self, Data judge, impulse):
-        cdef const double[::1] lam = impulse
-        cdef int32_t m = judge.blocks.n_rows, k = judge.blocks.n_blocks, i, n, size = 0
-        cdef view_t v = judge.view()
-        cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
-        cdef double* at
-        cdef double* scratch
-        cdef int32_t* ptr
-        self.judge, self.impulse, self.b = judge, impulse, judge.blocks
-        if m == 0:
-            self.regular = True
-            return
-        for i in range(k):
-            n = self.b.ptr[i + 1] - self.b.ptr[i]
-            size += n if is_rows(&self.b, i) else n * n
-        self.room = room_for((5 * <Py_ssize_t>m + 2 * size) * sizeof(double) + (m + k + 1) * sizeof(int32_t) + m)
-        at = <double*>self.room.at
-        self.w, self.e = at, at + m
-        ptr = <int32_t*>(at + 5 * m + 2 * size)
-        self.place_ = ptr + k + 1
-        self.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(ptr + k + 1 + m), ptr, at + 5 * m,
-                           at + 5 * m + size)
-        scratch_room = room_for(scratch_of(&v) * sizeof(double))
-        scratch = <double*>(<Room>scratch_room).at
+cdef ssize_t values_of(const blocks_t* b) noexcept nogil:
+    # of P
+    cdef int32_t i, n
+    cdef ssize_t size = 0
+    for i in range(b.n_blocks):
+        n = b.ptr[i + 1] - b.ptr[i]
+        size += n if is_rows(b, i) else n * n
+    return size
+
+
+cdef ssize_t room_of(const blocks_t* b, ssize_t values) noexcept nogil:
+    # numbers that `linearise` keeps
+    return 5 * <ssize_t>b.n_rows + 2 * values + (5 * <ssize_t>b.n_rows + 4 * <ssize_t>b.n_blocks + 11) // 8
+
+
+cdef void linearise(linear_t* a, const double* lam, double energy, double velocity, double* at, double* scratch) noexcept nogil:
+    """An impulse by the data of `a.v`; at (`room_of`), scratch (m + `scratch_of`); energy and velocity of doing nothing."""
+    cdef const blocks_t* b = &a.v.p
+    cdef int32_t m = b.n_rows
+    cdef ssize_t values = values_of(b)
+    cdef int32_t* ptr = <int32_t*>(at + 5 * m + 2 * values)
+    cdef score_t s = score_t(0.0, 0.0, 0.0, 0.0, -1, 1)
+    if m == 0:
+        a.regular = True
+        return
+    a.lam, a.w, a.place = at, at + m, ptr + b.n_blocks + 1
+    a.x = natural_t(at + 2 * m, at + 3 * m, at + 4 * m, <int8_t*>(a.place + m), ptr, at + 5 * m, at + 5 * m + values)
+    memcpy(a.lam, lam, m * sizeof(double))
+    judge_view(&a.v, a.lam, a.w, scratch, scratch + m, True, &s)
+    natural_all(b, a.lam, a.w, ptr, &a.x)
+    a.rows = place_rows(b, &a.x, a.place)
+    a.relative = relative_of(&s, a.w, m, energy, velocity)
+    a.floor = relative(s.floor_energy, s.floor_velocity, energy, velocity)
+
+
+cdef ssize_t room_of_factor(int32_t n) noexcept nogil:
+    # numbers that `factorise` keeps
+    return <ssize_t>n * n + (n + 1) // 2
+
+
+cdef ssize_t scratch_of_factor(int32_t n, const view_t* v) noexcept nogil:
+    cdef ssize_t most = n + (v.g.n if v.g != NULL else 0)
+    return n * (most if most > PANEL else PANEL)
+
+
+cdef bint factorise(linear_t* a, const view_t* v, double shift, double* at, double* scratch) noexcept nogil:
+    """G of H + shift, A of v; at (`room_of_factor`) and scratch (`scratch_of_factor`). Whether it is regular."""
+    cdef int32_t i, n = a.rows
+    cdef double least = 1.0 / 0.0, most = 0.0, x
+    a.tried = a.regular = True
+    if n == 0:
+        return True
+    a.lu, a.swap = at, <int32_t*>(at + <ssize_t>n * n)
+    form(a, v, shift, a.lu, scratch)
+    if dense_lu(has_wide(), n, a.lu, a.swap, scratch):
+        for i in range(n):
+            x = fabs(a.lu[<ssize_t>i * n + i])
+            least = x if x < least else least
+            most = x if x > most else most
+    a.regular = least > SINGULAR * most and most > 0.0
+    return a.regular
+
+
+cdef bint is_prepared(Data p):
+    # or has too many entries, or A_ii out of reach
+    try:
+        p.prepare()
+    except OverflowError:
+        return False
+    return first_outside(p.blocks.d, p.blocks.n_rows) < 0
+
+
+cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out):
+    """`Linear.adjoint` into out (3 m + n); or not."""
+    cdef int32_t m = a.v.p.n_rows, i
+    cdef const double* y
+    cdef const double* c
+    cdef const double* x
+    cdef Py_buffer views[3]
+    if velocity is None and impulse is None and slack is None:
+        return False
+    memset(&views[0], 0, 3 * sizeof(Py_buffer))         # what holds nothing is released in vain
+    try:
+        if not (is_plain(velocity, a.n, &views[0], &y) and is_plain(impulse, m, &views[1], &c)
+                and is_plain(slack, m, &views[2], &x)):
+            return False
+        if not (is_finite(y, a.n) and is_finite(c, m) and is_finite(x, m)):
+            return False
         with nogil:
-            judge_view(&v, &lam[0], self.w, self.e, scratch, True, &s)
-            natural_all(&self.b, &lam[0], self.w, ptr, &self.x)
-            self.rows = place_rows(&self.b, &self.x, self.place_)
-        self.relative = relative_of(&s, self.w, m, judge.start_energy, judge.start_velocity)
-        self.floor = relative(s.floor_energy, s.floor_velocity, judge.start_energy, judge.start_velocity)
+            lav_adjoint(a, y, c, x, out, out + m, out + 2 * m)
+            if c != NULL:
+                memcpy(out + 2 * m + a.n, c, m * sizeof(double))
+            else:
+                memset(out + 2 * m + a.n, 0, m * sizeof(double))
+        return True
+    finally:
+        for i in range(3):
+            PyBuffer_Release(&views[i])
+
+
+cdef class Linear:
+    """One of `Linears`. `solve` and `adjoint` are of the factor that was found last."""
+    cdef linear_t at
+    cdef Data judge, data                               # data: with the A of G
+    cdef Room room, factor
+
+    @property
+    def rows(self):
+        """Of G: those with a place."""
+        return self.at.rows
+
+    @property
+    def tried(self):
+        """Whether a factor was tried for."""
+        return self.at.tried
+
+    @property
+    def regular(self):
+        """Whether one was found, or nothing is to be factored."""
+        return self.at.regular
+
+    @property
+    def relative(self):
+        """The judge's relative residual."""
+        return self.at.relative
+
+    @property
+    def floor(self):
+        """What rounding leaves of it."""
+        return self.at.floor
 
     def prepare(self, Data data, double shift=0.0):
-        """Factor G of H + shift, A of the data in rows or J and M; whether there is a factor."""
-        cdef int32_t i, n = self.rows
-        cdef double least = 1.0 / 0.0, most = 0.0, x
-        cdef Room room
-        self.data = data
-        if n == 0:
-            self.regular = True
-            return True
-        self.factor = room_for((<Py_ssize_t>n * n) * sizeof(double) + n * sizeof(int32_t))
-        room = room_for(<Py_ssize_t>n * PANEL * sizeof(double))
-        self.lu = <double*>self.factor.at
-        self.swap = <int32_t*>(self.lu + <Py_ssize_t>n * n)
-        self.form(self.lu, shift)
+        """Factor G of H + shift, A of the data in rows or J and M; whether it is regular."""
+        cdef view_t v = data.view()
+        cdef Room spare = room_for(scratch_of_factor(self.at.rows, &v) * sizeof(double))
+        self.data, self.factor = data, room_for(room_of_factor(self.at.rows) * sizeof(double))
         with nogil:
-            if dense_lu(has_wide(), n, self.lu, self.swap, <double*>room.at):
-                for i in range(n):
-                    x = fabs(self.lu[<Py_ssize_t>i * n + i])
-                    least = x if x < least else least
-                    most = x if x > most else most
-        self.regular = least > SINGULAR * most and most > 0.0
-        return self.regular
+            factorise(&self.at, &v, shift, <double*>self.factor.at, <double*>spare.at)
+        return self.at.regular
+
+    def adjoint(self, velocity, impulse, slack):
+        """(q, s (m), f (n), c (m)) of (1), end to end, of y (n,), c and x, None for 0; of (2) n is 0. With a factor.
+
+        None where y, c or x is no such array or not finite: the long way finds the words.
+        """
+        cdef Py_buffer view
+        cdef bint made
+        out = empty(3 * self.at.v.p.n_rows + self.at.n)
+        PyObject_GetBuffer(out, &view, PyBUF_WRITABLE)
+        made = adjoint_into(&self.at, velocity, impulse, slack, <double*>view.buf)
+        PyBuffer_Release(&view)
+        return out if made else None
 
     @property
     def slides(self):
         """Whether some row of G is not that of H: some contact slides, or is without friction."""
         cdef int32_t i, j
-        for i in range(self.b.n_blocks):
-            for j in range(self.b.ptr[i], self.b.ptr[i + 1]):
-                if self.place_[j] >= 0 and self.x.case_[j] == SLIDES:
+        for i in range(self.at.v.p.n_blocks):
+            for j in range(self.at.v.p.ptr[i], self.at.v.p.ptr[i + 1]):
+                if self.at.place[j] >= 0 and self.at.x.case_[j] == SLIDES:
                     return True
         return False
 
-    cdef void form(self, double* g, double shift):
-        cdef int32_t n = self.rows, i
-        cdef Room room = room_for(<Py_ssize_t>n * (n + self.data.general.n) * sizeof(double))
-        cdef double* h = <double*>room.at
-        with nogil:
-            if self.data.is_general:
-                scaled_general(&self.data.general, n, self.place_, self.x.root, h + <Py_ssize_t>n * n, h)
-            else:
-                scaled_csr(&self.data.csr, self.b.n_rows, n, self.place_, self.x.root, h)
-            for i in range(n):
-                h[<Py_ssize_t>i * n + i] += shift
-            system_rows(&self.x, &self.b, n, self.place_, h, g)
-
     def matrix(self):
         """G (n, n) on the rows with a place."""
-        out_ = np.empty((self.rows, self.rows))
+        out_ = np.empty((self.at.rows, self.at.rows))
         cdef double[:, ::1] out = out_
-        if self.rows:
-            self.form(&out[0, 0], 0.0)
+        cdef view_t v = self.data.view()
+        cdef Room work
+        if self.at.rows:
+            work = room_for(scratch_of_factor(self.at.rows, &v) * sizeof(double))
+            form(&self.at, &v, 0.0, &out[0, 0], <double*>work.at)
         return out_
 
     def solve(self, r, bint back=False):
         """x (n,) with G x = r, of the transpose with `back`."""
         out_ = r.copy()
         cdef double[::1] out = out_
-        if self.rows and back:
-            dense_lu_solve_back(self.rows, self.lu, self.swap, &out[0])
-        elif self.rows:
-            dense_lu_solve(self.rows, self.lu, self.swap, &out[0])
+        if self.at.rows and back:
+            dense_lu_solve_back(self.at.rows, self.at.lu, self.at.swap, &out[0])
+        elif self.at.rows:
+            dense_lu_solve(self.at.rows, self.at.lu, self.at.swap, &out[0])
         return out_
-
-    def adjoint(self, velocity, impulse, slack):
-        """(q, s (m), f, p (n), c (m)) of (1), end to end, of y (n,), c and x, None for 0; of (2) n is 0. With a factor.
-
-        None where y, c or x is no such array or not finite: the long way finds the words.
-        """
-        cdef view_t v = self.judge.view()
-        cdef int32_t m = self.b.n_rows, n = v.g.n if v.g != NULL else 6 * v.r.n_bodies if v.r != NULL else 0
-        cdef const double* given[3]                     # y, c, x
-        cdef Py_buffer views[4]
-        cdef double* out
-        cdef int i
-        memset(&views[0], 0, 4 * sizeof(Py_buffer))     # what holds nothing is released in vain
-        for i in range(3):
-            given[i] = NULL
-        try:
-            if not (is_plain(velocity, n, &views[0], &given[0]) and is_plain(impulse, m, &views[1], &given[1])
-                    and is_plain(slack, m, &views[2], &given[2])):
-                return None
-            made = empty(3 * m + 2 * n)
-            PyObject_GetBuffer(made, &views[3], PyBUF_WRITABLE)
-            out = <double*>views[3].buf
-            with nogil:
-                lav_adjoint(&v, &self.x, self.rows, self.place_, self.lu, self.swap, n, given[0], given[1], given[2],
-                            out, out + m, out + 2 * m, out + 2 * m + n)
-                if given[1] != NULL:
-                    memcpy(out + 2 * (m + n), given[1], m * sizeof(double))
-                else:
-                    memset(out + 2 * (m + n), 0, m * sizeof(double))
-            return made
-        finally:
-            for i in range(4):
-                PyBuffer_Release(&views[i])
 
     def times(self, v_, bint back=False, bint edge=False):
         """P v (m,), or with `edge` dPi/de v; `back`: of the transpose."""
         cdef const double[::1] v = v_
-        out_ = np.empty(self.b.n_rows)
+        out_ = np.empty(self.at.v.p.n_rows)
         cdef double[::1] out = out_
-        if self.b.n_rows:
-            block_times(&self.x, &self.b, self.x.edge if edge else self.x.p, &v[0], back, &out[0])
+        if self.at.v.p.n_rows:
+            block_times(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], back, &out[0])
         return out_
 
     cdef object numbers(self, const double* x):
-        cdef int32_t m = self.b.n_rows
+        cdef int32_t m = self.at.v.p.n_rows
         out_ = np.empty(m)
         cdef double[::1] out = out_
         if m:
@@ -294,54 +351,191 @@ cdef class Linear:
         return out_
 
     @property
+    def impulse(self):
+        """lambda (m,) [N s]."""
+        return self.numbers(self.at.lam)
+
+    @property
     def slack(self):
         """w (m,) [m/s]."""
-        return self.numbers(self.w)
+        return self.numbers(self.at.w)
 
     @property
     def root(self):
         """D^1/2 (m,)."""
-        return self.numbers(self.x.root)
+        return self.numbers(self.at.x.root)
 
     @property
     def residual(self):
         """F (m,) of (1) of natural.pxd."""
-        return self.numbers(self.x.f)
+        return self.numbers(self.at.x.f)
 
     @property
     def margin(self):
         """(m,) N s: of each row to the next case."""
-        return self.numbers(self.x.margin)
+        return self.numbers(self.at.x.margin)
 
     @property
     def p(self):
         """Values of P, block by block: the diagonal of rows, else row by row."""
-        cdef int32_t n = self.x.at[self.b.n_blocks] if self.b.n_rows else 0
+        cdef int32_t n = self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0
         out_ = np.empty(n)
         cdef double[::1] out = out_
         if n:
-            memcpy(&out[0], self.x.p, n * sizeof(double))
+            memcpy(&out[0], self.at.x.p, n * sizeof(double))
         return out_
 
     @property
     def case(self):
         """(m,) int8, by the numbers of CASES."""
         cdef int32_t i
-        out_ = np.empty(self.b.n_rows, np.int8)
+        out_ = np.empty(self.at.v.p.n_rows, np.int8)
         cdef int8_t[::1] out = out_
-        for i in range(self.b.n_rows):
-            out[i] = self.x.case_[i]
+        for i in range(self.at.v.p.n_rows):
+            out[i] = self.at.x.case_[i]
         return out_
 
     @property
     def place(self):
         """(m,) row of G that each row is, -1 without one."""
         cdef int32_t i
-        out_ = np.empty(self.b.n_rows, np.int32)
+        out_ = np.empty(self.at.v.p.n_rows, np.int32)
         cdef int32_t[::1] out = out_
-        for i in range(self.b.n_rows):
-            out[i] = self.place_[i]
+        for i in range(self.at.v.p.n_rows):
+            out[i] = self.at.place[i]
         return out_
+
+
+cdef class Linears:
+    """Many impulses (m,) [N s], judged by the data that the judge reads, their reference known, and linearised, at once.
+
+    impulses: a list, or (all of them, where each begins, how many rows each has) of arrays. With a factor where A is of J
+    and M and G has at most `most` rows. Left to the caller are data that are None, an impulse that is no array of its rows,
+    A_ii out of reach: `one` is None.
+    """
+    cdef Room table, room, factors
+    cdef list data
+    cdef linear_t* at
+    cdef readonly Py_ssize_t n, size                    # how many impulses; numbers of `adjoint`
+
+    def __init__(self, list data, impulses, int32_t most=0):
+        cdef Py_ssize_t i, n = len(data), size = 0, scratch = 1, more = 0
+        cdef Data p
+        cdef linear_t* a
+        cdef const double* lam
+        cdef Py_buffer held
+        cdef double* to
+        cdef double* work
+        cdef Room spare
+        cdef list each = impulses if type(impulses) is list else None
+        cdef const double[::1] flat
+        cdef const int64_t[:] first, sizes
+        if each is None:
+            flat, first, sizes = impulses
+        self.data, self.n = data, n
+        self.table = room_for(n * sizeof(linear_t))
+        self.at = <linear_t*>self.table.at
+        memset(self.at, 0, n * sizeof(linear_t))
+        for i in range(n):
+            p = data[i]
+            a = self.at + i
+            if p is None or not is_prepared(p):
+                continue
+            a.known, a.v = True, p.view()
+            a.n = a.v.g.n if a.v.g != NULL else 6 * a.v.r.n_bodies if a.v.r != NULL else 0
+            size += room_of(&a.v.p, values_of(&a.v.p))
+            scratch = max(scratch, a.v.p.n_rows + scratch_of(&a.v))
+        self.room, spare = room_for(size * sizeof(double)), room_for(scratch * sizeof(double))
+        to = <double*>self.room.at
+        for i in range(n):
+            a = self.at + i
+            if not a.known:
+                continue
+            p = data[i]
+            memset(&held, 0, sizeof(Py_buffer))
+            try:
+                if each is None:
+                    a.known = sizes[i] == a.v.p.n_rows
+                    lam = &flat[0] + first[i] if a.v.p.n_rows else NULL
+                else:
+                    a.known = each[i] is not None and is_plain(each[i], a.v.p.n_rows, &held, &lam)
+                if not a.known:
+                    continue
+                with nogil:
+                    linearise(a, lam, p.start_energy, p.start_velocity, to, <double*>spare.at)
+            finally:
+                PyBuffer_Release(&held)
+            to += room_of(&a.v.p, values_of(&a.v.p))
+            if a.v.g != NULL and a.rows <= most:
+                more += room_of_factor(a.rows)
+                scratch = max(scratch, scratch_of_factor(a.rows, &a.v))
+        self.factors, spare = room_for(more * sizeof(double)), room_for(scratch * sizeof(double))
+        to, work = <double*>self.factors.at, <double*>spare.at
+        with nogil:
+            for i in range(n):
+                a = self.at + i
+                if a.known and a.v.g != NULL and a.rows <= most:
+                    factorise(a, &a.v, 0.0, to, work)
+                    to += room_of_factor(a.rows)
+
+    def one(self, Py_ssize_t i):
+        """The `Linear` of one of them, or None."""
+        cdef Linear made
+        if not self.at[i].known:
+            return None
+        made = Linear.__new__(Linear)
+        made.at, made.judge, made.data = self.at[i], self.data[i], self.data[i]
+        made.room, made.factor = self.room, self.factors
+        return made
+
+    def leave(self, double accepted):
+        """Leave also those without a regular factor, and with a residual above `accepted`: a list of all that are left."""
+        cdef Py_ssize_t i
+        cdef linear_t* a
+        cdef list left = []
+        self.size = 0
+        for i in range(self.n):
+            a = self.at + i
+            a.known = a.known and a.tried and a.regular and a.relative <= accepted
+            a.first = self.size
+            if a.known:
+                self.size += 3 * a.v.p.n_rows + a.n
+            else:
+                left.append(i)
+        return left
+
+    def adjoint(self, list velocities, list impulses, list slacks):
+        """`Linear.adjoint` of all that are not left, end to end; and a list of those that it had to leave."""
+        cdef Py_ssize_t i
+        cdef Py_buffer view
+        cdef list left = []
+        numbers = empty(self.size)
+        PyObject_GetBuffer(numbers, &view, PyBUF_WRITABLE)
+        for i in range(self.n):
+            if self.at[i].known and not adjoint_into(self.at + i, velocities[i], impulses[i], slacks[i],
+                                                     <double*>view.buf + self.at[i].first):
+                left.append(i)
+        PyBuffer_Release(&view)
+        return numbers, left
+
+    def place(self, Py_ssize_t i):
+        """The slice of one of them in what `adjoint` finds."""
+        cdef linear_t* a = self.at + i
+        return slice(a.first, a.first + 3 * a.v.p.n_rows + a.n)
+
+    def places(self, bint velocities):
+        """The places there of every s (sum m,), or of every f (sum n,)."""
+        cdef Py_ssize_t i, j, k = 0
+        cdef int32_t m, n
+        out_ = np.empty(self.size, np.intp)
+        cdef Py_ssize_t[::1] out = out_
+        for i in range(self.n):
+            m, n = self.at[i].v.p.n_rows, self.at[i].n
+            if self.at[i].known:
+                for j in range(n if velocities else m):
+                    out[k] = self.at[i].first + (2 * m if velocities else m) + j
+                    k += 1
+        return out_[:k]
 
 
 def wrench(Data p, const double[::1] lam, double[:, ::1] f):

@@ -23,6 +23,7 @@ from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.core.view cimport view_t
 
 
 cdef enum:                      # the case of a row
@@ -43,6 +44,23 @@ cdef struct natural_t:          # of all blocks
     const int32_t* at           # (k + 1) first value of each block in p and edge: its diagonal for bounded rows, else square
     double* p                   # P
     double* edge                # dPi/de, e_g the reach of part g in its first column
+
+
+cdef struct linear_t:           # an answer, judged and linearised
+    view_t v                    # what the judge reads
+    natural_t x
+    int32_t n                   # velocities, 0 of a matrix
+    int32_t rows                # of G
+    bint known                  # all of this, and
+    bint tried                  # for a factor, which is
+    bint regular                # that of a regular G
+    double* lam                 # (m) N s
+    double* w                   # (m) m/s
+    int32_t* place              # (m) row of G that each row is, -1 without one
+    double* lu                  # (rows, rows) P G^T = L U
+    int32_t* swap               # (rows)
+    double relative, floor      # of the judge
+    ssize_t first               # number of its own, among those of many
 
 
 cdef inline void natural_row(double lam, double w, double low, double high, double root, double* f, double* margin,
@@ -175,6 +193,9 @@ cdef inline void block_times(const natural_t* x, const blocks_t* b, const double
                 out[j + k] = a[k] * v[j + k]
                 continue
             s = 0.0
+            if x.case_[j] == OPEN:                      # all zeros
+                out[j + k] = s
+                continue
             for l in range(n):
                 s += a[l * n + k if back else k * n + l] * v[j + l]
             out[j + k] = s

@@ -26,19 +26,13 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport length
 from lavender_ext.core.generalized cimport dot, generalized_t
+from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
                                             respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
 
-
-cdef enum:
-    DONE = 0                    # the test at tol was met
-    SPENT = 1                   # the steps asked for are done
-    STUCK = 2                   # nothing moves any more
-    FAILED = 3                  # a factorisation failed
-    LOST = 4                    # numbers are no longer finite
 
 cdef enum:                      # a round of Coulomb friction
     BEGINS = 0
@@ -270,7 +264,7 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double le
 
 
 cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nogil:
-    """Newton steps until the error is `goal` times its limits, or nothing moves; SPENT: call again to go on.
+    """Newton steps until the error is `goal` times its limits, or nothing moves; MORE: call again to go on.
 
     The iterate with the least error stands in `best`; `share` of d is the softness of rows without one, lowered where the
     centre's progress is slow. Idle is what does not lower the least error of this descent: the first step of one often
@@ -297,10 +291,10 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             x.least = over
             keep(f, island, f.lam, f.best)
         if over <= goal:
-            return DONE
+            return REACHED
         if f.steps <= 0:
             x.known = 1                                 # N, s and lambda stay as they are
-            return SPENT
+            return MORE
         x.idle += 1
         x.n += 1
         if x.idle > IDLE_STEPS:
@@ -327,7 +321,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         if x.stale or not (x.moved or is_held(f, island)):
             form(f, island, square)
             if not factor(f, island, square):
-                return FAILED
+                return BROKEN
         x.stale = x.moved = 0
         newton_step(f, island, square)
         if square:
@@ -437,23 +431,23 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
         f.p.law = CONE if x.at == RELAXED else COULOMB
         n = descend(f, island, 0.1 * least if x.at == RELAXED and least > 1e2 else 1.0)
         if x.at == RELAXED:
-            if n == LOST or n == FAILED:
+            if n == LOST or n == BROKEN:
                 return n
-            if n == SPENT:
+            if n == MORE:
                 keep(f, island, f.phi, f.aside)
             keep(f, island, f.best, impulse)
             level(f, island)
             offer(f, island, impulse)
         else:
-            if n == SPENT:
+            if n == MORE:
                 keep(f, island, impulse, f.aside)
             if n != LOST and offer(f, island, f.best):
                 keep(f, island, f.best, impulse)
         if x.least <= 1.0:
-            return DONE
-        if n == SPENT:
+            return REACHED
+        if n == MORE:
             x.least = least                             # as if nobody had looked
-            return SPENT
+            return MORE
         if x.at == OWN:
             lower_normals(f, island, impulse)
             x.rounds += 1
@@ -477,7 +471,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
         if not offer(f, island, impulse):
             return LOST
         if f.wait.least <= 1.0:
-            return DONE
+            return REACHED
     if f.law == COULOMB:
         end = with_coulomb(f, island, impulse)
         keep(f, island, f.first_best, impulse)
@@ -486,20 +480,20 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
             begin_descent(f, island, f.law, f.wait.least)
         end = descend(f, island, 1.0)
         keep(f, island, f.best, impulse)
-    f.wait.island = island if end == SPENT else -1
+    f.wait.island = island if end == MORE else -1
     return end
 
 
 cdef inline int32_t descend_all(flow_t* f, double* impulse) noexcept nogil:
-    """All islands from `impulse` (m), or from the one that waits on, into it: DONE, or how the worst of them ended."""
+    """All islands from `impulse` (m), or from the one that waits on, into it: REACHED, or how the worst of them ended."""
     cdef int32_t i, end, first = f.wait.island
     if first < 0:
         first = 0
-        f.wait.worst, f.wait.cold = DONE, is_nothing(&f.p, impulse)
+        f.wait.worst, f.wait.cold = REACHED, is_nothing(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
-        if end == SPENT:                                # N is of this one
-            return SPENT
+        if end == MORE:                                # N is of this one
+            return MORE
         if end > f.wait.worst:
             f.wait.worst = end
     return f.wait.worst

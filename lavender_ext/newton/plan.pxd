@@ -12,6 +12,7 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
+from lavender_ext.core.method cimport CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
@@ -28,14 +29,6 @@ from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTE
 from lavender_ext.newton.steps cimport begin_interior, delta_of, interior_step
 from lavender_ext.newton.system cimport BODIES, DENSE, OF_BARRIER, system_factor, system_natural, system_solve, system_times
 
-
-cdef enum:                      # outcomes of a turn
-    MORE = 0
-    REACHED = 1                 # tol
-    FLOOR = 2                   # within twice what rounding leaves
-    STUCK = 3
-    CERTIFICATE = 4             # `direction` may prove that there is no solution: the caller looks, and calls again
-    SPENT = 5                   # the budget, or `stop`
 
 cdef enum:
     REFINEMENTS = 3             # of a first point,

@@ -8,6 +8,7 @@ from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.method cimport CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
@@ -20,7 +21,7 @@ from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay
 from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
-from lavender_ext.newton.plan cimport (CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK, newton_start, newton_step)
+from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
                                       RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
                                       own_index, own_room, proof_of, relative_at)

@@ -25,7 +25,7 @@ from lavender_ext.core.parts cimport CONE, FRICTIONS, blocks_t, frictions_of, la
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport room_t
+from lavender_ext.core.method cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
 from lavender_ext.judge.measure cimport Judged
@@ -399,7 +399,7 @@ cdef class Friction(Small):
     cdef solve(self, own, double tol, bint follow, double* most):
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
                              self.most, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
-        cdef room_t r = room_t(0, 0, NULL, NULL)
+        cdef room_t r = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
         try:
             good = self.whole(own, &o, &r) if self.count == 1 else self.islands(own, &o, &r)
         finally:

@@ -9,13 +9,13 @@ from libc.string cimport memcmp, memcpy, memset
 from lavender_ext.accelerate.accelerated cimport lav_anderson, sweep_data_t
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE
 from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.method cimport CERTIFICATE, MORE, ROOM, options_t, room_t, said_t
 from lavender_ext.core.parts cimport CONE, blocks_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport NEWTON, ROOM, options_t, lav_room, lav_start, lav_step, room_t, said_t
+from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
-from lavender_ext.judge.measure cimport do_nothing, judge_view, relative_of
+from lavender_ext.judge.measure cimport do_nothing, judge_view, reference_of, relative_of
 from lavender_ext.judge.score cimport score_t
-from lavender_ext.newton.plan cimport CERTIFICATE, MORE
 from lavender_ext.sweep.serial cimport context_t, form_velocity
 
 
@@ -189,6 +189,7 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
     cdef uint64_t rng
     cdef const blocks_t* p = &s.v.p
     cdef double own = o.e0, fast = o.v0, less, now = s.nothing
+    cdef double begun[3]
     t.s, t.o, t.r = s, o, r
     lay_turns(&t, work, order, &rng)
     do_nothing(p, s.answer, t.w)
@@ -215,7 +216,10 @@ cdef inline bint solve_part(part_t* s, ask_t* o, room_t* r, double* work, int32_
         o.driven += 1
         # Both measures of the part's own error of doing nothing are then below tol of its share.
         now = t.e0 / own if t.e0 / own < t.v0 / fast else t.v0 / fast
-        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now)
+        begun[0], begun[1] = own, fast
+        if s.nothing < 0.0:
+            reference_of(p, &nothing, begun)
+        t.options = options_t(NEWTON, STEPS, 0, 0, o.wide, o.tol * now, begun[0], begun[1], 1.0 / 0.0)
         now = factor_in_turns(&t)
     o.swept += t.c.turn
     o.undone += <int64_t>t.c.control[UNDONE]

@@ -1,6 +1,6 @@
 """Problems in generalised coordinates, one or many, without the interpreter: lay out, prepare, solve, judge.
 
-The same kernels in the same order as on one problem alone (`generalized/newton.pyx`), so the same bits and counts. What
+The same kernels in the same order as on one problem alone, so the same bits and counts. What
 does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
 asked for, is left to the caller.
 """
@@ -15,17 +15,15 @@ import numpy as np
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
 from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
-from lavender_ext.driver.driver cimport room_t
+from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
-from lavender_ext.generalized.flow cimport flow_t
-from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
-from lavender_ext.generalized.newton cimport DONE, SPENT, descend_all, is_soft
-from lavender_ext.generalized.sparse cimport per_column
+from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
 from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
@@ -136,21 +134,19 @@ cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int3
     return (READ + FORMED * factored) * once + 0.5 * factored * l.work * work + LINE * l.entry * j.p.n_rows * lines
 
 
-cdef inline int32_t descend_within(job_t* j, flow_t* f, const limits_t* l, double work) noexcept nogil:
-    """`descend_all` for as long as what it did is counted to cost less than `most` of the job: `spent` where it is not over then.
+cdef inline int32_t step_within(job_t* j, const view_t* v, const options_t* o, const room_t* r, const limits_t* l) noexcept nogil:
+    """Steps for as long as what they did is counted to cost less than `most` of the job: `spent` where it is not over then.
 
-    Steps that factor nothing are cheap, so it is asked again for as many as what is left is for if each did.
+    Those that factor nothing are cheap, so it is asked again for as many as what is left is for if each did.
     """
-    cdef int32_t code = SPENT, left = f.steps
-    cdef double each = spent_by(j, l, work, 1, LOOKS) - spent_by(j, l, work, 0, 0.0), fit = 1.0
-    while code == SPENT and left > 0 and fit >= 1.0:
-        fit = (j.most - spent_by(j, l, work, f.factorisations, f.evaluations)) / each
-        f.steps = <int32_t>max(fit, 0.0) if fit < left else left
-        left -= f.steps
-        code = descend_all(f, j.lam)
-        left += f.steps
-    f.steps = left
-    j.spent = code == SPENT and left > 0
+    cdef said_t said = said_t(0, 0, 0, 0, 0.0, NULL, NULL)
+    cdef int32_t code = MORE
+    cdef double each = spent_by(j, l, r.work, 1, LOOKS) - spent_by(j, l, r.work, 0, 0.0), fit = 1.0
+    while code == MORE and fit >= 1.0:
+        fit = (j.most - spent_by(j, l, r.work, said.factorisations, said.evaluations)) / each
+        code = lav_step(v, o, r, <int32_t>max(fit, 0.0) if fit < o.budget else o.budget, j.lam, &said)
+    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = said.work, said.factorisations, said.rounds, said.evaluations
+    j.spent = code == MORE
     return code
 
 
@@ -192,9 +188,10 @@ cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
 
 
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
-    cdef flow_t f
-    cdef need_t need
-    cdef int32_t m = j.p.n_rows, steps = MOST, per = per_column(j.g.n), code
+    cdef view_t v
+    cdef options_t o = options_t(NEWTON, MOST, 0, 0, 0, tol, 0.0, 0.0, limits.values)
+    cdef room_t r
+    cdef int32_t m = j.p.n_rows, code = ROOM
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE or first_outside(j.p.d, m) >= 0:
         return
@@ -202,28 +199,26 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
         return
     if j.begin[0] < 0.0:
         begin(j, room.real)
-    while True:
-        if not has_room(room, marks_of(&j.p, &j.g, per), 0):
+    v = view_t(j.p, NULL, NULL, &j.g)
+    lav_room(&v, &o, &r)
+    while code == ROOM and not r.laid:
+        if not has_room(room, r.n_index, 0):
             return
-        settle(&f, &j.p, &j.g, per, room.index, &need)
-        if not need.crowded or <double>per * j.g.n > limits.values:
-            break
-        per *= 2                                        # L has more entries than that in a row
-    if f.n_islands <= MOST // STEPS:
-        steps = STEPS * f.n_islands
-    if need.crowded or need.values > limits.values or cost_of(&j.p, &j.g, limits, need.work) > allowed(&j.p, &j.g, limits):
+        r.index = room.index
+        code = lav_start(&v, &o, &r, j.lam)
+    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits) or not has_room(room, 0, r.n_real):
         return
-    if not has_room(room, 0, numbers_of(&f, &need)):
-        return
-    furnish(&f, &need, room.real)
+    r.real = room.real
+    if r.islands <= MOST // STEPS:
+        o.budget = STEPS * r.islands
+    o.e0, o.v0 = j.begin[0], j.begin[1]
     if j.cold:
         do_nothing(&j.p, j.lam, j.both)
     if j.made.n_empty and not settle_empty_rows(j, tol):
         return
-    aim_at(&f, tol, steps, j.begin[0], j.begin[1])
-    code = descend_within(j, &f, limits, need.work)
-    j.counts[0], j.counts[1], j.counts[2], j.counts[3] = steps - f.steps, f.factorisations, f.rounds, f.evaluations
-    if code != DONE and not j.spent:
+    lav_start(&v, &o, &r, j.lam)
+    code = step_within(j, &v, &o, &r, limits)
+    if code != REACHED and not j.spent:
         return
     if not has_room(room, 0, 2 * <ssize_t>j.g.n + m):
         return
@@ -290,7 +285,7 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     is the result. d, Y and the error of doing nothing stay with the data.
     """
     cdef job_t j
-    cdef room_t room = room_t(0, 0, NULL, NULL)
+    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     cdef Py_ssize_t m = p.blocks.n_rows
     cdef double[::1] lam, both
     cdef bint known = p.ready

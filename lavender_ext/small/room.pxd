@@ -2,7 +2,7 @@
 from libc.stdint cimport int32_t, int64_t
 from libc.stdlib cimport free, malloc
 
-from lavender_ext.driver.driver cimport room_t
+from lavender_ext.core.method cimport room_t
 
 
 cdef inline bint has_room(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:

@@ -10,8 +10,8 @@ from libc.string cimport memcmp, memcpy
 from lavender_ext.core.door cimport first_outside, first_unsized, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
+from lavender_ext.core.method cimport room_t
 from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
-from lavender_ext.driver.driver cimport room_t
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
 

@@ -4,7 +4,7 @@ After `prepare` and `solve` without sweeps:
 
     index_room      whole numbers that the next call needs
     plan            bands, elements, elimination order; doubles that the next call needs
-    solve           the first phase of `newton` (start.pxd), then its turns (newton/plan.pxd); the judge's residual decides
+    solve           the first phase of `newton` (start.pxd), then its steps (newton/method.pxd); the judge's residual decides
 
 Natively and in WebAssembly the same lines, the same bits. What asks for another library, the augmented system, is left out;
 where that or `BUDGET` leaves the residual above tol, the best impulse found stays, and is told as such.
@@ -13,23 +13,31 @@ from libc.stdint cimport int32_t, int64_t, uint64_t
 
 import numpy as np
 
+from lavender_ext.core.method cimport CERTIFICATE, MORE, options_t, room_t, said_t
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.core.weights cimport block_weights, joint_weights
 from lavender_ext.engine.arrays cimport S_OUT, bind, engine_t
 from lavender_ext.engine.view cimport view
-from lavender_ext.newton.bodies cimport body_room, furnish_bodies, index_room, lay_bodies, make_pattern, pattern_t
-from lavender_ext.newton.plan cimport CERTIFICATE, MORE, newton_start, newton_step
-from lavender_ext.newton.scaling cimport find_elements
-from lavender_ext.newton.run cimport aim, impulse_of, judge_room, lay_judge, newton_t
+from lavender_ext.newton.method cimport bodies_room, bodies_start, system_step
 from lavender_ext.warm.start cimport (FACTORED, JUDGED, MOST_TRACED, UNDECIDED, band_width, judged, lay_out,
                                       observe, room_of, start_errors, warm_solve, warm_t)
 
 
 cdef enum:
-    HEAD = 4                    # whole numbers before the pattern: width of the band, those of the pattern
+    HEAD = 4                    # whole numbers before those of the method: width of the band, how many these are
     MOST = 2147483647
     BUDGET = 200                # factorisations: a picture waits for them
+
+
+cdef inline room_t method_room(const blocks_t* p, const rows_t* r) noexcept nogil:
+    """Whole numbers of Newton's method, 0 where it does not take the problem."""
+    cdef view_t v = view_t(p[0], NULL, r, NULL)
+    cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
+    if not bodies_room(&v, NULL, &room):
+        room.n_index = 0
+    return room
 
 
 cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
@@ -42,7 +50,7 @@ cdef public int32_t lav_newton_index_room(const int32_t* size, double* real, int
     cdef rows_t r
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    room = HEAD + (index_room(&p, &r) if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1
+    room = HEAD + (method_room(&p, &r).n_index if turns else 0) + r.n_bodies + 2 * <int64_t>r.n_joints + 1
     return <int32_t>room if room < MOST else -1
 
 
@@ -54,43 +62,43 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     cdef int64_t room
     cdef blocks_t p
     cdef rows_t r
-    cdef newton_t n
-    cdef pattern_t a
+    cdef view_t v
+    cdef room_t n
     bind(size, real, index, keys, &e, used)
     view(&e, &p, &r)
-    scratch[1] = <int32_t>index_room(&p, &r) if turns else 0
+    n = method_room(&p, &r)
+    scratch[1] = <int32_t>n.n_index if turns else 0
     scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
     room = room_of(&p, &r, scratch[0]) + p.n_rows
     if scratch[1] > 0:
-        lay_bodies(&n, &a, scratch + HEAD, &p, &r)
-        find_elements(&n.sc, &p, NULL, &r)
-        make_pattern(&n.sc, &a, &r)
-        room += judge_room(&p, &r, NULL) + body_room(&n, &a, &p, &r)
+        v = view_t(p, NULL, &r, NULL)
+        n.index = scratch + HEAD
+        bodies_start(&v, NULL, &n, NULL)                # finds the pattern, and how much more room it needs
+        room += n.n_real
     return <int32_t>room if room < MOST else -1
 
 
-cdef inline int32_t solve_in_turns(const blocks_t* p, const rows_t* r, warm_t* s, newton_t* n, double tol, double* lam,
+cdef inline int32_t solve_in_turns(const view_t* problem, const options_t* o, room_t* room, warm_t* s, double* lam,
                                    double* v) noexcept nogil:
     """What `warm_solve` has left undecided, also from lam = 0; UNDECIDED short of tol: lam is then the best that was scored."""
-    cdef int32_t how = MORE
-    n.tol, n.budget = tol, BUDGET
-    newton_start(n, lam)
+    cdef said_t said
+    cdef int32_t how = bodies_start(problem, o, room, lam)
     while how == MORE or how == CERTIFICATE:
-        how = newton_step(n, 1)
-        s.factorisations = n.s.factorisations
+        how = system_step(problem, o, room, 1, lam, &said)
+        s.factorisations = said.factorisations
         if s.trace != NULL:
-            judged(p, r, s, n.lam, v, n.problem.e0, n.problem.v0)
-    impulse_of(n, n.best_z, lam)
-    s.relative = judged(p, r, s, lam, v, n.problem.e0, n.problem.v0)
-    return FACTORED if n.best <= tol else UNDECIDED
+            judged(&problem.p, problem.r, s, said.tried, v, o.e0, o.v0)
+    s.relative = judged(&problem.p, problem.r, s, lam, v, o.e0, o.v0)
+    return FACTORED if said.relative <= o.tol else UNDECIDED
 
 
 cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s, double tol, int32_t turns,
                                    int32_t* scratch, double* room, double* lam, double* v) noexcept nogil:
     cdef int32_t j, how = warm_solve(p, r, s, tol, lam, v, 1)
     cdef double e0 = 1.0, v0 = 1.0
-    cdef newton_t n
-    cdef pattern_t a
+    cdef view_t problem
+    cdef options_t o
+    cdef room_t n
     if how != UNDECIDED or p.n_rows == 0 or not turns:
         return how
     s.relative = 1.0 / 0.0
@@ -104,12 +112,10 @@ cdef inline int32_t newton_substep(const blocks_t* p, const rows_t* r, warm_t* s
         return UNDECIDED
     if not scratch[1]:
         return UNDECIDED
-    lay_bodies(&n, &a, scratch + HEAD, p, r)
-    find_elements(&n.sc, p, NULL, r)                    # the pattern stands from `lav_newton_plan`
-    aim(&n, p, NULL, r, NULL)
-    furnish_bodies(&n, &a, lay_judge(&n, room), p, r)
-    n.problem.e0, n.problem.v0 = e0, v0
-    return solve_in_turns(p, r, s, &n, tol, lam, v)
+    problem = view_t(p[0], NULL, r, NULL)
+    o = options_t(0, BUDGET, 0, 0, 0, tol, e0, v0, 1.0 / 0.0)
+    n = room_t(scratch[1], MOST, scratch + HEAD, room, 1, 0, 0, 0.0)    # the pattern stands from `lav_newton_plan`
+    return solve_in_turns(&problem, &o, &n, s, lam, v)
 
 
 cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_t* index, uint64_t* keys, double tol,

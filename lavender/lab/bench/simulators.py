@@ -142,7 +142,8 @@ def parts(problem: Problem) -> tuple[float, float, float]:
         begin = perf_counter()
         newton = general.prepare(made)
         if newton is not None:
-            newton.run(impulse, TARGET, general.CLOCK)
+            newton.start(impulse, TARGET, general.CLOCK)
+            newton.step(general.CLOCK, impulse)
         kernel = min(kernel, perf_counter() - begin)
         judge = min(judge, least(lambda p=made, x=impulse: judged(p, x), 2))  # type: ignore[misc]
     return float(prepare), float(kernel), float(judge)

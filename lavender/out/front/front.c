@@ -57,8 +57,8 @@ struct lav_solver {
   struct sweep_serial_packing_t packing;
   struct accelerate_accelerated_sweep_data_t fast;
   struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
-  struct driver_driver_options_t newton_options;
-  struct driver_driver_room_t drive;
+  struct core_method_options_t newton_options;
+  struct core_method_room_t drive;
   int32_t driven;              /* Newton's method has begun, as `newton_options` says */
   blocks_t q;                  /* with d, nu and step of A, where a method goes over A */
   struct pivot_direct_direct_t direct;

@@ -248,12 +248,15 @@ static const double CLOSEST = 1e-2;
 static int32_t begin_newton(lav_solver *s, double tol, int32_t budget) {
   s->newton_options.tol = tol;
   s->newton_options.budget = budget;
+  s->newton_options.e0 = s->start[0];
+  s->newton_options.v0 = s->start[1];
+  s->newton_options.most = INFINITY;
   return k_start(&s->view, &s->newton_options, &s->drive, s->impulse);
 }
 
 static int32_t start_newton(lav_solver *s) {
   uint64_t from = s->used;
-  int32_t how = driver_driver_ROOM;
+  int32_t how = core_method_ROOM;
   s->newton_options.method = driver_driver_NEWTON;
   s->newton_options.wide = LAVENDER_HAS_WIDE();
   s->view = s->read;
@@ -266,12 +269,12 @@ static int32_t start_newton(lav_solver *s) {
     if (!k_room(&s->view, &s->newton_options, &s->drive)) return LAV_ERROR_UNSUPPORTED;
     from = s->used;
   }
-  while (how == driver_driver_ROOM) {
+  while (how == core_method_ROOM) {
     s->used = from;
     s->drive.index = TAKE(s, int32_t, s->drive.n_index);
     s->drive.real = TAKE(s, double, s->drive.n_real);
     if (s->is_short) return LAV_ERROR_ROOM;
-    how = s->view.a ? newton_plan_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
+    how = s->view.a ? core_method_MORE : begin_newton(s, s->newton_options.tol, s->newton_options.budget); /* as the last run: it tells the room */
   }
   s->driven = s->view.a == NULL;
   return LAV_OK;
@@ -292,9 +295,9 @@ static void keep_better(lav_solver *s, const double *begin) {
 }
 
 static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out) {
-  struct driver_driver_said_t said = {0, 0.0, NULL};
+  struct core_method_said_t said = {0, 0, 0, 0, 0.0, NULL, NULL};
   double closer = 1.0;
-  int32_t how = newton_plan_MORE, before = 0;
+  int32_t how = core_method_MORE, before = 0;
   lav_verdict now;
   COPY(s->compare, s->impulse, s->p.n_rows);
   if (!s->driven || budget->tol != s->newton_options.tol || budget->iterations != s->newton_options.budget)
@@ -302,9 +305,9 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
   s->driven = 0;
   while (out->outcome == LAV_MAX_ITERATIONS && out->iterations < budget->iterations) {
     how = k_step(&s->view, &s->newton_options, &s->drive, is_timed(budget) ? 1 : 1 << 30, s->impulse, &said);
-    out->iterations = before + said.factorisations;
-    if (how == newton_plan_SPENT) break;
-    if (how == newton_plan_REACHED) {
+    out->iterations = before + said.work;
+    if (how == core_method_SPENT) break;
+    if (how == core_method_REACHED) {
       judge(s, s->impulse, 1, &now); /* over velocities sums are rounded in another order, and vanish where squares do */
       if (now.relative <= budget->tol) out->outcome = LAV_CONVERGED;
       else if (closer <= CLOSEST || budget->iterations <= out->iterations) out->outcome = LAV_STALLED;
@@ -313,8 +316,8 @@ static void run_newton(lav_solver *s, const lav_budget *budget, lav_result *out)
         closer *= 0.25;
         begin_newton(s, closer * budget->tol, budget->iterations - before);
       }
-    } else if (how == newton_plan_FLOOR) out->outcome = LAV_FLOOR;
-    else if (how == newton_plan_STUCK) out->outcome = LAV_STALLED;
+    } else if (how == core_method_FLOOR) out->outcome = LAV_FLOOR;
+    else if (how != core_method_MORE && how != core_method_CERTIFICATE) out->outcome = LAV_STALLED;
     else if (is_late(s, budget)) out->outcome = LAV_TIME_LIMIT;
   }
   if (out->outcome != LAV_CONVERGED && out->outcome != LAV_FLOOR) keep_better(s, s->compare);

@@ -95,8 +95,8 @@ static int64_t newton_room(const lav_problem *q, const lav_options *o, int32_t n
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
   struct core_view_view_t view;
-  struct driver_driver_options_t newton;
-  struct driver_driver_room_t room;
+  struct core_method_options_t newton;
+  struct core_method_room_t room;
   csr_t none = {NULL, NULL, NULL};
   (void)o, (void)n_v;
   if (q->form == LAV_VELOCITIES) return 60 * m + 18 * k + 2 * nv * (nv < 180 ? nv : 180) + 2048;

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch
 from lavender.judge.residuals import judged, reference, remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender_ext.generalized.newton import ENDS, Newton
+from lavender_ext.driver.driver import OUTCOMES, Driver
 
 FORM = "generalized velocities"
 # Steps for each island between two looks at the clock and at Ctrl-C, at most as many as are counted for WATCHED [s]: at
@@ -28,25 +26,26 @@ FLOP = 1e-10  # s for each multiply-add of a dense factor
 CLOSEST = 1e-2  # of tol, up to which the kernel is asked again where the judge does not find what it found
 ROOM = 9e6  # values of one island's N: 3,000 velocities dense, 144 MB with its factor
 _STATUS = {
-    ENDS["done"]: Status.CONVERGED,
-    ENDS["spent"]: Status.MAX_ITERATIONS,
-    ENDS["stuck"]: Status.STALLED,
-    ENDS["failed"]: Status.NUMERICAL_ERROR,
-    ENDS["lost"]: Status.DIVERGED,
+    OUTCOMES["reached"]: Status.CONVERGED,
+    OUTCOMES["more"]: Status.MAX_ITERATIONS,
+    OUTCOMES["stuck"]: Status.STALLED,
+    OUTCOMES["broken"]: Status.NUMERICAL_ERROR,
+    OUTCOMES["lost"]: Status.DIVERGED,
 }
+NO_END = 2**31 - 1  # steps: who leads them counts them
 _WORDS = ("factorisations", "Coulomb rounds", "line evaluations")
 
 
-def prepare(problem: Problem) -> Newton | None:
+def prepare(problem: Problem) -> Driver | None:
     """Islands and room for them; None where N of one is too large to be kept."""
     reference(problem)
-    kernel = Newton(problem.metric, ROOM)
+    kernel = Driver(problem.metric, ROOM)
     return kernel if kernel.fits else None
 
 
 def run(
     problem: Problem,
-    kernel: Newton,
+    kernel: Driver,
     impulse: FloatArray,
     max_iter: int,
     tol: float,
@@ -58,7 +57,7 @@ def run(
     `again`: on from where a run before, to the same tol, has used up its steps.
     """
     deadline, watch = Deadline(time_limit), Stopwatch()
-    counts = np.zeros(4, np.int64)
+    counts = [0, 0, 0, 0]
     status, closer = Status.MAX_ITERATIONS, 1.0
     now = 0.0
     islands = max(1, kernel.islands)
@@ -71,9 +70,12 @@ def run(
         if deadline.passed(min(step, 1e6)):
             status = Status.TIME_LIMIT
             break
-        end, done = kernel.run(impulse, closer * tol, min(steps, max_iter - int(counts[0])), again)
-        counts += done
-        status = _STATUS[end]
+        if not again:
+            kernel.start(impulse, closer * tol, NO_END)
+        before = kernel.counts
+        status = _STATUS[kernel.step(min(steps, max_iter - counts[0]), impulse)]
+        done = [now - then for now, then in zip(kernel.counts, before, strict=True)]
+        counts = [count + more for count, more in zip(counts, done, strict=True)]
         if status is Status.CONVERGED and not confirmed(problem, impulse, tol):
             # Its sums are rounded in another order, and vanish where squares do.
             status = Status.MAX_ITERATIONS if closer > CLOSEST else Status.STALLED
@@ -91,7 +93,7 @@ def run(
             status = Status.TIME_LIMIT
             break
         if left is not None:
-            step = max(now / max(1, int(counts[0])), (now - last) / max(1, int(done[0])))
+            step = max(now / max(1, counts[0]), (now - last) / max(1, done[0]))
             steps = max(1, int(min(clock, TIME_SHARE * left / max(step, counted, 1e-9))))
     return claim(status, counts)
 
@@ -105,6 +107,6 @@ def confirmed(problem: Problem, impulse: FloatArray, tol: float) -> bool:
 
 def claim(status: Status, counts: Any) -> Claim:
     """What (steps, factorisations, rounds, evaluations) come to in words."""
-    done, *parts = (int(c) for c in counts)
+    done, *parts = counts
     work = {word: c for word, c in zip(_WORDS, parts, strict=True) if c or word == _WORDS[0]}
     return Claim(status, done, work, form=FORM)

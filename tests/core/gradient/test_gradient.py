@@ -288,6 +288,70 @@ def test_a_batch_is_each_one_alone(operator):
     )
 
 
+def test_arrays_of_a_batch_are_those_of_its_gradients():
+    # one after the other, of what the compiled call takes and of what goes alone: a matrix, a singular system
+    rng = np.random.default_rng(0)
+    problems = [drawn(seed, "disk", "cone", "generalized") for seed in range(3)]
+    twice = lv.Problem.from_jacobian(
+        np.ones((2, 1)), np.eye(1), [-1.0], cones=lv.Cones.bounded(np.zeros(2), np.inf)
+    )
+    for given in (problems, [*problems, twice, drawn(3, "ellipse", "cone", "generalized")]):
+        solutions = lv.solve_many(given, tol=1e-12)
+        weights = [rng.standard_normal(p.generalized.nv) for p in given]
+        for answers in (solutions, [s.impulse for s in solutions], [s.impulse.tolist() for s in solutions]):
+            d = lv.derivatives(given, answers)
+            found = d.vjp(velocity=weights)
+            each = [
+                lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)
+            ]
+            assert np.array_equal(found.v_free, np.concatenate([g.v_free for g in each]))
+            assert np.array_equal(found.mu, np.concatenate([g.mu for g in each]))
+            assert np.array_equal(found[-1].v_free, each[-1].v_free) and len(found[:2]) == 2
+        if twice in given:
+            with pytest.raises(lv.CapabilityError, match="share a load"):
+                found.b  # noqa: B018 - read
+        else:
+            assert np.array_equal(found.b, np.concatenate([g.b for g in each]))
+            lists = d.vjp(velocity=[y.tolist() for y in weights])
+            assert np.array_equal(lists.b, found.b)
+        weights[1][0] = np.nan
+        with pytest.raises(lv.InputError, match="problem 1: velocity"):
+            d.vjp(velocity=weights)
+
+
+def test_what_an_array_of_a_batch_is_not():
+    p = drawn(0, "disk", "cone", "generalized")
+    found = lv.derivatives([p], [solved(p)]).vjp(impulse=[np.ones(p.m)])
+    with pytest.raises(AttributeError, match=r"gradients have no 'M' of all problems; \[i\]"):
+        found.M  # noqa: B018 - read
+    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is no matrix"):
+        found[0].full("mu")
+    assert repr(found) == "<Gradients of 1 problems>" and "compliance, J, M>" in repr(found[0])
+    assert repr(lv.derivatives([p], [solved(p)])[0]).startswith(f"<Derivative of {p.m} rows: ")
+
+
+def test_a_stacked_batch_and_solutions_of_other_problems():
+    rng = np.random.default_rng(0)
+    batch = lv.Batch(
+        rng.standard_normal((3, 6, 7)),
+        np.tile(np.eye(7), (3, 1, 1)),
+        rng.standard_normal((3, 7)),
+        cones=lv.Cones.contacts(0.5, 2, count=5),
+        count=[6, 3, 6],  # the second has room for three rows more
+        friction="cone",
+    )
+    solutions = lv.solve_many(batch, tol=1e-12)
+    found = lv.derivatives(batch, solutions).vjp(velocity=np.ones((3, 7)))
+    for i, g in enumerate(found):
+        alone = lv.derivative(batch[i], solutions[i]).vjp(velocity=np.ones(7))
+        assert np.array_equal(g.b, alone.b) and np.array_equal(found.v_free[7 * i : 7 * i + 7], alone.v_free)
+    with pytest.raises(lv.InputError, match="problem 0: this is no solution"):
+        lv.derivatives(batch[::-1], solutions)
+    others = [drawn(seed, "free", "cone", "generalized") for seed in range(3)]
+    with pytest.raises(lv.InputError, match=r"problem 0: impulse .* has shape"):
+        lv.derivatives(others, solutions)
+
+
 def test_batches_of_another_length_are_refused():
     p = drawn(0, "disk", "cone", "generalized")
     s = solved(p)
@@ -299,7 +363,7 @@ def test_batches_of_another_length_are_refused():
         lv.derivatives([p], [s]).vjp(velocity=[1, 2])
     with pytest.raises(lv.InputError, match="a list of them is needed"):
         lv.derivatives(p, s)
-    assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]) == []
+    assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
 
 
 @pytest.mark.parametrize("count", [3, 170])  # dense; sparse

@@ -17,7 +17,7 @@ from lavender.problem import generalized as coordinates
 from lavender.solvers.newton import Newton
 from lavender.solvers.newton_systems import general
 from lavender.solvers.sweeping import reads_whitened
-from lavender_ext.generalized.newton import ENDS
+from lavender_ext.driver.driver import OUTCOMES
 
 # -- the operator ----------------------------------------------------------------------------------
 
@@ -220,11 +220,14 @@ def test_slow_steps_are_few_between_two_looks_and_end_where_many_do(monkeypatch)
 
     class Spy:
         def __init__(self, kernel):
-            self.kernel, self.islands, self.work = kernel, kernel.islands, kernel.work
+            self.kernel = kernel
 
-        def run(self, impulse, tol, steps, *rest):
+        def __getattr__(self, name):
+            return getattr(self.kernel, name)
+
+        def step(self, steps, impulse):
             asked.append(steps)
-            return self.kernel.run(impulse, tol, steps, *rest)
+            return self.kernel.step(steps, impulse)
 
     monkeypatch.setattr(general, "WATCHED", 0.0)
     impulse = problem.start()
@@ -308,23 +311,26 @@ def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(frictio
     """Cut anywhere, in one of several islands: the same impulse and counts."""
     problem = random_general(seed, friction, n=24, compliance=False)
     whole, cut = problem.start(), problem.start()
-    end, counts = general.prepare(problem).run(whole, 1e-9, 90)
-    kernel, done, now, again = general.prepare(problem), np.zeros(4, int), ENDS["spent"], False
-    while now == ENDS["spent"] and done[0] < 90:
-        now, more = kernel.run(cut, 1e-9, min(steps, 90 - done[0]), again)
-        done, again = done + more, kernel.waits
-    assert (now, tuple(done)) == (end, counts)
-    assert kernel.waits == (end == ENDS["spent"])
+    once, kernel = general.prepare(problem), general.prepare(problem)
+    once.start(whole, 1e-9, 90)
+    kernel.start(cut, 1e-9, 90)
+    end = OUTCOMES["more"]
+    while end == OUTCOMES["more"]:
+        end = kernel.step(steps, cut)
+    assert once.step(90, whole) == end
+    assert kernel.counts == once.counts
     np.testing.assert_array_equal(cut, whole)
 
 
-def test_newton_that_waits_begins_anew_unless_it_is_told_to_go_on():
+def test_newton_that_waits_begins_anew_where_it_is_started_anew():
     problem = random_general(3, "coulomb", n=24, compliance=False)
     kernel, fresh = general.prepare(problem), problem.start()
-    end, counts = kernel.run(fresh, 1e-9, 5)
-    assert end == ENDS["spent"] and kernel.waits
+    kernel.start(fresh, 1e-9, 90)
+    end, counts = kernel.step(5, fresh), kernel.counts
+    assert end == OUTCOMES["more"] and kernel.waits
     other = problem.start()
-    assert kernel.run(other, 1e-9, 5) == (end, counts)
+    kernel.start(other, 1e-9, 90)
+    assert (kernel.step(5, other), kernel.counts) == (end, counts)
     np.testing.assert_array_equal(other, fresh)
 
 

@@ -75,12 +75,16 @@ def test_cheap_first_steps_promise_nothing_of_those_that_follow(monkeypatch):
     clock, asked = [0.0], []
 
     class Kernel:
-        islands, work, ends = 1, general.prepare(problem).work, general.ENDS["spent"]
+        islands, work, counts = 1, general.prepare(problem).work, (0, 0, 0, 0)
 
-        def run(self, impulse, tol, steps, again):
+        def start(self, impulse, tol, budget):
+            pass
+
+        def step(self, steps, impulse):
             asked.append(steps)
             clock[0] += 1e-3 if len(asked) == 1 else 0.4 * steps
-            return self.ends, np.array([steps, 0, 0, 0])
+            self.counts = (sum(asked), 0, 0, 0)
+            return general.OUTCOMES["more"]
 
     monkeypatch.setattr(general, "FLOP", 1e-8)
     monkeypatch.setattr("lavender.base.deadline.perf_counter", lambda: clock[0])

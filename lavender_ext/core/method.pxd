@@ -1,0 +1,70 @@
+"""A method as three functions on plain structs: room, start, step. Nothing here needs Python, allocates, or looks at a clock.
+
+    view_t v          a problem: its blocks with d and nu, and one of A, bodies, J and M
+    options_t o       which method, to what tolerance, with how much work
+    room_t r          the caller's arrays
+    room(&v, &o, &r)            -> r.n_index, r.n_real as a first guess; 0: the method does not take this problem
+    start(&v, &o, &r, lambda)   -> MORE | ROOM (r.n_index, r.n_real say how much; give it, start again) | an end
+    step(&v, &o, &r, work, lambda, &s) -> MORE | another outcome, lambda the best so far
+
+What a start finds before it knows how much room it needs stands in r.index, and is found once: what r says of the problem
+(`laid`) is true from the first answer of ROOM that asks for no more whole numbers. What a method keeps stands in r, which
+may not move between start and the last step, as little as the arrays of v.
+"""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.core.view cimport view_t
+
+
+cdef enum:                      # outcomes
+    MORE = 0
+    REACHED = 1                 # tol
+    FLOOR = 2                   # within twice what rounding leaves
+    STUCK = 3
+    CERTIFICATE = 4             # `direction` may prove that there is no solution: the caller looks, and calls again
+    SPENT = 5                   # the budget, or `stop`
+    ROOM = 6
+    UNFIT = 7                   # the method does not take this problem
+    BROKEN = 8                  # a factor has no sound pivots
+    LOST = 9                    # numbers are not finite
+
+
+cdef struct options_t:
+    int32_t method
+    int32_t budget              # units of work
+    int32_t proven              # the direction of a CERTIFICATE is a proof
+    int32_t stop                # end with what is there
+    int32_t wide                # four lanes are one instruction: the same bits, sooner
+    double tol                  # relative residual
+    double e0                   # error of doing nothing, as the judge has it: sqrt J
+    double v0                   # m/s
+    double most                 # doubles of one factor, above which the method does not take the problem
+
+
+cdef struct room_t:
+    int64_t n_index
+    int64_t n_real
+    int32_t* index              # a multiple of 8 bytes
+    double* real
+    int32_t laid                # what follows is known, and stands in index
+    int32_t tries               # layouts that were too small
+    int32_t islands
+    double work                 # multiply-adds of one factor
+
+
+cdef struct said_t:             # since the start
+    int32_t work                # in the method's unit
+    int32_t factorisations
+    int32_t rounds              # over J and M: of Coulomb friction,
+    int32_t evaluations         # and of lambda along a line
+    double relative             # residual of lambda, -1: not known
+    const double* direction     # (m) N s of a CERTIFICATE, or NULL
+    const double* tried         # (m) N s, the impulse that was judged last, or NULL
+
+
+cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
+    """Is there as much? Else that is what is needed."""
+    cdef bint enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
+    if not enough:
+        r.n_index, r.n_real = n_index, n_real
+    return enough

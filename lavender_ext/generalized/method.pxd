@@ -1,0 +1,67 @@
+"""Newton's method over generalised velocities as room, start and step (`core/method.pxd`).
+
+The unit of work is a step of one island; 0 judges what is there. `room_t.work` has N of all islands and a factor of each.
+"""
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.method cimport MORE, ROOM, SPENT, UNFIT, grant, options_t, room_t, said_t
+from lavender_ext.core.view cimport view_t
+from lavender_ext.generalized.flow cimport flow_t
+from lavender_ext.generalized.islands cimport aim_at, furnish, marks_of, need_t, numbers_of, settle
+from lavender_ext.generalized.newton cimport descend_all
+from lavender_ext.generalized.sparse cimport per_column
+
+
+cdef struct state_t:            # at the beginning of the room's whole numbers
+    flow_t f
+    need_t need
+    int32_t done                # steps
+
+
+cdef inline int32_t general_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil:
+    """Whole numbers for the least fill; the others are known when the fill is."""
+    r.n_index = sizeof(state_t) // sizeof(int32_t) + marks_of(&v.p, v.g, per_column(v.g.n) << r.tries)
+    r.n_real = 0
+    return 1
+
+
+cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
+    cdef state_t* s = <state_t*>r.index
+    cdef need_t* need = &s.need
+    cdef int32_t per
+    cdef room_t least = r[0]
+    while not r.laid:
+        general_room(v, o, &least)
+        if not grant(r, least.n_index, 0):
+            return ROOM
+        per = per_column(v.g.n) << r.tries
+        settle(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
+        r.laid = not need.crowded
+        r.work, r.islands = need.work, s.f.n_islands
+        if (need.crowded and <double>per * v.g.n > o.most) or (r.laid and need.values > o.most):
+            return UNFIT
+        least.tries = r.tries = r.tries + (1 - r.laid)  # L has more entries than that in a row
+    if not grant(r, r.n_index, numbers_of(&s.f, need)):
+        return ROOM
+    furnish(&s.f, need, r.real)
+    aim_at(&s.f, o.tol, 0, o.e0, o.v0)
+    s.done = 0
+    return MORE
+
+
+cdef inline int32_t general_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
+                                 said_t* said) noexcept nogil:
+    """All islands, the one that waits first."""
+    cdef state_t* s = <state_t*>r.index
+    cdef int32_t how = SPENT, left = o.budget - s.done
+    said.direction = said.tried = NULL
+    said.relative = -1.0
+    if left > 0 and not o.stop:
+        s.f.steps = work = work if work < left else left
+        how = descend_all(&s.f, lam)
+        s.done += work - s.f.steps
+        if how == MORE and s.done >= o.budget:
+            how = SPENT
+    said.work, said.factorisations = s.done, s.f.factorisations
+    said.rounds, said.evaluations = s.f.rounds, s.f.evaluations
+    return how
