@@ -49,8 +49,8 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 
 #: Modules of these names are exempt from the check of what a core reaches, with the reason. `threaded` yields and
 #: sleeps by the system's calls; `checked_sweeps` calls the Python faces of kernels one after the other, `many` and
-#: `call` the kernels themselves, and allocate what these need; `checks` and `blocks` read arrays of Python, `newton`
-#: and `solve` are the driver's newton for Python. The arithmetic of all is that of other modules, which this
+#: `call` the kernels themselves, and allocate what these need; `checks` and `blocks` read arrays of Python, `method`
+#: and `solve` lead the driver's newton for Python. The arithmetic of all is that of other modules, which this
 #: check sees, but for the logarithms by which `checked_sweeps` guesses about sweeps; that of `pgs`, `serial`,
 #: `accelerated`, `direct`, `lemke`, `principal`, `measure` and `watch` is cut out for the C library, which refuses what
 #: needs Python.
@@ -69,7 +69,7 @@ EXEMPT = {
     "principal": "called by direct; the C library has it whole",
     "measure": "thin entries of the judge for Python; the C library has it whole",
     "watch": "the loop of sweeps and checks for Python; the C library has it whole",
-    "newton": "makes room for Python; its arithmetic is in the driver's core",
+    "method": "leads the steps of a method for Python, computes nothing",
     "start": "makes room for Python; its arithmetic is in the substep's core",
     "solve": "calls the turns that the driver calls, in arrays of Python",
 }

@@ -29,7 +29,8 @@ from lavender.out.library import HERE
 from lavender.out.view import METHODS, OTHER_BITS, NotTaken, choices, takes, view
 from lavender.solvers import registry
 from lavender.solvers.steps import METHODS as CANDIDATES
-from lavender_ext.driver.driver import OUTCOMES, Driver
+from lavender_ext.core.method import OUTCOMES
+from lavender_ext.driver.driver import Driver
 
 __all__ = ["Step", "driven", "file_of", "made", "pack", "pack_problem", "steps_of"]
 

@@ -43,7 +43,8 @@ from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
-from lavender_ext.newton.solve import COUNTED, OUTCOMES
+from lavender_ext.core.method import OUTCOMES
+from lavender_ext.newton.solve import COUNTED
 
 FORMS = ("auto", "velocity", "impulse")
 ROWS = 3000  # up to which A is formed where velocities did not end it
@@ -63,7 +64,7 @@ class NewtonState:
 
     problem: Problem
     system: System | None  # None where nothing moves
-    general: Any = None  # lavender_ext.generalized.newton.Newton, in generalised coordinates
+    general: Any = None  # lavender_ext.driver.driver.Driver, in generalised coordinates
     begun: bool = False  # by `turn`
 
     @property
@@ -196,7 +197,7 @@ class Newton(Solver):
                 state.problem, state.system, impulse, n, tol, time_limit, again, left or SPEC.max_iter
             )
         claim = general.run(state.problem, state.general, impulse, n, tol, time_limit, again)
-        if claim.status is Status.MAX_ITERATIONS and not state.general.waits:
+        if claim.status is Status.MAX_ITERATIONS and state.general.how != OUTCOMES["more"]:
             return Claim(Status.STALLED, claim.iterations, claim.work)
         return claim
 
@@ -245,7 +246,7 @@ class Newton(Solver):
             impulse[:] = system.solve.fixed
             return Claim(Status.STALLED, 0, {"factorisations": 0}, "no row can move")
         sweeps = worked = 0
-        before = system.solve.factorisations if again else 0
+        before = system.solve.done if again else 0
         if self.form == "auto" and problem.rows is not None and not again:
             how, sweeps, worked = warm_start(problem, impulse, tol, max_iter, time_limit)
             claim = claim_of(how, sweeps, worked)
@@ -254,9 +255,9 @@ class Newton(Solver):
         max_iter -= worked
         status, certificate = _turns(problem, system, impulse, max_iter, tol, time_limit, again, more)
         solve = system.solve
-        factorisations = worked + solve.factorisations - before
+        factorisations = worked + solve.done - before
         message = ", ".join(
-            counted(count, what) for count, what in zip(solve.counts, COUNTED, strict=True) if count
+            counted(count, what) for count, what in zip(solve.ran, COUNTED, strict=True) if count
         )
         work = {"factorisations": factorisations} | ({"sweeps": sweeps} if sweeps else {})
         return Claim(status, factorisations, work, message, form=system.form, certificate=certificate)
@@ -279,39 +280,36 @@ def _turns(
     deadline = Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
-    last = max_iter + (solve.factorisations if again else 0)
+    last = max_iter + (solve.done if again else 0)
     if not again:
         solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
     if more:
         solve.allow(more)
     try:
         while True:
-            before = solve.factorisations
+            before = solve.done
             most = WATCHED / max(system.seconds, 1e-6)
             left, watch = deadline.left(), Stopwatch()
             if left is not None:
                 # Of the first the pace is only counted.
-                most = (
-                    min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.factorisations else 1.0
-                )
+                most = min(most, TIME_SHARE * left / max(system.seconds, 1e-9)) if solve.done else 1.0
                 if left <= system.seconds:
                     late = True
                     solve.stop()
-            end = solve.step(max(1, int(min(most, last - before) if more else most)))
-            if solve.factorisations > before:
-                system.took(watch.seconds / (solve.factorisations - before))
+            end = solve.step(max(1, int(min(most, last - before) if more else most)), impulse)
+            if solve.done > before:
+                system.took(watch.seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:
                 certificate = solve.direction
                 proven = check_certificate(problem, certificate, tol) is None
                 if proven:
                     solve.prove()
-            elif end != OUTCOMES["more"] or (more and solve.factorisations >= last):
+            elif end != OUTCOMES["more"] or (more and solve.done >= last):
                 break
     except KeyboardInterrupt:
         interrupted = True  # the best iterate goes back all the same
         solve.stop()
-        solve.step(1)
-    solve.take(impulse)
+        solve.step(1, impulse)
     if interrupted:
         return Status.INTERRUPTED, None
     if proven:
@@ -321,7 +319,7 @@ def _turns(
     if end == OUTCOMES["spent"]:
         if more and not late:
             return Status.STALLED, certificate  # none may follow
-        return (Status.TIME_LIMIT if late and solve.factorisations < last else Status.MAX_ITERATIONS), None
+        return (Status.TIME_LIMIT if late and solve.done < last else Status.MAX_ITERATIONS), None
     return _ENDS[end], certificate
 
 

@@ -13,6 +13,7 @@ may not move between start and the last step, as little as the arrays of v.
 """
 from libc.stdint cimport int32_t, int64_t
 
+from lavender_ext.core.problem cimport Data
 from lavender_ext.core.view cimport view_t
 
 
@@ -62,9 +63,26 @@ cdef struct said_t:             # since the start
     const double* tried         # (m) N s, the impulse that was judged last, or NULL
 
 
+cdef struct method_t:
+    int32_t (*room)(const view_t*, const options_t*, room_t*) noexcept nogil
+    int32_t (*start)(const view_t*, const options_t*, room_t*, const double*) noexcept nogil
+    int32_t (*step)(const view_t*, const options_t*, const room_t*, int32_t, double*, said_t*) noexcept nogil
+
+
 cdef inline bint grant(room_t* r, int64_t n_index, int64_t n_real) noexcept nogil:
     """Is there as much? Else that is what is needed."""
     cdef bint enough = r.n_index >= n_index and r.n_real >= n_real and (r.real != NULL or n_real == 0)
     if not enough:
         r.n_index, r.n_real = n_index, n_real
     return enough
+
+
+cdef class Method:
+    cdef Data data
+    cdef view_t view
+    cdef options_t options
+    cdef room_t space
+    cdef said_t said
+    cdef method_t own
+    cdef readonly int how       # it stands: one of `OUTCOMES`
+    cdef void aim(self, double tol, int budget) noexcept

@@ -14,12 +14,6 @@ cdef enum:                      # methods
     NEWTON = 0
 
 
-cdef struct method_t:
-    int32_t (*room)(const view_t*, const options_t*, room_t*) noexcept nogil
-    int32_t (*start)(const view_t*, const options_t*, room_t*, const double*) noexcept nogil
-    int32_t (*step)(const view_t*, const options_t*, const room_t*, int32_t, double*, said_t*) noexcept nogil
-
-
 cdef public int32_t lav_room(const view_t* v, const options_t* o, room_t* r) noexcept nogil
 cdef public int32_t lav_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,

@@ -1,7 +1,7 @@
 """Newton's method on one problem for Python: arrays that `newton_t` points into."""
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.problem cimport Data
+from lavender_ext.core.method cimport Method
 from lavender_ext.newton.bodies cimport pattern_t
 from lavender_ext.newton.run cimport newton_t
 from lavender_ext.newton.system cimport others_t
@@ -17,10 +17,9 @@ cdef class Layout:
     cdef readonly double work                           # multiply-adds of a factor
 
 
-cdef class Solve:
-    cdef newton_t n
+cdef class Solve(Method):
+    cdef newton_t* n
     cdef others_t calls
-    cdef Data data
     cdef list held
     cdef object others, raised, real, index
     cdef readonly object keep, block, ptr, part, wptr, fixed, scale, theta, g, lower, upper, reach

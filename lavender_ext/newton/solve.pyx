@@ -8,7 +8,7 @@ from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
 from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.method cimport CERTIFICATE, FLOOR, MORE, REACHED, SPENT, STUCK
+from lavender_ext.core.method cimport Method, method_t
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
@@ -19,19 +19,18 @@ from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay_pattern, order_bodies, order_index,
                                          panel_of, pattern_t)
 from lavender_ext.newton.interior cimport ipm_scale
+from lavender_ext.newton.method cimport begin, head, state_of, system_step
 from lavender_ext.newton.path cimport path_compliance, smooth
 from lavender_ext.newton.phases cimport begin_exchanges, exchange_once, sides
-from lavender_ext.newton.plan cimport newton_start, newton_step
 from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INTERIOR, N_COUNTED, PATH, POLISH, PROXIMAL, PURSUIT,
-                                      RELAXED, aim, furnish, impulse_of, judge_room, lay_index, lay_judge, newton_t,
-                                      own_index, own_room, proof_of, relative_at)
+                                      RELAXED, aim, furnish, judge_room, lay_index, lay_judge, newton_t, own_index,
+                                      own_room, relative_at)
 from lavender_ext.newton.scaling cimport find_elements
 from lavender_ext.newton.steps cimport begin_interior, duals, interior_step, slips, turn
 from lavender_ext.newton.system cimport (DENSE, OF_BARRIER, OF_NATURAL, OF_PAIR, SPARSE, dense_room,
                                          natural_times, others_t, solve_natural, solve_refined, system_factor,
                                          system_natural, system_sign, system_solve, system_times)
 
-OUTCOMES = {"more": MORE, "reached": REACHED, "floor": FLOOR, "stuck": STUCK, "certificate": CERTIFICATE, "spent": SPENT}
 WHATS = {"barrier": OF_BARRIER, "pair": OF_PAIR, "natural": OF_NATURAL}
 #: Phases by the bits of `Solve.without`.
 PHASES = {
@@ -47,7 +46,7 @@ PHASES = {
 }
 #: Of s on z, along a path of smoothed problems.
 COMPLIANCE = path_compliance()
-#: What `Solve.counts` counts, as the message of a solution names it.
+#: What `Solve.ran` counts, as the message of a solution names it.
 COUNTED = (
     "exchanges",
     "refinements",
@@ -146,27 +145,24 @@ cdef class Solve:
     """
 
     def __init__(self, Data data, Data matrix=None):
-        cdef newton_t* n = &self.n
+        cdef newton_t* n
         cdef const csr_t* a = NULL
         cdef const rows_t* r = NULL
         cdef int64_t rows = data.blocks.n_rows, k
-        aim(n, &data.blocks, NULL, NULL, NULL)
+        self.data, self.view, self.own = data, data.view(), method_t(NULL, NULL, system_step)
+        self.index = np.zeros(head() + own_index(rows) + 1, np.int32)
+        self.space.index = <int32_t*>address(self.index)
+        n = self.n = state_of(&self.space)
+        aim(n, &self.view.p, self.view.a, self.view.r, self.view.g)
         n.problem.e0, n.problem.v0 = data.start_energy, data.start_velocity
-        if data.is_general:
-            n.problem.g = &data.general
-        elif data.factored:
-            n.problem.r = &data.rows
-        else:
-            n.problem.a = &data.csr
         if matrix is not None:
             a = &matrix.csr
         else:
             r = &data.rows
         judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
-        self.index = np.empty(own_index(rows) + 1, np.int32)
-        self.data, self.held = data, [matrix, judge]
+        self.held = [matrix, judge]
         lay_judge(n, <double*>address(judge))
-        lay_index(n, rows, <int32_t*>address(self.index))
+        lay_index(n, rows, self.space.index + head())
         find_elements(&n.sc, &n.problem.p, a, r)
         self.real = zeros(own_room(rows, n.sc.small))
         furnish(n, a, r, <double*>address(self.real))
@@ -261,62 +257,28 @@ cdef class Solve:
         for i in range(PARTS):
             x[i] = <double*>address(values[i])
         self.held += [panel, layout, own, values]
-        furnish_factor(&self.n, &a, <double*>address(panel), &columns[0], s, lu, super_, places, x)
+        furnish_factor(self.n, &a, <double*>address(panel), &columns[0], s, lu, super_, places, x)
 
     # -- turns -------------------------------------------------------------------------------------
 
     def start(self, const double[::1] impulse, double tol, int budget):
         """From impulse (rows,), to a relative residual of tol, with so many factorisations."""
-        cdef newton_t* n = &self.n
-        n.tol, n.budget = tol, budget
+        self.aim(tol, budget)
         self.raised = None
         with nogil:
-            newton_start(n, &impulse[0])
+            begin(self.n, &self.options, &impulse[0])
 
-    def step(self, int work):
-        """`work` factorisations or a few more; one of `OUTCOMES`."""
-        cdef int32_t how
-        with nogil:
-            how = newton_step(&self.n, work)
+    def step(self, int work, double[::1] impulse):
+        """`work` factorisations or a few more; how it stands, impulse (rows,) the best so far."""
+        Method.step(self, work, impulse)
         if self.raised is not None:
             error, self.raised = self.raised, None
             raise error
-        return how
-
-    def take(self, double[::1] impulse):
-        """The best so far into impulse (rows,)."""
-        impulse_of(&self.n, self.n.best_z, &impulse[0])
-
-    def allow(self, int more):
-        """So many factorisations more at most."""
-        self.n.budget = min(self.n.budget, self.n.s.factorisations + more)
-
-    def stop(self):
-        """There is no time for another factorisation: the next step judges what is there, and ends."""
-        self.n.stop = 1
-
-    def prove(self):
-        """`direction` is a proof that there is no solution."""
-        self.n.proven = 1
+        return self.how
 
     @property
-    def factorisations(self):
-        """Done since the start."""
-        return self.n.s.factorisations
-
-    @property
-    def best(self):
-        """Lowest relative residual."""
-        return self.n.best
-
-    @property
-    def direction(self):
-        """(rows,) along which a certificate was asked for."""
-        return np.asarray(<double[:self.n.problem.p.n_rows]><double*>proof_of(&self.n)).copy()
-
-    @property
-    def counts(self):
-        """What ran, in the order of `COUNTED`."""
+    def ran(self):
+        """How often what ran, in the order of `COUNTED`."""
         return [self.n.counts[i] for i in range(N_COUNTED)]
 
     @property
@@ -346,7 +308,7 @@ cdef class Solve:
 
     def smooth(self, const double[::1] z, double tau, double wide=1.0):
         """F (m,) of path.pxd with c = wide, and dF / d log tau (m,); its derivative's small matrices into p, einv and v."""
-        cdef newton_t* n = &self.n
+        cdef newton_t* n = self.n
         n.s.law, n.path.wide = COULOMB, wide
         smooth(n, &z[0], tau, True)
         return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
@@ -382,7 +344,7 @@ cdef class Solve:
 
     def exchange(self, const double[::1] z):
         """One exchange from z (m,): (whether it is finite, z after it, relative residual, rows that changed)."""
-        cdef newton_t* n = &self.n
+        cdef newton_t* n = self.n
         n.depth = 0
         begin_exchanges(n, &z[0])
         n.depth = 0
@@ -393,23 +355,23 @@ cdef class Solve:
 
     def begin(self, double delta, double share=0.0):
         """The first point of an interior point."""
-        begin_interior(&self.n, delta, share)
+        begin_interior(self.n, delta, share)
 
     def advance(self):
         """A step of it: (whether it went, its length, gap before it, |F| and velocity error after it)."""
-        went = interior_step(&self.n)
+        went = interior_step(self.n)
         return went, self.n.ip.length, self.n.ip.gap, self.n.ip.energy, self.n.ip.velocity
 
     @property
     def point(self):
         """z, u1, u2 (m,) of it."""
-        cdef newton_t* n = &self.n
+        cdef newton_t* n = self.n
         return tuple(np.asarray(x).copy() for x in (
             <double[:self.m]>n.ip.z, <double[:self.m]>n.ip.u1, <double[:self.m]>n.ip.u2))
 
     def weigh(self, double delta):
         """The interior point's V = (W + theta + delta)^-1 and B, V = B B^T, into v and bt; the gap."""
-        cdef newton_t* n = &self.n
+        cdef newton_t* n = self.n
         cdef double gap
         ipm_scale(n.s.e, n.ip.z, n.ip.u1, n.ip.u2, delta, n.s.v, n.s.bt, &gap)
         return gap

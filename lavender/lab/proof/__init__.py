@@ -18,7 +18,7 @@ where each inequality holds over the box of the zero, it is a solution. Rows tha
 included, keep the impulse that they were given: the impulses are one of a family, the velocities are those of all.
 Balls cannot tell a zero from a small number: a row that carries nothing and has w = 0 is proven where it depends, as
 exactly, on rows that have, or where a solution in rational numbers says so (nothing slides, up to RATIONAL unknowns);
-else it is named as on the border of two cases.
+else it is named as on the border of two cases, unless a proof begins from an answer of OTHERS, inside of a family.
 
 Needs python-flint (extra `proof`).
 """
@@ -27,15 +27,23 @@ from __future__ import annotations
 
 from typing import Any
 
+from lavender.base.arrays import FloatArray
+from lavender.base.errors import CapabilityError
 from lavender.judge.solution import Solution
 from lavender.lab.motion.reference import PROOF, judged, kept, reference
 from lavender.lab.proof.numbers import balls
 from lavender.lab.proof.search import Enclosure, Search
 from lavender.problem import Problem, check_problem
+from lavender.solving.solve import solve
 
 __all__ = ["Enclosure", "enclosed", "prove", "require"]
 
 BITS = (128, 256)  # of the balls: what the first leave undecided the second try
+# Where impulses are a family, an answer at its edge is between two cases; these end inside of it.
+OTHERS = ("newton", "admm")
+OTHERS_ROWS = 2000
+SECONDS = 10.0  # for each of them
+NEAR = 1e-6  # of the largest b: from the velocities of the answer
 
 
 def prove(problem: Problem, solution: Any) -> Enclosure:
@@ -76,9 +84,25 @@ def prove(problem: Problem, solution: Any) -> Enclosure:
     """
     check_problem(problem)
     given = problem.impulse_array(solution.impulse if isinstance(solution, Solution) else solution)
+    found = _searched(problem, given, given)
+    if found.borders and problem.m <= OTHERS_ROWS:
+        for name in OTHERS:
+            try:
+                other = solve(problem, name, tol=1e-12, time_limit=SECONDS)
+            except CapabilityError:
+                continue
+            # Of the same motion: where Coulomb's law has several, another one says nothing of the answer.
+            again = _searched(problem, other.impulse, given)
+            if again.proven and again.velocity_radius <= NEAR * float(abs(problem.b).max()):
+                return again
+    return found
+
+
+def _searched(problem: Problem, start: FloatArray, given: FloatArray) -> Enclosure:
+    """The enclosure that a search from one answer ends with, beside another."""
     for bits in BITS:
         with balls(bits) as flint:
-            search = Search(flint, problem, given)
+            search = Search(flint, problem, start, given)
             found = search.run()
         if found.proven or search.singular:
             break

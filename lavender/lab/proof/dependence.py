@@ -1,7 +1,8 @@
-"""Rows that depend on others exactly: found modulo a prime, held to J in rational numbers."""
+"""Rows that depend on others exactly: found modulo a prime, held to the rank of J in whole numbers."""
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,11 @@ from lavender.base.later import lapack
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 
-__all__ = ["PRIMES", "Tangled", "dependencies", "pivots"]
+__all__ = ["EXACT", "PRIME", "Tangled", "dependencies", "pivots"]
 
 
 class Tangled(Exception):
-    """Rows that depend on each other to rounding, by no simple quotients."""
+    """Rows that depend on each other, too many to tell from rounding."""
 
 
 SPARSE = 1000  # rows above which the factor is sparse: it does not take the farthest row first
@@ -42,16 +43,23 @@ def pivots(j: Any) -> tuple[Any, int]:
     return np.concatenate([np.flatnonzero(alone), np.flatnonzero(~alone)]), int(np.count_nonzero(alone))
 
 
-PRIMES = (2**61 - 1, 2**521 - 1)  # the second where numbers of the first are too small for the quotients
+PRIME = 2**61 - 1
+
+EXACT = 600  # rank up to which rows that look dependent are held to it in whole numbers: seconds
 
 
 def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple[Any, Any]:
     """Rows of J that are independent of those before them, and others whose target contradicts theirs: exactly.
 
     Rows that are independent modulo a prime are so. Where they span all columns that they reach, the others depend on
-    them; else what these are made of is read modulo the prime as quotients of whole numbers, and held to J in rational
-    numbers. Rows of no target contradict nothing. The first `sure` rows are independent to rounding: as many of them as
-    columns that they reach are taken for a basis, which the inverse of their equations proves.
+    them; else the rank in whole numbers says so, with the targets as one more column for those that contradict nothing.
+    The first `sure` rows are independent to rounding: as many of them as columns that they reach are taken for a basis,
+    which the inverse of their equations proves.
+
+    Raises
+    ------
+    Tangled
+        Rows whose rank modulo a prime is above EXACT and below the number of their columns.
     """
     _, label = sp.csgraph.connected_components(
         sp.block_array([[None, j != 0], [(j != 0).T, None]]).astype(float), directed=False
@@ -64,68 +72,76 @@ def dependencies(flint: Any, j: Any, target: FloatArray, sure: int = 0) -> tuple
         if len(basis) == len(columns) and not target[rows].any():
             kept.append(basis)
             continue
-        for prime in PRIMES:
-            found = _dependent(flint, j[rows][:, columns], target[rows], prime)
-            if found is not None:
-                break
-        else:
+        found = _dependent(flint, j[rows][:, columns], target[rows])
+        if found is None:
             raise Tangled(rows)
         kept.append(rows[found[0]])
         contradict.append(rows[found[1]])
     return np.sort(np.concatenate(kept)), np.sort(np.concatenate([np.zeros(0, np.int64), *contradict]))
 
 
-def _dependent(flint: Any, j: Any, target: FloatArray, prime: int) -> tuple[list[int], list[int]] | None:
+def _dependent(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[int]] | None:
     m, n = j.shape
-    entries, by_row = [0] * (n * m), j.tocoo()
-    for i, k, x in zip(by_row.row.tolist(), by_row.col.tolist(), by_row.data.tolist(), strict=True):
-        entries[k * m + i] = _residue(x, prime)
-    if prime < 2**64:
-        reduced, rank = flint.nmod_mat(n, m, entries, prime).rref()
-    else:
-        reduced, rank = flint.fmpz_mod_mat(n, m, entries, flint.fmpz_mod_ctx(prime)).rref()
-    kept: list[int] = []
-    for k in range(m):
-        if len(kept) < rank and int(reduced[len(kept), k]) != 0:
-            kept.append(k)
-    others = sorted(set(range(m)) - set(kept))
-    if not others or (rank == n and not target.any()):
-        return kept, []
-    number = _exact(flint)
-    exact = [
-        dict(zip(j.indices[s:e].tolist(), map(number, j.data[s:e].tolist()), strict=True))
-        for s, e in zip(j.indptr[:-1].tolist(), j.indptr[1:].tolist(), strict=True)
-    ]
-    goal, contradict = [number(x) for x in target.tolist()], []
-    for k in others:
-        rest, left = dict(exact[k]), goal[k]
-        for i, base in enumerate(kept):
-            c = int(reduced[i, k])
-            if c:
-                share = flint.fmpq(*_quotient(c, prime))
-                left = left - share * goal[base]
-                for column, x in exact[base].items():
-                    rest[column] = rest.get(column, 0) - share * x
-        if any(x != 0 for x in rest.values()):
+    whole = _whole(np.column_stack([j.toarray(), target]))
+    prime = PRIME
+    while True:
+        reduced, rank = flint.nmod_mat(
+            n, m, [row[k] % prime for k in range(n) for row in whole], prime
+        ).rref()
+        kept: list[int] = []
+        for k in range(m):
+            if len(kept) < rank and int(reduced[len(kept), k]) != 0:
+                kept.append(k)
+        others = sorted(set(range(m)) - set(kept))
+        if not others or (rank == n and not target.any()):
+            return kept, []
+        made = [(i, k) for i in range(rank) for k in others if int(reduced[i, k]) != 0]
+        goal = [(i, whole[k][n]) for i, k in enumerate(kept) if whole[k][n]]
+        left = {k: (whole[k][n] - sum(int(reduced[i, k]) * t for i, t in goal)) % prime for k in others}
+        held = [_spanned(flint, whole, part, left) for part in _parted(m, [(kept[i], k) for i, k in made])]
+        if None in held:
             return None
-        if left != 0:
-            contradict.append(k)
-    return kept, contradict
+        if all(held):
+            return kept, [k for k in others if left[k]]
+        prime = _next(flint, prime)  # it divides what is not 0
 
 
-def _exact(flint: Any) -> Any:
-    return lambda x: flint.fmpq(*x.as_integer_ratio())
+def _parted(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
+    """Sets of rows, of m, that pairs join; a row that is in none stands by itself."""
+    at = tuple(np.array(pairs, np.int64).reshape(-1, 2).T)
+    joined = sp.coo_array((np.ones(len(pairs)), at), shape=(m, m))
+    n, label = sp.csgraph.connected_components(joined, directed=False)
+    return [np.flatnonzero(label == k).tolist() for k in range(n)]
 
 
-def _residue(x: float, prime: int) -> int:
-    top, bottom = x.as_integer_ratio()
-    return top * pow(bottom, -1, prime) % prime
+def _spanned(flint: Any, whole: list[list[int]], rows: list[int], left: dict[int, int]) -> bool | None:
+    """Whether rows depend on those without `left`, targets (the last column) too where that is 0; None: too many."""
+    base = [k for k in rows if k not in left]
+    if len(base) == len(rows):
+        return True
+    if len(base) > EXACT:
+        return None
+    agree = [whole[k] for k in rows if not left.get(k)]
+    return _rank(flint, [whole[k][:-1] for k in rows]) == len(base) == _rank(flint, agree)
 
 
-def _quotient(c: int, prime: int) -> tuple[int, int]:
-    """The quotient of least size that is c modulo the prime (half an extended Euclid; Wang 1981)."""
-    a, b, u, v = prime, c, 0, 1
-    while b * b > prime:
-        q = a // b
-        a, b, u, v = b, a - q * b, v, u - q * v
-    return (b, v) if v > 0 else (-b, -v)
+def _rank(flint: Any, rows: list[list[int]]) -> int:
+    live = [k for k in range(len(rows[0])) if any(row[k] for row in rows)] if rows else []
+    return int(flint.fmpz_mat(len(rows), len(live), [row[k] for row in rows for k in live]).rank())
+
+
+def _next(flint: Any, prime: int) -> int:
+    """The prime after a prime."""
+    return next(p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime())
+
+
+def _whole(a: FloatArray) -> list[list[int]]:
+    """Each row times a power of two, in whole numbers."""
+    share, power = np.frexp(a)
+    power = np.where(a != 0.0, power, power.max(axis=1, keepdims=True, initial=0))
+    power -= power.min(axis=1, keepdims=True, initial=power.max(initial=0))
+    digits = (share * 2.0**53).astype(np.int64)
+    return [
+        [x << p for x, p in zip(row, by, strict=True)]
+        for row, by in zip(digits.tolist(), power.tolist(), strict=True)
+    ]

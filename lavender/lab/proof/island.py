@@ -148,7 +148,8 @@ class Island:
         start = [number(x) for x in given]
         for inverse in (FloatInverse, BallInverse):
             try:
-                found = self._krawczyk(*self._newton(start, inverse))
+                with np.errstate(over="ignore", invalid="ignore"):  # what is not finite proves nothing
+                    found = self._krawczyk(*self._newton(start, inverse))
             except ZeroDivisionError:
                 found = None
             if found is not None:

@@ -85,8 +85,9 @@ class _Undecided(Exception):
 class Search:
     """Cases of all blocks, their equations, and the changes of cases that inequalities ask for."""
 
-    def __init__(self, flint: Any, problem: Problem, given: FloatArray) -> None:
-        self.flint, self.problem, self.given = flint, problem, given
+    def __init__(self, flint: Any, problem: Problem, given: FloatArray, answer: FloatArray) -> None:
+        self.flint, self.problem = flint, problem
+        self.given, self.answer = given, answer  # where it begins, and what distances are from
         self.operator, self.cone = Operator(problem), problem.law == "cone"
         self.blocks = self._cases()
         self.family: Any = np.zeros(0, np.int64)
@@ -257,7 +258,8 @@ class Search:
                     touching = touching[:0]
                     continue
                 raise self._named(
-                    rows[tangled.args[0]], "depend on each other to rounding, not exactly"
+                    rows[tangled.args[0]],
+                    "depend on each other to rounding, too many to tell whether exactly",
                 ) from None
             kept, contradict = (rows[k] for k in found)
             left = np.setdiff1d(touching, kept)
@@ -413,8 +415,8 @@ class Search:
     def told(self, lam: list[Any], w: list[Any]) -> Enclosure:
         """The enclosure of balls of impulses and slacks."""
         kind = Balls(self.flint)
-        own = self.operator.slack(kind, [kind.number(x) for x in self.given.tolist()])
-        off = max((upper_end(x - g) for x, g in zip(lam, self.given.tolist(), strict=True)), default=0.0)
+        own = self.operator.slack(kind, [kind.number(x) for x in self.answer.tolist()])
+        off = max((upper_end(x - g) for x, g in zip(lam, self.answer.tolist(), strict=True)), default=0.0)
         speed = max((upper_end(x - y) for x, y in zip(w, own, strict=True)), default=0.0)
         if not (math.isfinite(off) and math.isfinite(speed)):
             raise _Undecided("no bound of the impulses is finite")

@@ -21,6 +21,7 @@ from lavender.lab.report.tables import Advice, Line
 from lavender.lab.report.text import NONE, count, percent, residual, seconds, share, times, who, without
 
 __all__ = [
+    "DIFFICULTY",
     "Section",
     "advice_table",
     "backend_table",
@@ -47,6 +48,10 @@ __all__ = [
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")
 SHOWN_TIES = 2
+DIFFICULTY = (
+    "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks on the "
+    "border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
+)
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
 
@@ -81,10 +86,6 @@ def sections(report: Report) -> list[Section]:
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
-        hard = (
-            "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks "
-            "on the border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
-        )
         every = "floor: rounding to float64 allows no better"
         carried = "median residual, time of all steps; carried from step to step, or cold"
         cases = reach_table(tables.reaches(records, levels), levels).without("form")
@@ -95,7 +96,7 @@ def sections(report: Report) -> list[Section]:
             Section("By motion error", moved, speed_table(report)),
             Section("Motion error of each case", moved, moved_table(report), grouped=True),
             Section("Cases", every, cases, grouped=True),
-            Section("Difficulty", hard, difficulty_table(tables.difficulties(records))),
+            Section("Difficulty", DIFFICULTY, difficulty_table(tables.difficulties(records))),
             Section("Sequences", carried, pass_table(tables.passes(records)), grouped=True),
         ]
     if report.before is not None:

@@ -155,7 +155,12 @@ def _cases(records: Records, levels: Sequence[float]) -> dict[str, Any]:
         }
         for name, rows in by_case.items()
     ]
-    return {"cases": cases, "case_list": contents.case_table(records, fastest, level, stored)}
+    return {
+        "cases": cases,
+        "case_list": contents.case_table(records, fastest, level, stored),
+        "difficulty": contents.difficulty_table(tables.difficulties(records) if cases else []),
+        "difficulty_note": contents.DIFFICULTY,
+    }
 
 
 def _links(lines: Sequence[tables.Line]) -> dict[str, str]:

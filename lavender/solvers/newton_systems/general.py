@@ -12,7 +12,8 @@ from lavender.base.deadline import Deadline, Stopwatch
 from lavender.judge.residuals import judged, reference, remember
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
-from lavender_ext.driver.driver import OUTCOMES, Driver
+from lavender_ext.core.method import OUTCOMES
+from lavender_ext.driver.driver import Driver
 
 FORM = "generalized velocities"
 # Steps for each island between two looks at the clock and at Ctrl-C, at most as many as are counted for WATCHED [s]: at

@@ -11,7 +11,7 @@ from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.running.runner import with_motion
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclosed
-from lavender.lab.report import tables
+from lavender.lab.report import tables, write
 
 SHORT = {"budgets": (4,), "repeats": 1, "orders": (), "time_limit": 60.0}
 
@@ -90,7 +90,7 @@ def test_what_has_nothing_to_do_is_described_so():
 
 
 def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_residual_is_contradicted(
-    monkeypatch,
+    monkeypatch, tmp_path
 ):
     pytest.importorskip("flint", reason="python-flint (extra proof) is not installed")
     plan = bench.Plan(levels=(1e-6,), prove=True, **SHORT)
@@ -99,6 +99,8 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     near, border = (records.cases[name].proof for name in ("granular(n=2)", "threshold"))
     assert near.startswith("within ") and float(near.split()[1]) < 1e-9
     assert border.startswith("none: contact 0, normal")
+    page = write(records, tmp_path, figures=False).read_text(encoding="utf-8")
+    assert page.count(near) == page.count(border) == 1  # a column of the table of difficulty
     # A judge that finds no error in an answer that is wrong: only the exact solution tells.
     problem = suite.case("granular(n=2)").problem
     enclosed(problem)
@@ -113,7 +115,7 @@ def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_resi
     assert "from the exact solution" in with_motion(record, problem, wrong).contradicted
 
 
-def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration():
+def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_iteration(tmp_path):
     plan = bench.Plan(levels=(1e-3, 1e-6), **SHORT)
     records = bench.run(["stack(n=8)", "threshold"], ["pgs", "newton", "lemke", "direct"], plan)
     stack, border = tables.difficulties(records)
@@ -122,3 +124,5 @@ def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_itera
     told = [replace(r, iterations=0, bits="x") if r.solver in ("lemke", "direct") else r for r in records]
     shared = replace(records, records=told)
     assert tables.difficulties(shared)[0].same == ("direct", "lemke")
+    page = write(shared, tmp_path, figures=False).read_text(encoding="utf-8")
+    assert "direct, lemke" in page and "exact solution" not in page

@@ -9,7 +9,8 @@ import scipy.sparse as sp
 
 import lavender as lv
 from lavender import suite
-from lavender.lab.proof import island, operator, search
+from lavender.lab import proof
+from lavender.lab.proof import dependence, island, operator, search
 from lavender.lab.proof.numbers import Balls
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
@@ -33,6 +34,7 @@ def test_a_linear_problem_beside_rational_numbers():
 CASES = (
     "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "pyramid(k=30)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)",
     "four_bar", "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",
+    "pyramidF(k=6, mass_ratio=1e3, sliding=0.5)",  # rows that depend on others by quotients of thousands of bits
 )  # fmt: skip
 
 
@@ -66,6 +68,16 @@ def test_every_kind_of_contact_and_form(friction, rolling):
             # A was rounded: another problem, whose solution is off by some 1e-16 times the condition.
             assert again.proven and np.allclose(again.impulse, found.impulse, atol=1e-9)
     assert proven >= 10
+
+
+def test_an_answer_at_the_edge_of_a_family_of_impulses_is_proven_from_inside_of_it(monkeypatch):
+    problem = suite.case("wild(seed=0, rows=600)").problem
+    edge = lv.solve(problem, "admm", tol=1e-12)
+    found = lv.prove(problem, edge)
+    assert found.proven and found.velocity_radius < 1e-9
+    assert abs(found.impulse - edge.impulse).max() <= found.impulse_radius  # of this answer, not of the other
+    monkeypatch.setattr(proof, "OTHERS", ())
+    assert lv.prove(problem, edge).borders == ("row 12", "row 21")
 
 
 def test_a_border_is_named():
@@ -129,6 +141,18 @@ def test_both_inverses_enclose_the_same_zero(monkeypatch):
     assert one.proven and two.proven
     assert abs(one.impulse - two.impulse).max() <= 2.0**-50 * abs(two.impulse).max()
     assert one.impulse_radius == pytest.approx(two.impulse_radius, rel=1e-9)
+
+
+def test_a_prime_that_divides_the_numbers_makes_no_rows_dependent(monkeypatch):
+    """Modulo 3 rows 0 and 1 are one row and their targets agree; in whole numbers neither holds."""
+    independent = sp.csr_array([[1.0, 0.5, 0.0], [1.0, 2.0, 0.0], [0.5, 0.25, 0.0], [0.0, 0.0, 2.0**-60]])
+    contradicting = sp.csr_array([[0.5, 1.0], [1.0, 2.0], [3.0, 6.0]])
+    for prime in (3, dependence.PRIME):
+        monkeypatch.setattr(dependence, "PRIME", prime)
+        kept, wrong = dependence.dependencies(flint, independent, np.array([1.0, 0.5, 0.5, 1.0]))
+        assert kept.tolist() == [0, 1, 3] and wrong.tolist() == []
+        kept, wrong = dependence.dependencies(flint, contradicting, np.array([0.25, 2.0, 1.5]))
+        assert kept.tolist() == [0] and wrong.tolist() == [1]
 
 
 def hair(h):
