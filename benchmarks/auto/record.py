@@ -20,10 +20,12 @@ import numpy as np
 
 import lavender as lv
 from lavender import registry
+from lavender.base import deadline
 from lavender.judge.residuals import judged, reference
 from lavender.judge.solution import Status
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
+from lavender.solvers.steps import METHODS
 
 __all__ = ["LEVELS", "SOLVERS", "Record", "as_line", "read", "records"]
 
@@ -31,17 +33,7 @@ LEVELS = (1e-3, 1e-6, 1e-9)
 GROWTH = 0.25  # of the iterations so far, between two points of a curve
 SHORT = 0.03  # s of CPU time below which a run is made three times
 FAR, LEAST = 12.0, 0.05  # times the least time to the middle level, and s, after which a solver is given up
-NNCG = {"order": "symmetric", "restart": "against"}
-SOLVERS: dict[str, tuple[str, dict[str, Any]]] = {
-    "anderson": ("anderson", {}),
-    "nncg": ("nncg", NNCG),
-    "relaxation": ("anderson", {}),
-    "newton": ("newton", {}),
-    "newton over rows": ("newton", {"form": "impulse"}),
-    "direct": ("direct", {}),
-    "admm": ("admm", {}),
-    "auto": ("auto", {}),
-}
+SOLVERS: dict[str, tuple[str, dict[str, Any]]] = METHODS | {"admm": ("admm", {}), "auto": ("auto", {})}
 Points = list[tuple[int, float, float]]
 
 
@@ -79,8 +71,6 @@ def as_line(record: Record) -> str:
 
 def takes(problem: Problem, name: str) -> bool:
     """Whether the solver is one for this problem, and not another's twin on it."""
-    if name == "relaxation":
-        return problem.law == "coulomb"
     if name == "newton over rows" and (problem.generalized is None or problem.cones.has_round):
         return False
     return registry.get(SOLVERS[name][0]).refuses(problem) is None
@@ -88,6 +78,7 @@ def takes(problem: Problem, name: str) -> bool:
 
 def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> Iterator[Record]:
     """All solvers on each problem, one after the other; `time_limit`: s of CPU time of one curve."""
+    deadline.perf_counter = process_time  # or what else this machine does would end solvers early
     for case, problem in cases:
         least = math.inf
         for name in SOLVERS:
@@ -111,18 +102,16 @@ def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points, s
     """One curve; what judges its points takes no time of it."""
     fresh = replace(problem.disk, copy=False)
     reference(fresh)
-    solved = fresh.relaxed("cone") if name == "relaxation" else fresh
     solver: Any = registry.get(SOLVERS[name][0]).load()(**SOLVERS[name][1])
     lam, points, best = fresh.start(), Points(), math.inf
-    tol = LEVELS[-1] * (1.0 if solved is fresh else 0.1)
     with one_thread():
         begun = process_time()
-        state = solver.prepare(solved)
+        state = solver.prepare(fresh)
         spent = setup = process_time() - begun
         while True:
             done = points[-1][0] if points else 0
             begun = process_time()
-            claim = solver.run(state, lam, max(1, math.ceil(GROWTH * done)), tol, None)
+            claim = solver.run(state, lam, max(1, math.ceil(GROWTH * done)), LEVELS[-1], None)
             spent += process_time() - begun
             best = min(best, judged(fresh, lam.copy()).relative) if np.isfinite(lam).all() else best
             points.append((done + claim.iterations, spent, best))

@@ -50,7 +50,6 @@ CHOSEN = """/* What the report measured: {solver}, to a relative residual of {to
 typedef struct lav_step {{
   lav_options options;
   lav_budget budget;
-  int32_t relaxed; /* run it under LAV_CONE, whatever the problem's law is */
 }} lav_step;
 
 static const lav_step lav_chosen[{count}] = {{
@@ -69,7 +68,6 @@ class Step:
     iterations: int
     tol: float
     options: Mapping[str, Any] = field(default_factory=dict)
-    relaxed: bool = False  # under the law of the cone, whatever the problem's is
 
     def whole(self) -> tuple[int, ...]:
         """Whole numbers of `lav_options` but its seed: method, order, memory, sweep, convex, keeps."""
@@ -78,31 +76,31 @@ class Step:
     def packed(self) -> bytes:
         """As check.c reads it."""
         omega = choices(self.solver, self.options)[1]
-        return struct.pack("<7qdqdq", *self.whole(), 0, omega, self.iterations, self.tol, self.relaxed)
+        return struct.pack("<7qdqd", *self.whole(), 0, omega, self.iterations, self.tol)
 
     def text(self) -> str:
-        """As C has it: options, budget, relaxed."""
+        """As C has it: options, budget."""
         whole, omega = ", ".join(map(str, self.whole()[1:])), choices(self.solver, self.options)[1]
         options = f"sizeof(lav_options), LAV_{self.solver.upper()}, {whole}, 0, {omega!r}"
         budget = f"sizeof(lav_budget), {self.iterations}, {self.tol!r}, 0.0, 0, 0"
-        return f"{{{{{options}}}, {{{budget}}}, {int(self.relaxed)}}}"
+        return f"{{{{{options}}}, {{{budget}}}}}"
 
 
 def steps_of(found: lv.Solution, step: Step) -> list[Step]:
     """What a solve did: the step itself, or the turns of `auto`, each solver once with twice all of its work."""
     if step.solver != "auto":
         return [step]
-    done: dict[tuple[str, bool], int] = {}
+    done: dict[str, int] = {}
     for turn in found.turns:
-        of, _, name = turn.solver.rpartition(": ")
-        key = name.split()[0], of == "relaxation"
-        pivots = key[0] in ("direct", "lemke")  # which end by themselves
+        name, _, _ = turn.solver.partition(" on ")
+        solver = CANDIDATES.get(name, (name, {}))[0]
+        pivots = solver in ("direct", "lemke")  # which end by themselves
         counted = 0 if pivots else max((turn.work.get(kind, 0) for kind in COUNTED), default=0)
-        done[key] = done.get(key, 0) + (2 * counted or registry.specs()[key[0]].max_iter)
+        done[name] = done.get(name, 0) + (2 * counted or registry.specs()[solver].max_iter)
     steps = []
-    for (name, relaxed), count in (done or {("anderson", False): 1}).items():
-        options = CANDIDATES[name][1] if name in CANDIDATES else {}
-        steps.append(replace(step, solver=name, iterations=count, options=options, relaxed=relaxed))
+    for name, count in (done or {"anderson": 1}).items():
+        solver, options = CANDIDATES.get(name, (name, {}))
+        steps.append(replace(step, solver=solver, iterations=count, options=options))
     return steps
 
 
@@ -127,7 +125,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
     measured = _chosen(records, solver)
     packed: list[bytes] = []
     left: list[str] = []
-    steps: dict[tuple[str, bool], Step] = {}
+    steps: dict[tuple[int, ...], Step] = {}
     longest = 2 * max(r.iterations for r in measured)
     for record in {(r.case, r.sha): r for r in measured}.values():
         if len(packed) >= most and record.solver != "auto":
@@ -140,7 +138,7 @@ def made(path: Path, solver: str | None, most: int) -> dict[str, str | bytes]:
             continue
         packed.append(vector)
         for step in ran:
-            key = step.solver, step.relaxed
+            key = step.whole()
             count = step.iterations if record.solver == "auto" else min(step.iterations, longest)
             steps[key] = replace(step, iterations=max(count, steps[key].iterations if key in steps else 1))
     if not packed:

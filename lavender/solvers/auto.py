@@ -5,8 +5,9 @@
                                 sweeps: one compiled call (`small.py`); if that does not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
-    sweeps (`anderson`)         for SHARE of Newton's cost, or until they predict that they will cost more than it
-    a loose pile of bodies      that do not roll: sweeps of the convex relaxation, then a few iterations of `nncg`
+    sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it
+    Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile of bodies
+                                that do not roll, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
     all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`; all together LAST times
@@ -41,16 +42,15 @@ from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Relaxation, Step, Sweeps, setup_time
+from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Step, Sweeps, setup_time
 from lavender_ext.factor import graph
 
-SHARE = 0.8  # of Newton's counted cost, that sweeps have before it
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
-LAST = 200.0  # times Newton's counted cost, that all have together
-FEW = 32.0  # iterations of `nncg` after the relaxation, and of sweeps before a factor that may fill
-BAND = 100  # half bandwidth up to which `direct` comes first
+LAST = 100.0  # times Newton's counted cost, that all have together
+FEW = 32.0  # sweeps before a factor that may fill
+BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
@@ -165,9 +165,9 @@ class Tree:
         p = self.problem
         if p.matrix is None or self.law != "lcp" or len(p._compressed[1]) > (2.0 * BAND + 1.0) * p.m:
             return False
-        return max(p.bandwidth) <= BAND and bool(p.is_symmetric)
+        return max(p.bandwidth) <= min(BAND, p.m // 4) and bool(p.is_symmetric)
 
-    @property
+    @cached_property
     def is_loose(self) -> bool:
         """Bodies under Coulomb's law that do not roll, nearly each contact between another pair: sweeps then decide
         what sticks.
@@ -192,10 +192,6 @@ class Tree:
                 f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations",
             )
         yield from self.sweeps_first(self.least)
-        if self.is_loose:
-            why = "a loose pile: the convex relaxation, whose solution is one where contacts stick"
-            yield Stage("relaxation", self.newton / self.sweep, self.newton, why, self.newton / self.sweep)
-            yield Stage("nncg", FEW, FEW * 2.0 * self.sweep, "puts right what slides")
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         # What follows where these fail has its line here.
@@ -204,7 +200,7 @@ class Tree:
         self.left = (LAST - MOST) * unit - self.begun
         for k in range(TURNS):
             for stage in self.in_turn(2.0**k):
-                if self.left <= 0.0:
+                if self.left < 1.0:  # ns
                     return
                 share = min(1.0, self.left / stage.cost)
                 self.left -= share * stage.cost
@@ -217,19 +213,28 @@ class Tree:
             yield Stage(name, times * state.steps, times * state.cost, why)
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
-        """For a share of Newton's cost: first of what that is at least, then of what it is counted for."""
-        cost, short = SHARE * newton - self.begun, self.is_short(newton)
+        """For Newton's cost: first what that is at least, then what it is counted for."""
+        cost, short = newton - self.begun, self.is_short(newton)
         if short and not self.begun:
             cost = max(cost, 0.5 * self.deadline.nanoseconds())
+        if short and self.law == "coulomb":
+            cost *= 0.5  # nncg has the other half
         pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
-            most = inf if short else newton
-            yield self.sweeps(cost, f"{SHARE:g} of {words(newton)}, what newton costs", most)
+            why = f"{words(cost)} of what newton costs"
+            yield self.sweeps(cost, why, inf if short else newton)
+            if self.law == "coulomb":
+                yield self.gradients(cost, why)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""
         return Stage("anderson", cost / self.sweep, cost, why, most / self.sweep)
+
+    def gradients(self, cost: float, why: str) -> Stage:
+        """Two sweeps of each iteration, forwards and backwards."""
+        name = "nncg from the cone law" if self.is_loose else "nncg"
+        return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
     def in_turn(self, times: float) -> Iterator[Stage]:
         """All, with so many times the work of Newton's method before."""
@@ -239,7 +244,7 @@ class Tree:
             yield self.sweeps(cost, why)
         yield from self.factorisations(times * MOST)
         if self.law in ("coulomb", "cone"):
-            yield Stage("nncg", 0.5 * cost / self.sweep, cost, why)
+            yield self.gradients(cost, why)
 
 
 def words(ns: float) -> str:
@@ -317,11 +322,11 @@ class Auto(Solver):
 @np.errstate(all="ignore")  # what overflows is judged
 def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
     """The lines of the tree, until one solves the problem or none has more to do; `sweeps` that are set up."""
+    steps: dict[str, Step] = {}
     if sweeps is not None:
         sweeps.begin(log)
         sweeps.finish()
         return
-    steps: dict[str, Step] = {}
     idle = 0  # lines in a row that had nothing to do
     lines = iter(tree)
     while not log.done() and idle <= len(METHODS):  # before the next line counts what it needs
@@ -338,6 +343,8 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             if isinstance(step, Newton | Direct):
                 set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
                 step.over = log.ends_late(set_up + SURE * once(stage))
+            elif isinstance(step, Iterations):
+                step.over = step.state is None and not sets_up_in_time(stage.solver, log)
         idle = idle + 1 if step.over else 0
         if step.over:
             tree.left += stage.cost
@@ -346,6 +353,11 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             step.run(stage.iterations)
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
+
+
+def sets_up_in_time(name: str, log: SolveLog) -> bool:
+    """Whether what is set up takes a small part of the time that is left."""
+    return not log.deadline.passed(SURE * setup_time(name, log.problem))
 
 
 def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:
@@ -371,8 +383,7 @@ def make(name: str, log: SolveLog, tree: Tree) -> Step:
         newton = Newton(name, log)
         newton.state = tree.states[name]
         return newton
-    kinds: dict[str, type[Step]] = {"direct": Direct, "relaxation": Relaxation}
-    return kinds.get(name, Iterations)(name, log)
+    return (Direct if name == "direct" else Iterations)(name, log)
 
 
 SPEC = SolverSpec(

@@ -52,9 +52,12 @@ class Count:
     steps: float = 1.0  # for each factorisation by law
 
 
-def factorisations(law: str) -> float:
-    """How many Newton's method is counted for; linear is one."""
-    count = RATES["count"] | {"linear": 1.0, "lcp": RATES["count"]["rows"]}
+def factorisations(law: str, form: str = "") -> float:
+    """How many Newton's method is counted for; linear is one, Coulomb's law over velocities what bounded rows are."""
+    rows = RATES["count"]["rows"]
+    count = (
+        RATES["count"] | {"linear": 1.0, "lcp": rows} | ({"coulomb": rows} if form == "velocities" else {})
+    )
     return float(count[law])
 
 
@@ -63,7 +66,7 @@ def newton_cost(count: Count, law: str) -> float:
     r = RATES
     each = r["row"] * count.rows + r["entry"] * count.entries + r["work"][count.form] * count.work
     start = r["start"] if count.rows else 0.0
-    return float(start + count.set_up + count.steps * factorisations(law) * each)
+    return float(start + count.set_up + count.steps * factorisations(law, count.form) * each)
 
 
 def least(problem: Problem) -> Count:

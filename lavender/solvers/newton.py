@@ -93,7 +93,7 @@ class NewtonState:
     def steps(self) -> float:
         """Iterations that it is counted to take: over velocities each is one of an island."""
         islands = 1 if self.general is None else max(1, self.general.islands)
-        return factorisations(self.problem.law) * self.count.steps * islands
+        return factorisations(self.problem.law, self.count.form) * self.count.steps * islands
 
     @property
     def cost(self) -> float:

@@ -46,7 +46,7 @@ MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities u
 
 def limits(sweeps: float, most: float = MOST) -> Limits:
     """Limits of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`."""
-    count = (factorisations(law) for law in ("lcp", "coulomb", "cone"))
+    count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"]
     return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from lavender.base.errors import BREAKDOWN, last_words
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers._accelerated import operator
-from lavender.solvers.costs import sweep_cost
+from lavender.solvers.costs import SWEEPS, sweep_cost
 from lavender.solvers.direct import Enough
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import forming
@@ -21,17 +20,18 @@ from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
 
-__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Relaxation", "Step", "Sweeps", "setup_time"]
+__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Step", "Sweeps", "setup_time"]
 
+NNCG: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 #: Solver and options of each step.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "anderson": ("anderson", {}),
     "newton": ("newton", {}),
     "newton over rows": ("newton", {"form": "impulse"}),
     "direct": ("direct", {}),
-    # The convex relaxation of Coulomb's law; its solution is one of Coulomb's law wherever contacts stick.
-    "relaxation": ("anderson", {}),
-    "nncg": ("nncg", {"order": "symmetric", "restart": "against"}),
+    "nncg": ("nncg", NNCG),
+    # On a loose pile: the convex relaxation has one answer, and where contacts stick it is Coulomb's.
+    "nncg from the cone law": ("nncg", NNCG | {"convex": int(SWEEPS)}),
 }
 FIRST = 32  # sweeps before the first prediction of their remaining number
 MOST = 2**30  # iterations of one call
@@ -67,12 +67,7 @@ class Step:
             log.failure, self.over = last_words(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
-        log.note(self.shown, claim, before)
-
-    @property
-    def shown(self) -> str:
-        """The solver's name in messages."""
-        return METHODS[self.name][0]
+        log.note(self.name, claim, before)
 
     def turn(self, n: int) -> Claim:
         """Run and offer what came of it."""
@@ -113,8 +108,6 @@ class Direct(Step):
 class Iterations(Step):
     """A solver that continues to the bit: in short runs, for the clock and Ctrl-C."""
 
-    closer = 1.0  # of tol, to which it goes
-
     def turn(self, n: int) -> Claim:
         done, work = 0, dict[str, int]()
         if self.state is None:
@@ -143,32 +136,7 @@ class Iterations(Step):
         left = self.log.deadline.left()
         time = CHUNK_TIME if left is None else min(CHUNK_TIME, PROBE * left)
         few = min(max(1, int(time / self.each)), n - done)
-        return self.solver.run(self.state, self.impulse, few, self.closer * self.log.tol, None)
-
-
-class Relaxation(Iterations):
-    """Sweeps of the convex relaxation from zero impulses, judged by Coulomb's law."""
-
-    closer = 0.1
-    relative = 1.0  # by that law, at the last check
-
-    @property
-    def shown(self) -> str:
-        return "relaxation: anderson"
-
-    def begin(self) -> None:
-        self.state = self.solver.prepare(self.log.problem.relaxed("cone"))
-        self.impulse = self.log.problem.start()
-
-    def some(self, done: int, n: int) -> Claim:
-        """Until a check, which ends them where too many are predicted to be left."""
-        log, before = self.log, self.relative
-        claim = super().some(done, min(n, done + max(done // 2, FIRST)))
-        self.relative = log.offer(self.impulse)
-        left = sweeps_left(claim.iterations, before, self.relative, log.tol)
-        if claim.status is not Status.MAX_ITERATIONS or self.relative <= log.tol or left > self.least:
-            return replace(claim, status=Status.STALLED)
-        return claim
+        return self.solver.run(self.state, self.impulse, few, self.log.tol, None)
 
 
 class Sweeps(Step):

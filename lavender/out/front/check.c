@@ -35,7 +35,6 @@ static void *array(int64_t bytes) {
 typedef struct step_t {
   lav_options options;
   lav_budget budget;
-  int32_t relaxed;
 } step_t;
 
 static step_t read_step(void) {
@@ -44,7 +43,7 @@ static step_t read_step(void) {
   lav_default_budget(&s.budget);
   s.options.order = (int32_t)whole(), s.options.memory = (int32_t)whole(), s.options.sweep = (int32_t)whole();
   s.options.convex = (int32_t)whole(), s.options.keeps = (int32_t)whole(), s.options.seed = (uint64_t)whole();
-  s.options.omega = real(), s.budget.iterations = (int32_t)whole(), s.budget.tol = real(), s.relaxed = (int32_t)whole();
+  s.options.omega = real(), s.budget.iterations = (int32_t)whole(), s.budget.tol = real();
   return s;
 }
 
@@ -81,15 +80,9 @@ static int set(const lav_options *options, const lav_problem *q, void **memory, 
 static int run_step(const step_t *s, const lav_problem *q, double *found, lav_result *result, void **memory) {
   lav_solver *solver = NULL;
   lav_budget budget = s->budget;
-  lav_problem given = *q;
-  if (s->relaxed) given.law = LAV_CONE;
-  if (set(&s->options, &given, memory, &solver)) return 1;
+  if (set(&s->options, q, memory, &solver)) return 1;
   CHECK(lav_run(solver, &budget, result));
   CHECK(lav_impulse(solver, found, q->n_rows));
-  if (!s->relaxed) return 0;
-  given.law = q->law, given.impulse = found, budget.iterations = 0; /* judged by the problem's own law */
-  if (set(&s->options, &given, memory, &solver)) return 1;
-  CHECK(lav_run(solver, &budget, result));
   return 0;
 }
 
