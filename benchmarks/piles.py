@@ -7,6 +7,7 @@ these problems contacts under load are between sticking and slipping (docs/newto
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +75,17 @@ class Pile:
         key = (name.astype(np.uint64) << np.uint64(32)) | body[:, 1].astype(np.uint64)
         return lv.Problem.from_rows(rows, target=target.ravel(), mu=self.mu, key=key)
 
+    def problems(self, steps: int) -> Iterator[tuple[int, lv.Problem]]:
+        """Of step 0 to the last, and the pile steps on."""
+        last: tuple[lv.Problem, Any] | None = None
+        for step in range(steps + 1):
+            problem = self.problem()
+            yield step, problem
+            start = None if last is None else problem.carry(last)
+            impulse = lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse
+            self.velocity, last = problem.velocity(impulse).reshape(-1, 6), (problem, impulse)
+            self.place += DT * self.velocity[:, :3]
+
 
 @click.command("piles")
 @click.argument("out", type=click.Path(path_type=Path, file_okay=False))
@@ -84,13 +96,8 @@ def command(out: Path, seeds: tuple[int, ...], steps: int, every: int) -> None:
     """Step piles of balls and keep problems of theirs as files OUT/pileSEED_STEP.npz."""
     out.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
-        pile, before, impulse = Pile(seed), None, None
-        for step in range(steps + 1):
-            problem = pile.problem()
+        pile = Pile(seed)
+        for step, problem in pile.problems(steps):
             if step >= 60 and step % every == 0:
                 problem.save(out / f"pile{seed}_{step:04d}.npz")
-            start = problem.carry((before, impulse)) if before is not None else None
-            impulse = lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse
-            pile.velocity, before = problem.velocity(impulse).reshape(-1, 6), problem
-            pile.place += DT * pile.velocity[:, :3]
         click.echo(f"pile{seed}: {len(pile.mass)} balls, mu {pile.mu}, {problem.m} rows in the last step")

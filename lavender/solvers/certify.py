@@ -74,13 +74,17 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
         return None
     joints, contacts = fighting(problem, proof.y)
     soft, first, last = joints or contacts, problem.cones.ptr[:-1], problem.cones.ptr[1:]
-    rows = np.concatenate([np.arange(first[i], last[i]) for i in soft])
-    told = proof.fighting.split(" against ")[0]
-    for share in SOFT:
-        more = np.zeros(problem.m)
-        more[rows] = share * problem.d[rows]
-        if _newton(_softened(problem, more), SOFT_STEPS, tol, deadline)[0] <= tol:
-            return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
+    tries = [
+        (np.concatenate([np.arange(first[i], last[i]) for i in soft]), proof.fighting.split(" against ")[0])
+    ]
+    if contacts:  # others may fight as well, of which this proof says nothing
+        tries.append((np.flatnonzero(problem.cones.contact_rows), "all contacts"))
+    for rows, told in tries:
+        for share in SOFT:
+            more = np.zeros(problem.m)
+            more[rows] = share * problem.d[rows]
+            if _newton(_softened(problem, more), SOFT_STEPS, tol, deadline)[0] <= tol:
+                return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
     return Conflict(proof, joints + contacts, (), 0.0, "")
 
 

@@ -8,8 +8,10 @@ from random_problems import as_matrix, general, touching
 from worked import after
 
 import lavender as lv
+from benchmarks.piles import Pile
 from lavender import suite
 from lavender.judge.certificates import fighting
+from lavender.solvers.certify import conflict_of
 
 SCENES = {
     "stack": after(2, "stack", n=12, size=0.5, mass=60.0).constraint_problem(),
@@ -254,3 +256,17 @@ def test_the_compliance_that_is_advised_gives_an_answer(law, form):
         softer = replace(problem, compliance=problem.compliance + soft)
     assert lv.solve(softer).success
     assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]
+
+
+def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an_answer():
+    """Walls leave these balls no room: several conflicts at once, of which a proof names one."""
+    fights = 0
+    for step, problem in Pile(17).problems(100):
+        found = conflict_of(problem, 1e-6) if step in (60, 80, 100) else None
+        if found is not None:
+            fights += 1
+            assert found.blocks and "contacts" in found.advice
+            soft = np.zeros(problem.m)
+            soft[list(found.soft_rows)] = found.compliance
+            assert lv.solve(replace(problem, compliance=problem.compliance + soft), tol=1e-6).success
+    assert fights
