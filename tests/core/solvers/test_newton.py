@@ -140,15 +140,20 @@ def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form,
 
 
 def test_a_path_runs_through_its_folds():
-    """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
+    """Steps of a pile on which load passes from stick to slip, until two have needed a path.
+
+    Which do hangs on the last bits of a hundred steps before, so on the processor; of this pile it is one in three.
+    """
     pile, before, impulse, paths = Pile(12), None, None, 0
-    for step in range(201):
+    for step in range(221):
         problem = pile.problem()
-        if step in (160, 180, 200):
+        if step >= 120 and step % 5 == 0:
             # Phases before the first path take up to 200; a path that has to search its way around a fold 800 and more.
             solution = lv.solve(problem, "newton", max_iter=800, impulse=np.zeros(problem.m))
             assert solution.success, f"step {step}: {solution}"
             paths += "path steps" in solution.message
+        if paths == 2:
+            break
         start = problem.carry((before, impulse)) if before is not None else None
         impulse, before = (
             lv.solve(problem, "newton", tol=1e-4, max_iter=60, impulse=start).impulse,
@@ -156,7 +161,7 @@ def test_a_path_runs_through_its_folds():
         )
         pile.velocity = problem.velocity(impulse).reshape(-1, 6)
         pile.place += DT * pile.velocity[:, :3]
-    assert paths
+    assert paths == 2
 
 
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
