@@ -104,7 +104,7 @@ cdef enum:                      # coordinates: 4 i + FIRST of element i (a conta
 
 cdef inline double wide_of(int32_t k) noexcept nogil:
     """c of the k-th path."""
-    return 1.0 if k < 1 else 3.0 if k < 2 else 10.0     # not ==, of which compilers make a table
+    return 3.0 if k < 1 else 1.0 if k < 2 else 10.0     # not ==, of which compilers make a table
 
 
 cdef inline double exact_of() noexcept nogil:
@@ -311,7 +311,7 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     for j in range(m):
         x.size += n.s.e.g[j] * n.s.e.g[j]
     x.size = sqrt(x.size / m)
-    x.start = x.l = logarithm(3.0 * x.size)
+    x.start = x.l = logarithm(0.3 * x.size)
     x.exact = exact_of()
     x.near = 1e-2
     x.h = 0.3

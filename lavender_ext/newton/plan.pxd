@@ -4,9 +4,9 @@ Bounded rows: exchanges from the warm start and from the solution of H z = g, an
 decades. Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
-interior point with two shares of phi's derivative, ended by rounds; closed loops of joints through the augmented system;
-rounds from the answer of the convex relaxation, then from nothing; paths of smoothed problems; and the first rounds again
-for what is left of the budget.
+interior point, ended by rounds; a path of smoothed problems, but for closed loops of joints; De Saxce's with less of phi's
+derivative; closed loops through the augmented system; rounds from the answer of the convex relaxation, then from nothing;
+more paths; and the first rounds again for what is left of the budget.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
@@ -17,7 +17,6 @@ from lavender_ext.core.parts cimport CONE, COULOMB
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.judge.score cimport relative
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.elements cimport is_row
 from lavender_ext.newton.phases cimport (FIRST, LIMITLESS, STRETCH, begin_approach, begin_exchanges, begin_rounds, begin_steps,
                                          enter_rounds, go_approach, go_exchange, go_interior, go_polish, go_pursuit,
                                          go_rounds, pursue, shift_of)
@@ -26,7 +25,7 @@ from lavender_ext.newton.run cimport (APPROACH, DE_SAXCE, EXCHANGES, INNER, INTE
                                       PLAN_CONVEX, PLAN_COULOMB, POLISH, PROXIMAL, PURSUIT, RELAXED, SECOND, at_floor,
                                       begin_apart, done, end_apart, enter, leave, newton_t, put_aside, score, spent, take,
                                       take_back, tries_t, unknown_of, with_products)
-from lavender_ext.newton.steps cimport begin_interior, delta_of, interior_step
+from lavender_ext.newton.steps cimport begin_interior, delta_of, has_free_rows, interior_step
 from lavender_ext.newton.system cimport BODIES, DENSE, OF_BARRIER, system_factor, system_natural, system_solve, system_times
 
 
@@ -197,9 +196,9 @@ cdef inline void go_convex(newton_t* n) noexcept nogil:
 # -- Coulomb friction --------------------------------------------------------------------------------------------
 
 
-cdef inline void begin_de_saxce(newton_t* n, int32_t augmented) noexcept nogil:
-    n.tries.at = n.tries.second = 0
-    n.tries.augmented = augmented
+cdef inline void begin_de_saxce(newton_t* n, int32_t augmented, int32_t second) noexcept nogil:
+    n.tries.at = 0
+    n.tries.augmented, n.tries.second = augmented, second
     enter(n, DE_SAXCE)
 
 
@@ -219,7 +218,7 @@ cdef inline void go_de_saxce(newton_t* n) noexcept nogil:
         leave(n)
         return
     if x.augmented or x.at == 3 or (not x.second and x.at == 1 and best > 1e-2):    # far from an end: no rounds
-        if x.second:
+        if x.second or not x.augmented:
             leave(n)
         x.at = 0
         x.second = 1
@@ -254,16 +253,9 @@ cdef inline void go_relaxed(newton_t* n) noexcept nogil:
         pursue(n, 1, STRETCH, 1.0 / 0.0)
 
 
-cdef inline bint has_free_rows(const newton_t* n) noexcept nogil:
-    cdef int32_t i
-    for i in range(n.s.e.n):
-        if is_row(n.s.e, i) and not is_low(n.s.e, n.s.e.ptr[i]) and not is_high(n.s.e, n.s.e.ptr[i]):
-            return True
-    return False
-
-
 cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
+    cdef bint closed = n.loops and has_free_rows(n)     # loops of joints: their rows nearly depend on each other
     n.at += 1
     if at > 0 and over(n):
         at = 9
@@ -272,22 +264,27 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
         begin_rounds(n, 0, n.best_z, COULOMB, 1e-5, FIRST)     # (1e-4 to 1e-7: 2,030 to 2,530 factors of 68)
         pursue(n, 0, FIRST, 2.0 * first_gain() * n.best)
     elif at == 1:
-        begin_de_saxce(n, 0)
-    elif at == 2:                                       # closed loops of joints: their rows nearly depend on each other
-        if n.loops and has_free_rows(n):
-            begin_de_saxce(n, 1)
+        begin_de_saxce(n, 0, 0)
+    elif at == 2:                                       # stick and slip that fold the way to a solution
+        if not closed:
+            begin_path(n)
     elif at == 3:
+        begin_de_saxce(n, 0, 1)
+    elif at == 4:
+        if closed:
+            begin_de_saxce(n, 1, 0)
+    elif at == 5:
         begin_relaxed(n)
-    elif at == 4:                                       # a start that is near no solution may be worse than none
+    elif at == 6:                                       # a start that is near no solution may be worse than none
         if not n.cold:
             memset(n.trial, 0, n.s.e.m * sizeof(double))
             begin_rounds(n, 0, n.trial, COULOMB, 1e-5, FIRST)
             pursue(n, 0, FIRST, 2.0 * first_gain())
-    elif at == 5:                                       # stick and slip that fold the way to a solution
+    elif at == 7:
         if n.path.paths < PATHS:
             n.at = at
             begin_path(n)
-    elif at == 6:
+    elif at == 8:
         begin_rounds(n, 0, n.aside_z, COULOMB, 1e-5, INNER)     # they were cut short: anew, from the start
         enter_rounds(n, 0, LIMITLESS)
     else:
