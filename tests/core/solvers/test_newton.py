@@ -144,7 +144,7 @@ def test_a_path_runs_through_its_folds():
     paths = 0
     for step, problem in Pile(12).problems(200):
         if step >= 100 and step % 20 == 0:  # which of them need a path differs between processors
-            # A path that has to search its way around a fold 800 and more.
+            # A path that has to search its way around a fold takes 800 and more.
             solution = lv.solve(problem, "newton", max_iter=800, impulse=np.zeros(problem.m))
             assert solution.success, f"step {step}: {solution}"
             paths += "path steps" in solution.message
