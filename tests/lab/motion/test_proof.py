@@ -11,7 +11,7 @@ import lavender as lv
 from lavender import suite
 from lavender.lab import proof
 from lavender.lab.proof import dependence, island, operator, search
-from lavender.lab.proof.numbers import Balls
+from lavender.lab.proof.numbers import Balls, Rationals
 from lavender.lab.proof.operator import Operator
 from tests import proof_twin
 from tests.kkt_truth import Exact
@@ -155,20 +155,20 @@ def test_a_prime_that_divides_the_numbers_makes_no_rows_dependent(monkeypatch):
         assert kept.tolist() == [0] and wrong.tolist() == [1]
 
 
-def hair(h):
-    """Row 0 is pushed by h: a hair that balls of 256 bits cannot tell from nothing beside 1."""
-    a = [[2.0, -h, 1.0], [-h, 1.0, 0.0], [1.0, 0.0, 1.0]]
-    return lv.Problem(np.ones(3), lv.Cones.bounded([0.0, 1.0, 1.0], [np.inf, 1.0, 1.0]), np.array(a))
+def hair(h, side):
+    """Row 0 is pushed by h: a hair that balls of 256 bits cannot tell from nothing beside 1, which they round to 0."""
+    a = [[2.0, -h, side], [-h, 1.0, 0.0], [side, 0.0, 1.0]]
+    b = [side, 1.0, 1.0]
+    return lv.Problem(b, lv.Cones.bounded([0.0, 1.0, 1.0], [np.inf, 1.0, 1.0]), np.array(a))
 
 
 def told_of_hairs():
     """What is proven of row 0, which carries h / 2 where that is positive, else nothing."""
-    pushed, pulled = (lv.prove(hair(h), [0.0, 1.0, 1.0]) for h in (2.0**-300, -(2.0**-300)))
-    return (
-        pushed.proven
-        and pushed.impulse_radius >= 2.0**-301
-        and pulled.proven
-        and pulled.impulse_radius == 0.0
+    pushed, pulled = (
+        [lv.prove(hair(h, side), [0.0, 1.0, 1.0]) for side in (1.0, -1.0)] for h in (2.0**-300, -(2.0**-300))
+    )
+    return all(p.proven and p.impulse_radius >= 2.0**-301 for p in pushed) and all(
+        p.proven and p.impulse_radius == 0.0 for p in pulled
     )
 
 
@@ -184,10 +184,34 @@ def sign_of_upper_end(x):
     return 1 if (x.upper() if isinstance(x, flint.arb) else x) >= 0 else -1
 
 
-@pytest.mark.parametrize(("name", "turned"), [("upper_end", lower_end), ("sign_of", sign_of_upper_end)])
+def sign_of_middle(x):
+    return 1 if (x.mid() if isinstance(x, flint.arb) else x) >= 0 else -1
+
+
+@pytest.mark.parametrize(
+    ("name", "turned"),
+    [("upper_end", lower_end), ("sign_of", sign_of_upper_end), ("sign_of", sign_of_middle)],
+)
 def test_an_arithmetic_with_one_rounding_turned_is_caught(monkeypatch, name, turned):
     monkeypatch.setattr(search, name, turned)
     assert not told_of_hairs() or any(proof_twin.attack(seed)[2] for seed in range(50))
+
+
+@pytest.mark.parametrize("inverse", ["FloatInverse", "BallInverse"])
+def test_balls_of_a_linear_problem_hold_its_rational_solution(monkeypatch, inverse):
+    """And their middles are not that solution."""
+    monkeypatch.setattr(island, "FloatInverse", getattr(island, inverse))
+    reach = island.FloatInverse.reach
+    for share, held in ((1.0, True), (0.0, False)):
+        monkeypatch.setattr(island.FloatInverse, "reach", lambda *a, share=share: share * reach(*a))
+        inside = []
+        for seed in range(8):
+            problem = suite.case(f"random_spd(n=6, condition=1e4, seed={seed})").problem
+            given = lv.solve(problem, "direct").impulse
+            find = search.Search(flint, problem, given, given)
+            balls, exact = find._solve()[0], find._solve(Rationals(flint))[0]
+            inside += [ball.contains(x) for ball, x in zip(balls, exact, strict=True)]
+        assert all(inside) == held
 
 
 def test_a_matrix_that_is_indefinite_in_its_last_bit_has_no_unique_velocities():
