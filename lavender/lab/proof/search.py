@@ -144,14 +144,14 @@ class Search:
                 tried.add(key)
                 before = key
                 try:
-                    lam, w = self._solve()
+                    lam, w = self.solve()
                 except _Recase:
                     continue
                 if not (exactly and self.exact):
                     borders = self._changed(lam, w)
                     exactly = bool(borders) and self.exact
                 if exactly:
-                    borders = self._changed(*self._solve(Rationals(self.flint)))
+                    borders = self._changed(*self.solve(Rationals(self.flint)))
                 if borders == []:
                     return self.told(lam, w)
                 if borders:
@@ -189,7 +189,7 @@ class Search:
                 unknown += [block.first, *(r for part in block.parts for r in part.rows)]
         return np.array(sorted(unknown), np.int64), fixed
 
-    def _solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
+    def solve(self, kind: Any = None) -> tuple[list[Any], list[Any]]:
         """Balls that hold a zero of the equations, or the zero in rationals: impulses and slack of all rows."""
         kind = Balls(self.flint) if kind is None else kind
         self.number = kind.number

@@ -209,7 +209,7 @@ def test_balls_of_a_linear_problem_hold_its_rational_solution(monkeypatch, inver
             problem = suite.case(f"random_spd(n=6, condition=1e4, seed={seed})").problem
             given = lv.solve(problem, "direct").impulse
             find = search.Search(flint, problem, given, given)
-            balls, exact = find._solve()[0], find._solve(Rationals(flint))[0]
+            balls, exact = find.solve()[0], find.solve(Rationals(flint))[0]
             inside += [ball.contains(x) for ball, x in zip(balls, exact, strict=True)]
         assert all(inside) == held
 
