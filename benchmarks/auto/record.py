@@ -78,23 +78,29 @@ def takes(problem: Problem, name: str) -> bool:
 
 def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> Iterator[Record]:
     """All solvers on each problem, one after the other; `time_limit`: s of CPU time of one curve."""
+    clock = deadline.perf_counter
     deadline.perf_counter = process_time  # or what else this machine does would end solvers early
-    for case, problem in cases:
-        least = math.inf
-        for name in SOLVERS:
-            if not problem.m or not takes(problem, name):
-                continue
-            run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
-            limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else 3.0 * time_limit
-            found = [run(problem, name, limit)]
-            if found[0][1] and found[0][1][-1][1] < SHORT:
-                found += [run(problem, name, limit) for _ in range(2)]
-            runs = zip(*(points for _, points, _ in found), strict=False)
-            points = [(some[0][0], min(t for _, t, _ in some), some[0][2]) for some in runs]
-            setup = min(setup for setup, _, _ in found)
-            made = Record(case, problem.m, problem.law, problem.operator, name, setup, points, found[0][2])
-            least = min(least, made.to(LEVELS[1])[0])
-            yield made
+    try:
+        for case, problem in cases:
+            least = math.inf
+            for name in SOLVERS:
+                if not problem.m or not takes(problem, name):
+                    continue
+                run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
+                limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else 3.0 * time_limit
+                found = [run(problem, name, limit)]
+                if found[0][1] and found[0][1][-1][1] < SHORT:
+                    found += [run(problem, name, limit) for _ in range(2)]
+                runs = zip(*(points for _, points, _ in found), strict=False)
+                points = [(some[0][0], min(t for _, t, _ in some), some[0][2]) for some in runs]
+                setup = min(setup for setup, _, _ in found)
+                made = Record(
+                    case, problem.m, problem.law, problem.operator, name, setup, points, found[0][2]
+                )
+                least = min(least, made.to(LEVELS[1])[0])
+                yield made
+    finally:
+        deadline.perf_counter = clock
 
 
 @np.errstate(all="ignore")

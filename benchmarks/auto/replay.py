@@ -169,7 +169,10 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
                 newton.append((state.count, 1e9 * time, 1.0 if linear else kind if compiled else max(n, 1.0)))
     x = np.array(sweeps, float)
     row, entry, cone_entry = positive(lambda q: x[:, :3] @ q, x[:, 3], [12.0, 0.5, 1.7])
-    count: dict[Any, float] = {kind: float(np.median(found)) for kind, found in counts.items()}
+    # What no record is of keeps its count.
+    count: dict[Any, float] = {
+        kind: float(np.median(found or costs.RATES["count"][kind])) for kind, found in counts.items()
+    }
 
     def model(q: Any) -> Any:
         start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))

@@ -255,7 +255,8 @@ cdef inline void go_relaxed(newton_t* n) noexcept nogil:
 
 cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     cdef int32_t at = n.at
-    cdef bint closed = n.loops and has_free_rows(n)     # loops of joints: their rows nearly depend on each other
+    # Loops of joints, whose rows nearly depend on each other; known without what solves their augmented system.
+    cdef bint closed = n.s.form == BODIES and n.s.e.m <= LARGEST_AUGMENTED and has_free_rows(n)
     n.at += 1
     if at > 0 and over(n):
         at = 9
@@ -271,7 +272,7 @@ cdef inline void go_coulomb(newton_t* n) noexcept nogil:
     elif at == 3:
         begin_de_saxce(n, 0, 1)
     elif at == 4:
-        if closed:
+        if n.loops and closed:
             begin_de_saxce(n, 1, 0)
     elif at == 5:
         begin_relaxed(n)
