@@ -34,7 +34,7 @@ from lavender_ext.driver.driver import Driver
 
 __all__ = ["Step", "driven", "file_of", "made", "pack", "pack_problem", "steps_of"]
 
-MAGIC = b"LAVVEC2\0"
+MAGIC = b"LAVVEC3\0"
 COUNTED = ("sweeps", "factorisations", "solves")  # what the library counts as iterations
 
 

@@ -123,7 +123,7 @@ int main(int count, char **words) {
   int bad = 0;
   CHECK(lav_self_test());
   file = fopen(count > 1 ? words[1] : "vectors.bin", "rb");
-  if (!file || fread(magic, 8, 1, file) != 1 || memcmp(magic, "LAVVEC2", 8) != 0) return fprintf(stderr, "no vectors.bin here\n"), 2;
+  if (!file || fread(magic, 8, 1, file) != 1 || memcmp(magic, "LAVVEC3", 8) != 0) return fprintf(stderr, "no vectors.bin here\n"), 2;
   for (n = whole(), i = 0; i < n; i++) bad += solve_one();
   return bad > 0;
 }

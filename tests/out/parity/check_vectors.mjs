@@ -36,7 +36,6 @@ for (let i = 0; i < count; i++) {
   const options = Object.fromEntries(OPTIONS.map((name) => [name, whole()]));
   options.omega = real();
   const budget = { iterations: whole(), tol: real() };
-  whole(); // relaxed, which only `auto` has
   const problem = Object.fromEntries(COUNTS.map((name) => [name, whole()]));
   for (const [name, [kind]] of ARRAYS) {
     const n = whole();
