@@ -15,8 +15,8 @@
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
-problem is solved in the same way on every machine. Under a time limit the tree is the same: whoever factors begins only
-if SURE times the counted cost is left, and sweeps keep the time in which nobody else would end.
+problem is solved in the same way on every machine. Under a time limit the tree is the same. If it may be short, sweeps
+have the first half; whoever factors begins only if a result would be there in time; and sweeps have the rest.
 `Solution.turns` lists what ran, `lavender.explain` what would run.
 """
 
@@ -50,8 +50,12 @@ ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, th
 TURNS = 6  # that all have with doubled work
 LAST = 100.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # sweeps before a factor that may fill
+SPARSE = 0.05  # share of entries, below which A is sparse
+FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
+SHORT = 3.0 * SURE  # times the counted cost, below which a limit may be short
+EARLY = 0.25  # of the counted cost, after which an interior point has an impulse that is worth having
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
 STALE = 1e3
@@ -79,6 +83,7 @@ class Tree:
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
+        self.half = 0.5 * deadline.nanoseconds() if deadline.is_set else 0.0
 
     @cached_property
     def sweep(self) -> float:
@@ -142,22 +147,35 @@ class Tree:
 
     @property
     def is_late(self) -> bool:
-        """Nobody who factors would end in time."""
+        """Nobody who factors would have a result in time."""
+        return not self.has_time("newton", self.least)
+
+    def has_time(self, name: str, cost: float, before: float = 0.0) -> bool:
+        """Whether who factors, at this cost, would have a result in time if begun after `before` [ns].
+
+        Each factorisation of an interior point brings one; under Coulomb's law, and in `direct`, only the last does.
+        """
         if not self.deadline.is_set:
-            return False
-        return self.deadline.passed(setup_time("newton", self.problem) + 1e-9 * SURE * self.least)
+            return True
+        needed = 1e-9 * (before + (1.0 if name == "direct" or self.law == "coulomb" else EARLY) * cost)
+        if name == "newton" and "states" in vars(self):
+            return not self.deadline.passed(needed)
+        set_up, p = setup_time(name, self.problem), self.problem
+        if p.matrix is not None and FILLS * p.m < len(p._compressed[1]) < SPARSE * p.m**2:
+            set_up *= SURE  # an analysis of what fills in takes longer than is counted
+        return not self.deadline.passed(set_up + needed)
 
     def is_short(self, newton: float) -> bool:
-        """A limit that Newton's method of this cost [ns] may use up: sweeps tell the pace, and leave something."""
+        """A limit that Newton's method of this cost [ns] may use up: sweeps leave something before it."""
         return self.deadline.is_set and self.deadline.passed(
-            3.0 * (setup_time("newton", self.problem) + 1e-9 * SURE * newton)
+            3.0 * setup_time("newton", self.problem) + 1e-9 * SHORT * newton
         )
 
     @property
     def may_fill(self) -> bool:
         """A matrix of few entries without a narrow band."""
         p = self.problem
-        return len(p._compressed[1]) < 0.05 * p.m**2 and max(p.bandwidth) > BAND
+        return len(p._compressed[1]) < SPARSE * p.m**2 and max(p.bandwidth) > BAND
 
     @property
     def is_narrow(self) -> bool:
@@ -183,7 +201,7 @@ class Tree:
             if self.may_fill:
                 yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
-        if self.is_narrow:
+        if not self.is_short(self.least) and self.is_narrow:
             n = ROUNDS * costs.factorisations(self.law)
             yield Stage(
                 "direct",
@@ -214,9 +232,8 @@ class Tree:
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for."""
-        cost, short = newton - self.begun, self.is_short(newton)
-        if short and not self.begun:
-            cost = max(cost, 0.5 * self.deadline.nanoseconds())
+        short = self.is_short(newton)
+        cost = (self.half if short else newton) - self.begun
         if short and self.law == "coulomb":
             cost *= 0.5  # nncg has the other half
         pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
@@ -337,12 +354,12 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         if step is None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
-            if isinstance(step, Sweeps) and not tree_goes_on(log, tree, steps, stage.cost):
+            if isinstance(step, Sweeps) and not tree_goes_on(tree, steps, stage.cost):
                 step.finish()
                 return
             if isinstance(step, Newton | Direct):
-                set_up = 1e9 * setup_time("direct", log.problem) if isinstance(step, Direct) else 0.0
-                step.over = log.ends_late(set_up + SURE * once(stage))
+                cost = step.state.cost if isinstance(step, Newton) else stage.cost
+                step.over = not tree.has_time(METHODS[stage.solver][0], cost)
             elif isinstance(step, Iterations):
                 step.over = step.state is None and not sets_up_in_time(stage.solver, log)
         idle = idle + 1 if step.over else 0
@@ -351,6 +368,9 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         else:
             step.least, step.cost = stage.least, stage.cost
             step.run(stage.iterations)
+            if isinstance(step, Sweeps) and step.nearly_there and not log.done():
+                step.finish()
+                return
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
 
@@ -360,17 +380,12 @@ def sets_up_in_time(name: str, log: SolveLog) -> bool:
     return not log.deadline.passed(SURE * setup_time(name, log.problem))
 
 
-def tree_goes_on(log: SolveLog, tree: Tree, steps: dict[str, Step], cost: float) -> bool:
-    """Whether after work of this cost [ns] anybody who factors would still end in time."""
+def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
+    """Whether after work of this cost [ns] anybody who factors would still have a result in time."""
     if "states" not in vars(tree):
-        return not log.ends_late(cost + SURE * tree.least)
+        return tree.has_time("newton", tree.least, cost)
     able = [name for name in tree.states if name not in steps or not steps[name].over]
-    return bool(able) and not log.ends_late(cost + SURE * tree.newton)
-
-
-def once(stage: Stage) -> float:
-    """What whoever factors is counted to take [ns], without what it may take more."""
-    return stage.cost if stage.solver == "direct" else stage.cost / MOST
+    return bool(able) and tree.has_time("newton", tree.newton, cost)
 
 
 def make(name: str, log: SolveLog, tree: Tree) -> Step:

@@ -33,6 +33,7 @@ START = 5e-5  # s, of each
 EACH, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
 # s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.
 LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
+CALLS = 3e-4  # s of SciPy's calls where A is laid out by its entries
 # s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
 BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
@@ -73,8 +74,9 @@ def over_rows(problem: Problem) -> float:
         residuals.READ * entries if problem.matrix is not None and "_scan" not in problem.__dict__ else 0.0
     )
     loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
-    laid_out = WHOLE if entries == float(problem.m) ** 2 else LAID_OUT
-    return START + forming(problem) + compared + laid_out * entries + loaded
+    full = entries == float(problem.m) ** 2
+    laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
+    return START + forming(problem) + compared + laid_out + loaded
 
 
 def summed(problem: Problem) -> float:

@@ -53,7 +53,6 @@ class SolveLog:
         self.certificate: FloatArray | None = None  # (m,)
         self.direction: FloatArray | None = None  # (m,) one that is none, but bounds the impulses
         self.conflict: Any = None  # of `certify`: who fights in the convex relaxation, and what lifts it
-        self.pace = 0.0  # measured time / counted time, under a time limit; 0: not known
 
     def offer(self, impulse: FloatArray) -> float:
         """Judge an impulse (m,) and keep it if it is the best."""
@@ -115,8 +114,8 @@ class SolveLog:
         return self.timed_out or self.deadline.passed()
 
     def ends_late(self, cost: float) -> bool:
-        """Whether a step of this counted cost [ns] would end after the deadline, at the pace so far."""
-        return self.deadline.passed(1e-9 * (self.pace or 1.0) * cost)
+        """Whether a step of this counted cost [ns] would end after the deadline."""
+        return self.deadline.passed(1e-9 * cost)
 
     @property
     def still(self) -> bool:

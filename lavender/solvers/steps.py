@@ -143,6 +143,7 @@ class Sweeps(Step):
     """Accelerated sweeps whose checks predict how many are left (`lavender_ext/small/checked_sweeps.pyx`)."""
 
     relative = 1.0  # residual of the last check
+    rest = np.inf  # s, of the sweeps that are predicted to be left under a time limit
     told = 0, 0  # sweeps and restarts of the turns before
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -175,7 +176,15 @@ class Sweeps(Step):
         log = self.log
         room = self.each, PROBE, CHUNK_TIME, checked
         pace = self.state.within(self.impulse, self.relative, n, log.tol, FIRST, deadline.left, *room)
-        log.pace = pace / self.each
+        last = self.state.now
+        if last is not None:
+            self.rest = pace * sweeps_left(self.state.last, self.state.before, last.relative, log.tol)
+
+    @property
+    def nearly_there(self) -> bool:
+        """Under a time limit they go on if they are predicted to end in twice the time that is left, or sooner."""
+        deadline = self.log.deadline
+        return deadline.is_set and not self.over and not deadline.passed(0.5 * self.rest)
 
     def predicted(self, n: int) -> None:
         """Between looks at the clock, until more than `least` are predicted to be left."""
