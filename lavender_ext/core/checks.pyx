@@ -8,6 +8,7 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.door cimport first_outside, first_unsized, least, most
 
 #: The largest and the least size that a number of a problem may have.
@@ -47,10 +48,10 @@ def plain(value, tuple shape, bint finite, bint copy):
     return made
 
 
-def inside(const double[::1] x):
-    """Whether every number is at most MOST in size, none NaN: (1) of core/door.pxd."""
-    cdef Py_ssize_t i, n = x.shape[0]
-    cdef const double* at = &x[0] if n else NULL
+def inside(x):
+    """Whether every number of an array of float64 is at most MOST in size, none NaN: (1) of core/door.pxd."""
+    cdef Py_ssize_t i, n = x.size
+    cdef const double* at = doubles(x, n)
     cdef double limit = most()
     cdef int32_t out = 0
     for i in range(n):                                  # to the end without a branch: nearly all are inside
