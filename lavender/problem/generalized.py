@@ -96,10 +96,12 @@ class Generalized:
         """
         made = object.__new__(cls)
         n = len(mass[0]) - 1
-        if plain(jac[2], ANY, True, False) is None or plain(mass[2], ANY, True, False) is None:
-            for name, x in (("J", jac[2]), ("M", mass[2])):  # which finds the words
-                as_array(name, x, ANY, copy=False)
-        free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
+        for name, x in (("J", jac[2]), ("M", mass[2])):
+            if plain(x, ANY, True, False) is None:
+                as_array(name, x, ANY, copy=False)  # which finds the words
+        free = plain(v_free, (n,), True, False)
+        if free is None:
+            free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         made._fill(jac, mass, free, names, like)
         if momentum:
             v = free.copy() if made.order is None else free[made.order]
