@@ -33,6 +33,7 @@ NAMES = (
     "stability",
     "stand",
     "steppers",
+    "worlds",
 )
 
 
