@@ -120,7 +120,7 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
 
     The blocks are None where some bound is no number; held is a copy of type, id, dim and geom, one after the other.
     """
-    cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i, j
+    cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
     cdef int32_t limits[CODES]
     cdef Py_ssize_t step[3]
     cdef const int32_t* of = ints(type_, m)
