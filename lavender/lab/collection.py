@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import CapabilityError, InputError
+from lavender.io.stored import whole_file
 from lavender.judge.solution import Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
@@ -173,9 +174,9 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
     """
     known = {f.name for f in fields(Entry)}
     try:
-        lines: list[dict[str, Any]] = json.loads(Path(path).read_text(encoding="utf-8"))
+        lines: list[dict[str, Any]] = json.loads(whole_file(path, "the manifest"))
         return [Entry(**{k: v for k, v in line.items() if k in known}) for line in lines]
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no manifest of problems: {error}") from None
 
 
