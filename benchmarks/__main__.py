@@ -32,6 +32,7 @@ NAMES = (
     "stability",
     "stand",
     "steppers",
+    "worlds",
 )
 
 
