@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -142,18 +142,16 @@ def hidden(secret: str, count: int) -> list[str]:
     return [f"{families[i % 3]}(seed={seed}, rows=3000)" for i, seed in enumerate(seeds)]
 
 
-def entries(
-    groups: Iterable[str], make: Callable[[Problem, str, str], Entry] = certified
-) -> Iterator[tuple[Entry, Problem]]:
-    """Every problem of these sets, files and folders, with its entry by `make`; all sets if none is named."""
+def entries(groups: Iterable[str]) -> Iterator[Entry]:
+    """The certified entry of every problem of these sets, files and folders; of all sets if none is named."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
         if is_path(group):
             for item in resolve(group):
-                yield make(item.problem, item.name, "recorded"), item.problem
+                yield certified(item.problem, item.name, "recorded")
                 item.forget()
             continue
         for case in suite.cases(f"@{group}"):
-            yield make(case.problem, case.name, group), case.problem
+            yield certified(case.problem, case.name, group)
 
 
 def save(found: Iterable[Entry], path: Path | str) -> None:
