@@ -35,6 +35,8 @@ def test_a_crowd_is_its_parts_side_by_side(parts, seed):
         return  # one of them is refused
     assert crowd.m == sum(p.m for p in built)
     assert sorted(crowd.b) == sorted(np.concatenate([p.b for p in built]))
+    if crowd.rows is not None:  # bodies of several parts meet nowhere, and every joint has its rows
+        assert crowd.csr.nnz == sum(p.csr.nnz for p in built)
     if crowd.generalized is None:  # of J and M, sums in another order
         diagonal = np.concatenate([p.csr.diagonal() for p in built])  # a body of infinite numbers has NaN
         np.testing.assert_array_equal(np.sort(crowd.csr.diagonal()), np.sort(diagonal))
