@@ -18,6 +18,7 @@ NAMES = (
     "film",
     "float32",
     "gallery",
+    "imports",
     "islands",
     "kernels",
     "limits",
