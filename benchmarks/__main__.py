@@ -18,6 +18,7 @@ NAMES = (
     "film",
     "float32",
     "gallery",
+    "imports",
     "islands",
     "kernels",
     "limits",
@@ -32,6 +33,7 @@ NAMES = (
     "stability",
     "stand",
     "steppers",
+    "worlds",
 )
 
 

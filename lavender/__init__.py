@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from lavender import io
     from lavender.gradient import Derivative, derivative, derivatives
     from lavender.io import load
+    from lavender.judge.many import Residuals, residual_many
     from lavender.lab import bench, motion, phenomena, report, suite
     from lavender.lab.check import CrossCheck, cross_check
     from lavender.lab.motion import MotionError, Motions, motion_error, motions
@@ -63,7 +64,7 @@ if TYPE_CHECKING:
     from lavender.sim import engine, scene
     from lavender.sim.engine import SOLVER_FIELDS, Simulation, Snapshot
     from lavender.sim.scene import Scene
-    from lavender.solving.many import Residuals, Solutions, residual_many, solve_many
+    from lavender.solving.many import Solutions, solve_many
     from lavender.solving.plan import Plan, explain
     from lavender.solving.quadratic import solve_qp
 
@@ -77,7 +78,7 @@ _LATER = {
     "Motions": "lavender.lab.motion",
     "Plan": "lavender.solving.plan",
     "Redundancy": "lavender.lab.redundancy",
-    "Residuals": "lavender.solving.many",
+    "Residuals": "lavender.judge.many",
     "SOLVER_FIELDS": "lavender.sim.engine",
     "Scene": "lavender.sim.scene",
     "Simulation": "lavender.sim.engine",
@@ -94,7 +95,7 @@ _LATER = {
     "motions": "lavender.lab.motion",
     "prove": "lavender.lab.proof",
     "redundancy": "lavender.lab.redundancy",
-    "residual_many": "lavender.solving.many",
+    "residual_many": "lavender.judge.many",
     "solve_many": "lavender.solving.many",
     "solve_qp": "lavender.solving.quadratic",
 }

@@ -58,7 +58,7 @@ def problems(
             suite.names(f"@{name}")  # an unknown set is refused first
     if certify is not None:
         made = []
-        for entry, _ in collection.entries(names):
+        for entry in collection.entries(names):
             click.echo(f"{entry.name}: {entry.known}{'; ' if entry.reason else ''}{entry.reason}")
             made.append(entry)
         collection.save(made, certify)

@@ -257,7 +257,7 @@ class _Stretches:
                 self.arrays[name][:begin] = x[:begin]
         for name, x in self.arrays.items():
             given = getattr(source, name)
-            x[begin:end] = given if given.ndim == x.ndim else given.reshape(-1, *x.shape[1:])
+            x[begin:end] = given if given.ndim == x.ndim else given.reshape(count, *x.shape[1:])
         self.n = end
 
 

@@ -186,12 +186,13 @@ class Solution:
         tol: float,
         solve_time: float,
         rest: tuple[Callable[..., dict[str, Any]], tuple[Any, ...]],
+        setup_time: float = 0.0,
     ) -> Solution:
         """Fields that are known; `rest`, a function and its arguments, are the others for the first who asks."""
         made: Solution = object.__new__(cls)
         kept = made.__dict__
         kept["impulse"], kept["status"], kept["tol"] = impulse, status, tol
-        kept["setup_time"], kept["solve_time"], kept["_rest"] = 0.0, solve_time, rest
+        kept["setup_time"], kept["solve_time"], kept["_rest"] = setup_time, solve_time, rest
         return made
 
     def __getattr__(self, name: str) -> Any:

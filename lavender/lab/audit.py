@@ -27,6 +27,7 @@ from lavender.io import npz
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
 from lavender.io.stored import folder_for_steps, write_arrays
+from lavender.judge.many import residual_many
 from lavender.judge.residuals import AT_FLOOR, CLOSE, EARLY, ENOUGH, WRONG
 from lavender.lab.bench.running.campaign import check_workers, connected, hand_out
 from lavender.lab.bench.running.runner import Event
@@ -38,7 +39,6 @@ from lavender.lab.report.text import count, percent, size
 from lavender.lab.worlds import ENGINES, Runs, fields_of, frames, states_of
 from lavender.problem import PRECISIONS, Problem
 from lavender.problem.batch import Batch
-from lavender.solving.many import residual_many
 
 __all__ = ["Audit", "Worst", "audit"]
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import CapabilityError, InputError
+from lavender.io.stored import whole_file
 from lavender.judge.solution import Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
@@ -141,18 +142,16 @@ def hidden(secret: str, count: int) -> list[str]:
     return [f"{families[i % 3]}(seed={seed}, rows=3000)" for i, seed in enumerate(seeds)]
 
 
-def entries(
-    groups: Iterable[str], make: Callable[[Problem, str, str], Entry] = certified
-) -> Iterator[tuple[Entry, Problem]]:
-    """Every problem of these sets, files and folders, with its entry by `make`; all sets if none is named."""
+def entries(groups: Iterable[str]) -> Iterator[Entry]:
+    """The certified entry of every problem of these sets, files and folders; of all sets if none is named."""
     for group in [g.removeprefix("@") for g in groups] or suite.SETS:
         if is_path(group):
             for item in resolve(group):
-                yield make(item.problem, item.name, "recorded"), item.problem
+                yield certified(item.problem, item.name, "recorded")
                 item.forget()
             continue
         for case in suite.cases(f"@{group}"):
-            yield make(case.problem, case.name, group), case.problem
+            yield certified(case.problem, case.name, group)
 
 
 def save(found: Iterable[Entry], path: Path | str) -> None:
@@ -173,9 +172,9 @@ def load(path: Path | str = MANIFEST) -> list[Entry]:
     """
     known = {f.name for f in fields(Entry)}
     try:
-        lines: list[dict[str, Any]] = json.loads(Path(path).read_text(encoding="utf-8"))
+        lines: list[dict[str, Any]] = json.loads(whole_file(path, "the manifest"))
         return [Entry(**{k: v for k, v in line.items() if k in known}) for line in lines]
-    except (OSError, ValueError, TypeError, AttributeError) as error:
+    except (ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is no manifest of problems: {error}") from None
 
 

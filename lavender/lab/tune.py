@@ -30,6 +30,7 @@ from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
+from lavender.judge.many import residual_many
 from lavender.judge.residuals import ENOUGH
 from lavender.lab.audit import AT_ONCE
 from lavender.lab.bench.running.runner import Event
@@ -39,7 +40,6 @@ from lavender.lab.report.table import Table
 from lavender.lab.report.text import seconds, size, times
 from lavender.lab.worlds import Runs, flew_apart, states_of
 from lavender.problem.derived import cached_property
-from lavender.solving.many import residual_many
 
 __all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
 

@@ -31,7 +31,7 @@ from lavender.base.later import sparse as sp
 from lavender.problem.derived import cached_property
 from lavender_ext.core import generalized as kernels
 from lavender_ext.core.assemble import dense_to_csr, stacked
-from lavender_ext.core.checks import LEAST, inside
+from lavender_ext.core.checks import LEAST, plain
 from lavender_ext.factor.graph import least_degree
 
 __all__ = ["Generalized"]
@@ -42,6 +42,7 @@ MESH = 400  # velocities from which on the order of trees is looked for: below, 
 FACTORS = 20  # of a matrix like M that the solves of a problem take: what an order that fills in costs
 MET = 100  # trees that meet a tree, in the mean, beyond which no order keeps J^T J sparse
 Compressed = tuple[IntArray, IntArray, FloatArray]
+ANY = (None,)  # the shape of an array of any length
 
 
 class Generalized:
@@ -96,11 +97,11 @@ class Generalized:
         made = object.__new__(cls)
         n = len(mass[0]) - 1
         for name, x in (("J", jac[2]), ("M", mass[2])):
-            if type(x) is np.ndarray and inside(x):
-                x.setflags(write=False)
-            else:  # which finds the words
-                as_array(name, x, (None,), copy=False)
-        free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
+            if plain(x, ANY, True, False) is None:
+                as_array(name, x, ANY, copy=False)  # which finds the words
+        free = plain(v_free, (n,), True, False)
+        if free is None:
+            free = as_array("v_free", v_free, (n,), unit="m/s, rad/s", copy=False)
         made._fill(jac, mass, free, names, like)
         if momentum:
             v = free.copy() if made.order is None else free[made.order]

@@ -37,13 +37,13 @@ class Operators(ProblemData):
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
         """From read-only arrays that `export.numbers` has let in, in generalised coordinates: adopted."""
-        made = object.__new__(cls)
-        derived, put = Derived(), made.__dict__
-        put.update(given, derived=derived, precision="float64", copy=True)
+        made, derived = object.__new__(cls), Derived()
+        given["derived"], given["precision"], given["copy"] = derived, "float64", True
         derived.view = general_data(
-            put["cones"]._blocks, put["b"], put["generalized"].operator, put["compliance"],
-            FRICTION_NUMBER[put["friction"]],
+            given["cones"]._blocks, given["b"], given["generalized"].operator, given["compliance"],
+            FRICTION_NUMBER[given["friction"]],
         )  # fmt: skip
+        object.__setattr__(made, "__dict__", given)
         made._refuse_extremes()
         return made
 

@@ -18,6 +18,7 @@ from lavender.external.foreign import Foreign
 from lavender.judge.residuals import (
     Residual,
     judging_time,
+    known,
     reference,
     setup_time,
     told,
@@ -42,6 +43,7 @@ __all__ = ["Prepared", "prepare", "solve"]
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
+SET_UP_LATE = "what has to be set up first takes longer than the time limit"
 JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
@@ -306,7 +308,17 @@ class Prepared:
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         elif self._late or (loop.deadline.passed() and not spec.external):
-            claim = Claim(TIME_LIMIT, 0, {}, "what has to be set up first takes longer than the time limit")
+            if (
+                loop.records is None
+                and loop.deadline.passed()
+                and (known(problem, loop.impulse) or 0.0) > loop.tol
+            ):
+                start = loop.impulse if self._given is problem else self._given.cones.stretch * loop.impulse
+                words = (
+                    f"{SET_UP_LATE}: the start, unjudged"  # doing nothing, beside which nothing is weighed
+                )
+                return unjudged(self._given, spec, self.options, start, loop.tol, words, setup_time)
+            claim = Claim(TIME_LIMIT, 0, {}, SET_UP_LATE)
             loop.not_worse(loop.impulse)
         else:
             start = loop.impulse.copy() if loop.deadline.is_set else loop.impulse
@@ -358,7 +370,13 @@ class Prepared:
 
 
 def unjudged(
-    given: Problem, spec: SolverSpec, options: dict[str, Any], impulse: Any, tol: float, words: str
+    given: Problem,
+    spec: SolverSpec,
+    options: dict[str, Any],
+    impulse: Any,
+    tol: float,
+    words: str,
+    setup_time: float = 0.0,
 ) -> Solution:
     """The start as it is, where even the judge would be late; he measures it for the first who asks."""
     problem = given.disk
@@ -367,7 +385,7 @@ def unjudged(
         start = given.on_disk(problem.impulse_array(impulse))
     answer = start if given is problem else given.cones.stretch * start
     late = judged_later, (given, problem, spec, options, start.copy(), Claim(TIME_LIMIT, 0, {}, words), tol)
-    return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late)
+    return Solution.late(read_only(answer.copy()), TIME_LIMIT, tol, 0.0, late, setup_time)
 
 
 def _in_rows_of(given: Problem, stretch: FloatArray, callback: Callback) -> Callback:

@@ -8,7 +8,8 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.core.door cimport first_outside, first_unsized, least, most
+from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.door cimport first_unsized, least, most
 
 #: The largest and the least size that a number of a problem may have.
 MOST, LEAST = most(), least()
@@ -23,11 +24,11 @@ def plain(value, tuple shape, bint finite, bint copy):
     cdef Py_buffer view
     cdef Py_ssize_t i, n = 1
     cdef bint fits
-    if type(value) is not ndarray or not value.flags.c_contiguous:
+    if type(value) is not ndarray:
         return None
     try:
         PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
-    except ValueError:                                  # dates have no buffer
+    except ValueError:                                  # not contiguous; dates have no buffer
         return None
     fits = view.format[0] == 100 and view.format[1] == 0 and view.ndim == len(shape)    # "d"
     if fits:
@@ -38,23 +39,26 @@ def plain(value, tuple shape, bint finite, bint copy):
                 fits = False
                 break
     if fits and finite:
-        fits = first_outside(<const double*>view.buf, n) < 0
+        fits = are_inside(<const double*>view.buf, n)
     PyBuffer_Release(&view)
     if not fits:
         return None
     made = value.copy() if copy else value
-    made.setflags(write=False)
+    made.setflags(False)
     return made
 
 
-def inside(const double[::1] x):
-    """Whether every number is at most MOST in size, none NaN: (1) of core/door.pxd."""
-    cdef Py_ssize_t i, n = x.shape[0]
-    cdef const double* at = &x[0] if n else NULL
+def inside(x):
+    """Whether every number of an array of float64 is at most MOST in size, none NaN: (1) of core/door.pxd."""
+    return are_inside(doubles(x, x.size), x.size)
+
+
+cdef bint are_inside(const double* x, Py_ssize_t n) noexcept nogil:
+    cdef Py_ssize_t i
     cdef double limit = most()
     cdef int32_t out = 0
     for i in range(n):                                  # to the end without a branch: nearly all are inside
-        out |= not fabs(at[i]) <= limit
+        out |= not fabs(x[i]) <= limit
     return out == 0
 
 
@@ -63,11 +67,12 @@ def unsized(const double[::1] x):
     return first_unsized(&x[0], x.shape[0]) if x.shape[0] else -1
 
 
-def largest(const double[::1] x):
-    """max |x_i|: 0 without entries, NaN where one is."""
-    cdef Py_ssize_t i
+def largest(numbers):
+    """max |x_i| of float64: 0 without entries, NaN where one is."""
+    cdef Py_ssize_t i, n = numbers.size
+    cdef const double* x = doubles(numbers, n)
     cdef double s = 0.0
-    for i in range(x.shape[0]):
+    for i in range(n):
         if not fabs(x[i]) <= s:
             s = fabs(x[i])
             if s != s:

@@ -414,6 +414,8 @@ cdef class Operator:
     cdef readonly object jac            # (indptr, indices, data) of J
     cdef readonly object mass           # the same of the lower triangle of M
     cdef list keep
+    cdef const int32_t* mptr            # of `mass`
+    cdef const int32_t* midx
 
-    cdef bint has_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx)
-    cdef tuple find_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx)
+    cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx)
+    cdef tuple find_pattern(self, const int32_t* mptr, const int32_t* midx)

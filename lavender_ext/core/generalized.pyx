@@ -5,6 +5,7 @@ from libc.string cimport memcmp
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles, ints
 from lavender_ext.core.door cimport is_beyond
 from lavender_ext.core.generalized cimport jac_push, jac_row, tree_solve
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
@@ -28,20 +29,19 @@ cdef class Operator:
     """
 
     def __init__(self, jptr_, jidx_, jval_, mptr_, midx_, mval_, Operator like=None):
-        # Kept as they came: a view made an object again costs more than the view.
-        cdef const int32_t[::1] jptr = jptr_, jidx = jidx_, mptr = mptr_, midx = midx_
-        cdef const double[::1] jval = jval_, mval = mval_
-        cdef int32_t m = <int32_t>jptr.shape[0] - 1, n = <int32_t>mptr.shape[0] - 1, i
-        cdef double[::1] numbers
+        cdef int32_t m = <int32_t>len(jptr_) - 1, n = <int32_t>len(mptr_) - 1, i
+        cdef const int32_t* mptr = ints(mptr_, n + 1)
+        cdef const int32_t* midx = ints(midx_, len(midx_))
+        cdef double* numbers
         self.jac = (jptr_, jidx_, jval_)
         self.mass = (mptr_, midx_, mval_)
+        self.mptr, self.midx = mptr, midx
         self.g.n = n
         self.g.m = m
-        self.g.jptr = &jptr[0]
-        if jidx.shape[0]:
-            self.g.jidx = &jidx[0]
-            self.g.jval = &jval[0]
-        if like is not None and like.has_pattern(mptr, midx):
+        self.g.jptr = ints(jptr_, m + 1)
+        self.g.jidx = ints(jidx_, len(jidx_))
+        self.g.jval = doubles(jval_, len(jval_))
+        if like is not None and like.has_pattern(n, mptr, midx):
             marks, entries = like.keep[0], like.keep[1]
             self.g.lptr = like.g.lptr
             self.g.lidx = like.g.lidx
@@ -49,35 +49,30 @@ cdef class Operator:
         else:
             marks, entries = self.find_pattern(mptr, midx)
         factor = new(2 * n + self.g.lptr[n] + 1)
-        numbers = factor
+        numbers = doubles(factor, 2 * n + self.g.lptr[n] + 1)
         self.keep = [marks, entries, factor]
-        self.g.lval = &numbers[2 * n]
-        self.g.inv_pivot = &numbers[0]
-        self.g.root = &numbers[n]                       # the factor's pivots, until it is there
+        self.g.lval = numbers + 2 * n
+        self.g.inv_pivot = numbers
+        self.g.root = numbers + n                       # the factor's pivots, until it is there
         self.failed = -1
         if n:
-            self.failed = lav_tree_factor(n, &mptr[0], &midx[0], &mval[0], self.g.lptr, self.g.lidx, &numbers[2 * n],
-                                          &numbers[n], &numbers[0])
+            self.failed = lav_tree_factor(n, mptr, midx, doubles(mval_, len(mval_)), self.g.lptr, self.g.lidx,
+                                          numbers + 2 * n, numbers + n, numbers)
         for i in range(n):
             numbers[n + i] = sqrt(numbers[i])
 
-    cdef bint has_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
-        cdef const int32_t[::1] own_ptr = self.mass[0], own_idx = self.mass[1]
-        cdef Py_ssize_t n = mptr.shape[0], nnz = midx.shape[0]
-        if own_ptr.shape[0] != n or own_idx.shape[0] != nnz:
-            return False
-        if memcmp(&own_ptr[0], &mptr[0], n * sizeof(int32_t)) != 0:
-            return False
-        return nnz == 0 or memcmp(&own_idx[0], &midx[0], nnz * sizeof(int32_t)) == 0
+    cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx):
+        return self.g.n == n and (self.mptr == mptr or memcmp(self.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
+            self.midx == midx or memcmp(self.midx, midx, mptr[n] * sizeof(int32_t)) == 0)
 
-    cdef tuple find_pattern(self, const int32_t[::1] mptr, const int32_t[::1] midx):
+    cdef tuple find_pattern(self, const int32_t* mptr, const int32_t* midx):
         # L's columns by the elimination of M; the arrays that hold them.
-        cdef int32_t n = self.g.n, count, room = <int32_t>midx.shape[0] + 1
+        cdef int32_t n = self.g.n, count, room = mptr[n] + 1
         cdef int32_t[::1] whole, indices
         marks = new(5 * n + 2 + room, I4)
         whole = marks
         # lptr, parent, scratch, then the columns of L
-        count = tree_pattern(n, &mptr[0], &midx[0] if n else NULL, room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
+        count = tree_pattern(n, mptr, midx, room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
                              &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
         entries = marks
         self.g.lidx = &whole[5 * n + 1]
@@ -86,7 +81,7 @@ cdef class Operator:
             entries = new(room, I4)
             indices = entries
             self.g.lidx = &indices[0]
-            count = tree_pattern(n, &mptr[0], &midx[0], room, &whole[0], &indices[0], &whole[n + 1],
+            count = tree_pattern(n, mptr, midx, room, &whole[0], &indices[0], &whole[n + 1],
                                  &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
         self.g.lptr = &whole[0]
         self.g.parent = &whole[n + 1]
@@ -105,7 +100,7 @@ cdef class Operator:
     @property
     def fill(self):
         """Entries of L left of the diagonal that M does not have."""
-        return self.g.lptr[self.g.n] - (len(self.mass[1]) - self.g.n)
+        return self.g.lptr[self.g.n] - (self.mptr[self.g.n] - self.g.n)
 
     @property
     def least_pivot(self):

@@ -15,6 +15,7 @@ cimport cython
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.door cimport first_outside, least
@@ -524,11 +525,10 @@ cdef class Data:
         self.start_velocity = velocity
 
 
-def general_data(Blocks blocks, b_, Operator operator, compliance_, int law):
+def general_data(Blocks blocks, b, Operator operator, compliance, int law):
     """Data of a problem in generalised coordinates, whose own numbers wait until `prepare`; law: COULOMB or CONE."""
-    cdef const double[::1] b = b_, compliance = compliance_
     cdef Data made = Data.__new__(Data)
-    made.keep = [blocks, b_, operator, compliance_]
+    made.keep = [blocks, b, operator, compliance]
     made.blocks = blocks.at
     made.blocks.law = law
     made.general = operator.g
@@ -537,8 +537,8 @@ def general_data(Blocks blocks, b_, Operator operator, compliance_, int law):
     made.start_energy = made.start_velocity = made.start_relative = -1.0
     made.empty = _NONE
     if blocks.at.n_rows:
-        made.blocks.b = &b[0]
-        made.general.compliance = &compliance[0]
+        made.blocks.b = doubles(b, blocks.at.n_rows)
+        made.general.compliance = doubles(compliance, blocks.at.n_rows)
     return made
 
 

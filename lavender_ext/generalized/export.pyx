@@ -11,6 +11,7 @@ from libc.string cimport memcmp, memcpy
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles, ints, spread
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport is_number, is_size
 from lavender_ext.core.parts cimport ROW, contact_kind, lay_frictions
@@ -114,46 +115,48 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
     return k
 
 
-def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] codes, tuple most,
-           const int32_t[:] dim, const double[:, :] friction, const int32_t[:, :] geom, const double[:] loss, double dt):
+def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     """(blocks, scale, key, held), or the number of a row that is unknown, or names what is not there.
 
     The blocks are None where some bound is no number; held is a copy of type, id, dim and geom, one after the other.
     """
-    cdef int32_t m = <int32_t>type_.shape[0], c = <int32_t>dim.shape[0], k, i, j
+    cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
     cdef int32_t limits[CODES]
+    cdef Py_ssize_t step[3]
+    cdef const int32_t* of = ints(type_, m)
+    cdef const int32_t* which = ints(id_, m)
+    cdef const double* losses = doubles(loss, m)
+    cdef const char* dims = spread(dim, c, 1, "il", sizeof(int32_t), &step[0])
+    cdef const char* pair = spread(geom, c, 2, "il", sizeof(int32_t), &step[1])
+    cdef const char* rub = spread(friction, c, 5, "d", sizeof(double), &step[2])
     cdef Blocks made = Blocks.__new__(Blocks)
     for k in range(CODES):
         limits[k] = most[k]
-    if not m == id_.shape[0] == loss.shape[0] or not c == friction.shape[0] == geom.shape[0]:
-        raise ValueError("arrays of rows or of contacts that differ in length")
-    whole, copy, numbers, keys = new(2 * m + 1, I4), new(2 * m + 3 * c + 1, I4), new(7 * m + 5 * c + 1), new(m + 1, U8)
-    cdef int32_t[::1] w = whole, held = copy
-    cdef double[::1] x = numbers
-    cdef uint64_t[::1] key = keys
+    whole, copy, numbers, keys = new(2 * m + 1, I4), new(2 * m + 3 * c + 1, I4), new(6 * m + 5 * c + 1), new(m + 1, U8)
+    cdef int32_t* w = ints(whole, 2 * m + 1)
+    cdef int32_t* held = ints(copy, 2 * m + 3 * c + 1)
+    cdef double* x = doubles(numbers, 6 * m + 5 * c + 1)
+    cdef uint64_t* key = <uint64_t*>spread(keys, m + 1, 1, "LQ", sizeof(uint64_t), NULL)
+    memcpy(held, of, m * sizeof(int32_t))
+    memcpy(held + m, which, m * sizeof(int32_t))
     for i in range(m):
-        held[i] = type_[i]
-        held[m + i] = id_[i]
-        x[6 * m + i] = loss[i]
         x[4 * m + i] = x[5 * m + i] = 0.0               # no patch, nothing rolls by itself
     for i in range(c):
-        held[2 * m + i] = dim[i]
-        for j in range(2):
-            held[2 * m + c + 2 * i + j] = geom[i, j]
-        for j in range(5):
-            x[7 * m + 5 * i + j] = friction[i, j]
-    k = lav_export_blocks(m, &held[0], &held[m], &codes[0], limits, &held[2 * m], &x[7 * m], &held[2 * m + c],
-                          &x[6 * m], dt, &w[0], &w[m + 1] if m else NULL, &x[0], &x[m], &x[3 * m], &x[2 * m], &key[0])
+        memcpy(&held[2 * m + i], dims + i * step[0], sizeof(int32_t))
+        memcpy(&held[2 * m + c + 2 * i], pair + i * step[1], 2 * sizeof(int32_t))
+        memcpy(&x[6 * m + 5 * i], rub + i * step[2], 5 * sizeof(double))
+    k = lav_export_blocks(m, held, held + m, ints(codes, CODES), limits, held + 2 * m, x + 6 * m, held + 2 * m + c,
+                          losses, dt, w, w + m + 1, x, x + m, x + 3 * m, x + 2 * m, key)
     if k < 0:
         return -1 - k
     made.at.n_blocks = k
     made.at.n_rows = m
-    made.at.ptr = &w[0]
+    made.at.ptr = w
     if m:
-        made.at.kind = &w[m + 1]
-        made.at.lower = &x[0]
-        made.at.upper = &x[m]
-        lay_frictions(&made.at, &x[3 * m], m)
+        made.at.kind = w + m + 1
+        made.at.lower = x
+        made.at.upper = x + m
+        lay_frictions(&made.at, x + 3 * m, m)
     fits = made.check()
     made.spell()
     whole.setflags(False)
@@ -164,53 +167,53 @@ def blocks(const int32_t[:] type_, const int32_t[:] id_, const int32_t[::1] code
     return made if fits else None, numbers[2 * m:3 * m], keys[:k], copy
 
 
-def rows_of_dense(const double[::1] values, int32_t m, int32_t n, const double[::1] scale):
-    """(indptr, indices, data) of J scaled by row, from its numbers row by row; there are m n of them."""
-    cdef int32_t i, j
-    cdef Py_ssize_t at = 0
+def rows_of_dense(values, int32_t m, int32_t n, scale):
+    """(indptr, indices, data) of J scaled by row, from its numbers row by row; there are m n of them, or more."""
+    cdef int32_t i, j, at = 0
     cdef double x
-    indptr_ = new(m + 1, I4)
-    indices_ = new(m * n, I4)
-    data_ = new(m * n)
-    cdef int32_t[::1] indptr = indptr_, indices = indices_
-    cdef double[::1] data = data_
+    cdef const double* value = doubles(values, values.size)
+    cdef const double* factor = doubles(scale, m)
+    whole, data_ = new(m + 1 + m * n, I4), new(m * n)
+    cdef int32_t* indptr = ints(whole, m + 1 + m * n)
+    cdef int32_t* indices = indptr + m + 1
+    cdef double* data = doubles(data_, m * n)
     indptr[0] = 0
     for i in range(m):
         for j in range(n):
-            x = values[i * n + j] * scale[i]
+            x = value[i * n + j] * factor[i]
             if x != 0.0:
                 indices[at] = j
                 data[at] = x
                 at += 1
-        indptr[i + 1] = <int32_t>at
-    return indptr_, indices_[:at].copy(), data_[:at].copy()
+        indptr[i + 1] = at
+    return whole[:m + 1], whole[m + 1:m + 1 + at], data_[:at]
 
 
-def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int32_t[::1] first,
-                   const int32_t[::1] columns, const double[::1] scale, int32_t n):
+def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
     """The same of compressed rows of n columns that may have room between them; None where columns do not ascend.
 
     Of rows that cannot be followed, the first one's number.
     """
-    cdef int32_t i, m = <int32_t>count.shape[0], stray
-    cdef Py_ssize_t q, begin, end, at = 0, total = 0, room = min(values.shape[0], columns.shape[0])
+    cdef int32_t i, m = <int32_t>len(scale), stray
+    cdef Py_ssize_t q, begin, end, at = 0, total = 0, room = min(values.size, columns.size)
     cdef double x, factor
     cdef bint ascend = True
+    cdef const int32_t* count = ints(count_, m)
+    cdef const int32_t* first = ints(first_, m)
+    cdef const double* scales = doubles(scale, m)
+    cdef const int32_t* column = ints(columns, columns.size)
+    cdef const double* value = doubles(values, values.size)
     for i in range(m):
         if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
             return i
         total += count[i]
     whole, data_ = new(m + 1 + total, I4), new(total)
-    cdef int32_t[::1] view = whole
-    cdef double[::1] data_view = data_
-    cdef int32_t* indptr = &view[0]
+    cdef int32_t* indptr = ints(whole, m + 1 + total)
     cdef int32_t* indices = indptr + m + 1
-    cdef double* data = &data_view[0] if total else NULL
-    cdef const int32_t* column = &columns[0] if room else NULL
-    cdef const double* value = &values[0] if room else NULL
+    cdef double* data = doubles(data_, total)
     indptr[0] = 0
     for i in range(m):
-        factor = scale[i]
+        factor = scales[i]
         begin = first[i]
         end = begin + count[i]
         stray = 0
@@ -230,30 +233,31 @@ def rows_of_sparse(const double[::1] values, const int32_t[::1] count, const int
     return (whole[:m + 1], whole[m + 1:m + 1 + at], data_[:at]) if ascend else None
 
 
-def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1] columns, const double[::1] values,
-          const double[:] x, const double[:] y, tuple like):
+def lower(first_, count_, columns, values, x, y, tuple like):
     """M's rows by first place and length as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
     Columns ascend to the diagonal entry. None where these are no lower triangle, row behind row. `like` is (indptr,
     indices) of such a triangle, which are shared where they are these.
     """
-    cdef int32_t i, q, j, end, last, n = <int32_t>first.shape[0], nnz = <int32_t>columns.shape[0]
+    cdef int32_t i, q, j, end, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
     cdef double gap = 0.0, big = 0.0, own, size, z, w, term
-    cdef const int32_t[::1] seen_at = like[0], seen = like[1]
-    cdef int32_t[::1] whole
+    cdef const int32_t* first = ints(first_, n)
+    cdef const int32_t* given = ints(columns, nnz)
+    cdef const int32_t* count
     cdef const int32_t* at
     cdef const int32_t* column
+    cdef int32_t* whole
     cdef double* out
     cdef double* made
     cdef double* sizes
-    cdef double* v
-    if not n == count.shape[0] == x.shape[0] == y.shape[0] or nnz != values.shape[0] or n == 0:
+    cdef const double* v
+    cdef const double* right
+    if not n == len(count_) == len(x) == len(y) or nnz != len(values) or n == 0:
         return None if n or nnz else ((np.zeros(1, I4), new(0, I4), new(0)), 0.0)
-    if not (seen_at.shape[0] == n + 1 and seen.shape[0] == nnz and seen_at[n] == nnz
-            and memcmp(&seen_at[0], &first[0], n * sizeof(int32_t)) == 0
-            and memcmp(&seen[0], &columns[0], nnz * sizeof(int32_t)) == 0 and are_lengths(n, &seen_at[0], &count[0])):
+    count, v, right = ints(count_, n), doubles(x, n), doubles(y, n)
+    if not is_seen(like, n, nnz, first, count, given):
         like = new(n + 1, I4), np.array(columns, I4)
-        whole = like[0]
+        whole = ints(like[0], n + 1)
         whole[0] = 0
         for i in range(n):
             if first[i] != whole[i] or not 0 < count[i] <= nnz - whole[i]:
@@ -261,24 +265,23 @@ def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1]
             whole[i + 1] = whole[i] + count[i]
             last = -1
             for q in range(whole[i], whole[i + 1]):
-                if not last < columns[q] <= i:
+                if not last < given[q] <= i:
                     return None
-                last = columns[q]
+                last = given[q]
             if last != i:
                 return None
         if whole[n] != nnz:
             return None
         for made_ in like:
             made_.setflags(False)
-        seen_at, seen = like
-    at, column = &seen_at[0], &seen[0]
-    copy, scratch = new(nnz), new(3 * n)
-    cdef double[::1] value = copy, s = scratch
-    out, made, sizes, v = &value[0], &s[0], &s[n], &s[2 * n]    # M x, |M| |x|, x
-    memcpy(out, &values[0], nnz * sizeof(double))
+    at, column = ints(like[0], n + 1), ints(like[1], nnz)
+    copy, scratch = new(nnz), new(2 * n)
+    out, made = doubles(copy, nnz), doubles(scratch, 2 * n)
+    sizes = made + n                                    # M x, |M| |x|
+    memcpy(out, doubles(values, nnz), nnz * sizeof(double))
     for i in range(n):
         own = size = 0.0
-        z = v[i] = x[i]
+        z = v[i]
         w = fabs(z)
         end = at[i + 1] - 1
         for q in range(at[i], end):
@@ -291,30 +294,43 @@ def lower(const int32_t[::1] first, const int32_t[::1] count, const int32_t[::1]
         made[i] = own + out[end] * z
         sizes[i] = size + fabs(out[end]) * w
     for i in range(n):
-        gap = widest(gap, made[i] - y[i])
-        big = widest(big, sizes[i] + fabs(y[i]))
+        gap = widest(gap, made[i] - right[i])
+        big = widest(big, sizes[i] + fabs(right[i]))
     return (like[0], like[1], copy), gap / big if big > 0.0 else gap
 
 
-def motion_gap(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
-               const double[:, ::1] spatial, const double[::1] v):
+cdef bint is_seen(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
+    cdef const int32_t* at
+    cdef int32_t i
+    if len(like[0]) != n + 1 or len(like[1]) != nnz:
+        return False
+    at = ints(like[0], n + 1)
+    if at[n] != nnz or memcmp(at, first, n * sizeof(int32_t)) or memcmp(ints(like[1], nnz), columns, nnz * sizeof(int32_t)):
+        return False
+    for i in range(n):
+        if at[i + 1] - at[i] != count[i]:
+            return False
+    return True
+
+
+def motion_gap(parent, body, axis, spatial, v_):
     """How far the spatial velocities c (n, 6) of bodies are from those that v (nv) makes, and the largest term.
 
         c_i = c_parent(i) + sum over the velocities j of body i of s_j v_j,   s = axis (nv, 6)
 
     0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
     """
-    cdef Py_ssize_t i, j, k, n = v.shape[0], bodies = spatial.shape[0]
+    cdef Py_ssize_t i, j, k, n = len(v_), bodies = len(spatial)
     cdef double term, z, big = 0.0, gap = 0.0, filled = 0.0, lost = 0.0     # lost: 0, or NaN
-    if not body.shape[0] == axis.shape[0] == n or parent.shape[0] != bodies or bodies == 0:
+    if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
     scratch = new(6 * bodies)
-    cdef double[::1] view = scratch
-    cdef double* made = &view[0]
-    cdef const double* c = &spatial[0, 0]
-    cdef const double* s = &axis[0, 0] if n else NULL
-    cdef const int32_t* of = &body[0] if n else NULL
-    cdef const int32_t* up = &parent[0]
+    cdef double* made = doubles(scratch, 6 * bodies)
+    cdef const double* c = doubles(spatial, 6 * bodies)
+    cdef const double* s = doubles(axis, 6 * n)
+    cdef const double* v = doubles(v_, n)
+    cdef const int32_t* of = ints(body, n)
+    cdef const int32_t* up = ints(parent, bodies)
     for i in range(bodies):
         if not 0 <= up[i] < bodies:
             return -1.0, 0.0
@@ -395,9 +411,7 @@ def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const doub
     return found
 
 
-def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] jval, const double[::1] scale, double dt,
-            const double[:] v, const double[:] smooth, const double[:] aref, const double[:] r, const double[:] inverse,
-            const double[:] force, const double[:] vel, const double[:] b, const double[:] push, const double[:] a):
+def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_):
     """(b, compliance, v*, whether the door takes them, max |efc_R efc_D - 1|, gaps) of J scaled by row.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
@@ -409,27 +423,38 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
     with v before the step and f = efc_force. 0 where such a vector is all zeros: one that a copy did not fill. The size
     of terms is |J_i|_1 |x|_max for (1) and (2), the largest of |J|^T |f| for (3). The fourth is NaN where a is not finite.
     """
-    cdef int32_t i, j, m = <int32_t>jptr.shape[0] - 1, n = <int32_t>v.shape[0]
+    cdef int32_t i, j, m = <int32_t>len(aref_), n = <int32_t>len(v_)
     cdef Py_ssize_t q
+    cdef const int32_t* jptr = ints(jptr_, m + 1)
+    cdef const int32_t* jidx = ints(jidx_, jptr[m])
+    cdef const double* jval = doubles(jval_, jptr[m])
+    cdef const double* scale = doubles(scale_, m)
+    cdef const double* v = doubles(v_, n)
+    cdef const double* smooth = doubles(smooth_, n)
+    cdef const double* aref = doubles(aref_, m)
+    cdef const double* r = doubles(r_, m)
+    cdef const double* inverse = doubles(inverse_, m)
+    cdef const double* force = doubles(force_, m)
+    cdef const double* vel = doubles(vel_, m)
+    cdef const double* b = doubles(b_, m)
+    cdef const double* push = doubles(push_, n)
+    cdef const double* a = doubles(a_, n)
     cdef double c, size, s_v, s_free, f, finite = 0.0, gap_0 = 0.0, gap_1 = 0.0, gap_2 = 0.0, gap_3 = 0.0
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
-    made = new(2 * m + 5 * n + 1)
-    cdef double[::1] view = made
-    cdef double* rhs = &view[0]
+    made = new(2 * m + 4 * n + 1)
+    cdef double* rhs = doubles(made, 2 * m + 4 * n + 1)
     cdef double* compliance = rhs + m
     cdef double* free = compliance + m
     cdef double* pushed = free + n                      # J^T f, and the same of absolute values
-    cdef double* before = pushed + 2 * n                # v, then dt a0
-    cdef double* change = before + n
+    cdef double* change = pushed + 2 * n                # dt a0
     for j in range(n):
-        before[j] = v[j]
         change[j] = dt * smooth[j]
         pushed[j] = pushed[n + j] = 0.0
-        free[j] = before[j] + change[j]
+        free[j] = v[j] + change[j]
         sound &= is_number(free[j])
-        top_v = widest(top_v, before[j])
+        top_v = widest(top_v, v[j])
         top_free = widest(top_free, change[j])
         said_3 = widest(said_3, push[j])
         finite += 0.0 * a[j]
@@ -439,7 +464,7 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         for q in range(jptr[i], jptr[i + 1]):
             j = jidx[q]
             c = jval[q]
-            s_v += c * before[j]
+            s_v += c * v[j]
             s_free += c * change[j]
             size += fabs(c)
             c *= f
@@ -466,14 +491,6 @@ def numbers(const int32_t[::1] jptr, const int32_t[::1] jidx, const double[::1] 
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)
-
-
-cdef inline bint are_lengths(int32_t n, const int32_t* at, const int32_t* count) noexcept nogil:
-    cdef int32_t i
-    for i in range(n):
-        if at[i + 1] - at[i] != count[i]:
-            return False
-    return True
 
 
 cdef inline double larger(double so_far, double x) noexcept nogil:

@@ -16,14 +16,14 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
-from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
+from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
                                        AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
-from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
 from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
@@ -51,22 +51,6 @@ cdef enum:
     LOOKS = 3                   # evaluations of a step
 
 
-cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
-    double entry                # each multiply-add of a sweep, and
-    double work                 # of a factor,
-    double bounded              # factorisations by law,
-    double coulomb
-    double cone
-    double rigid                # times as many, but of bounded rows, with a rigid row,
-    double soft                 # and where none is, but of free ones
-    double start                # what a solve beside this call takes at least,
-    double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
-    double sweep_cone
-    double sweeps               # and how many of them
-    double values               # of one island's N
-    double most                 # what all may cost to be asked at all
-
-
 cdef struct job_t:
     blocks_t p
     generalized_t g
@@ -89,43 +73,6 @@ cdef inline void begin(job_t* j, double* w) noexcept nogil:
     cdef view_t v = view_t(j.p, NULL, NULL, &j.g)
     cdef ssize_t m = j.p.n_rows
     judge_nothing(&v, w + 2 * m, w, w + m, w + 3 * m, j.begin)
-
-
-cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
-    """One factor of each island, of so many multiply-adds in all [ns]."""
-    return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
-
-
-cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
-    """Is every row free?"""
-    cdef int32_t i, k
-    for i in range(p.n_blocks):
-        for k in range(p.ptr[i], p.ptr[i + 1]):
-            if not is_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
-                return False
-    return True
-
-
-cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
-    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
-    cdef double count = l.bounded
-    cdef bint linear = is_linear(p), rubs = has_friction(p), soft = is_soft(p, g)
-    if linear:
-        count = 1.0
-    elif rubs:
-        count = l.coulomb if p.law == COULOMB else l.cone
-    if soft and not linear:
-        count *= l.soft
-    elif not soft and (linear or rubs):
-        count *= l.rigid
-    return count * step_cost(p, g, l, work)
-
-
-cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
-    """What it may cost [ns]: where a row is rigid as much as sweeps, which may do with less."""
-    cdef double each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.entry
-    cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
-    return l.most if is_soft(p, g) else min(l.most, l.start + l.sweeps * sweep)
 
 
 cdef inline double spent_by(const job_t* j, const limits_t* l, double work, int32_t factored, double lines) noexcept nogil:
@@ -330,6 +277,25 @@ CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE}
 cdef enum:                      # what `Hand` says in the place of a world's number
     DONE_ALL = -1
     LISTEN = -2                 # to the clock
+
+
+def data_of(list problems, kind):
+    """(Data of each problem in generalised coordinates, None of one that the loop leaves; rows of each (n,))."""
+    cdef Py_ssize_t i, n = len(problems)
+    cdef Data p
+    cdef list data = [None] * n
+    sizes = np.empty(n, np.int64)
+    cdef int64_t[::1] rows = sizes
+    for i in range(n):
+        problem = problems[i]
+        p = problem.derived.view
+        if p is None:
+            rows[i] = problem.m
+            continue
+        rows[i] = p.blocks.n_rows
+        if type(problem) is kind and not (<Blocks>p.keep[0]).has_ellipse:
+            data[i] = p
+    return data, sizes
 
 
 cdef class Worlds:

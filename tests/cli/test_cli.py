@@ -231,27 +231,6 @@ def test_cases_lists_families_with_parameters_and_reasons(lavender):
 # -- what nobody should ask for ---------------------------------------------------------------------------
 
 
-def long_file(path, start=b""):
-    """A file of ten gigabytes that takes no room."""
-    with path.open("wb") as stream:
-        stream.write(start)
-        stream.truncate(10**10)
-    return path
-
-
-def test_files_of_ten_gigabytes_are_refused_by_their_size(lavender, tmp_path):
-    for words in (
-        ("report", long_file(tmp_path / "records.jsonl")),
-        ("report", tmp_path / "records.jsonl", "--out", tmp_path / "out"),
-        ("view", long_file(tmp_path / "a.film", b"LAVENDERFILM"), "--no-browser"),
-    ):
-        code, out, err = lavender(*words)
-        assert code == 2
-        assert "10000000000 bytes" in out + err
-    with pytest.raises(lv.InputError, match="10000000000 bytes"):
-        lv.Snapshot.load(tmp_path / "a.film")
-
-
 def test_a_line_without_end_is_refused(tmp_path):
     path = tmp_path / "records.jsonl"
     with path.open("wb") as stream:

@@ -27,17 +27,10 @@ QUICK = ("--solvers", "pgs", "--levels", "1e-3", "--budgets", "4", "--repeats", 
 
 
 @pytest.fixture
-def lavender(capsys, tmp_path, monkeypatch):
-    """`lavender ARGS` in an empty folder: (exit status, standard output, standard error)."""
+def lavender(lavender, tmp_path, monkeypatch):
+    """The command, beside what it reads."""
     monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        with pytest.raises(SystemExit) as exit_:
-            cli.main(list(map(str, words)))
-        out, err = capsys.readouterr()
-        return exit_.value.code, out, err
-
-    return run
+    return lavender
 
 
 # -- names ----------------------------------------------------------------------------------------
@@ -142,9 +135,6 @@ def test_what_cannot_be_read_costs_its_own_case_and_is_not_waited_for(bad, tmp_p
     records = bench.run([tmp_path], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
     assert {r.case for r in records} == {"good"}
     assert [told in s.reason for s in records.skips] == [True]
-    os.mkfifo(tmp_path / "records.jsonl")
-    with pytest.raises(lv.InputError, match="is no file"):
-        bench.read(tmp_path)
 
 
 def test_a_campaign_takes_files_and_folders(lavender, tmp_path):

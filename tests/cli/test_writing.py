@@ -114,6 +114,16 @@ def test_what_is_no_file_is_refused_and_left_as_it_is(kind, suffix, write, made,
 
 
 @everybody
+def test_what_names_no_file_is_refused_and_leaves_nothing(suffix, write, made, tmp_path):
+    (tmp_path / "file").write_text("")
+    wrong = [7, True, None, 1.5, b"p.npz", open, f"a\0{suffix}", tmp_path / "file" / f"p{suffix}"]
+    for path in wrong + [tmp_path / "missing" / f"p{suffix}"] * (suffix != ".jsonl"):  # whose folder is made
+        with pytest.raises(lv.InputError, match=r"path is|NUL|cannot write"):
+            write(made, path)
+    assert os.listdir(tmp_path) == ["file"]
+
+
+@everybody
 @pytest.mark.parametrize("where", ["in the middle of the file", "where it is renamed"])
 def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_path, monkeypatch):
     path = tmp_path / f"there{suffix}"

@@ -1,5 +1,4 @@
-"""Doors: another engine's memory, plug-ins that lie, numbers at the end of float64 and words of the
-command line; as plain data."""
+"""Doors: another engine's memory, numbers at the end of float64, words of the command line; as plain data."""
 
 import functools
 import os
@@ -11,9 +10,9 @@ import numpy as np
 import problems
 
 import lavender as lv
-from lavender import io, registry
+from lavender import io
 
-WHAT = ("memory", "plug-in", "plug-in", "far", "far", "command")
+WHAT = ("memory", "far", "far", "command")
 INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
            "M_rownnz")  # fmt: skip
 NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
@@ -21,11 +20,6 @@ NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss
 OPTIONS = ("jacobian", "cone", "timestep", "integrator", "noslip_iterations", "nefc", "ncon", "nJ")
 WHOLE = (-1, -2, 0, 1, 2, 3, 5, 7, 100, 2**15, 2**20, 2**30, 2**31 - 1, -(2**31))
 REAL = (0.0, -0.0, 1.0, -1.0, 1e300, -1e300, 1e-300, "nan", "inf", "-inf")
-LIES = ("keep", "write", "nan", "shape", "dtype", "best", "raise", "honest")
-CLAIMED = ("status", "iterations", "work", "message", "form", "certificate", "dual", "claim", "nothing")
-WILD = (
-    None, "CONVERGED", -1, 1.5, 10**30, True, [], {}, {"sweeps": None}, {"sweeps": 1e400}, [1.0, 2.0], "a", [[1], 2],
-)  # fmt: skip
 WORDS = (
     ("report", "two_particles", "--campaign", "--workers", "{}"),
     ("report", "granular", "--campaign", "--seeds", "0:{}"),
@@ -57,16 +51,9 @@ def door_specs():
     edits = st.one_of(
         memory_edits(INDICES, WHOLE), memory_edits(NUMBERS, REAL), memory_edits(OPTIONS, WHOLE + REAL)
     )
-    lie = {
-        "lie": pick(LIES),
-        "field": pick(CLAIMED),
-        "value": pick(range(len(WILD))),
-        "resumable": st.booleans(),
-    }
     words = st.tuples(pick(WORDS), pick(ASKED)).map(lambda x: [word.format(x[1]) for word in x[0]])
     fields = {
         "memory": {"model": st.integers(0, 11), "edits": st.lists(edits, min_size=1, max_size=3)},
-        "plug-in": lie,
         "far": {"problem": problems.parts(8), "exponent": st.integers(-1070, 1020)},
         "command": {"words": words},
     }
@@ -82,9 +69,7 @@ def memory_edits(names, values):
 
 def check(spec):
     """What was broken."""
-    yield from {
-        "memory": memory, "plug-in": plug_in, "far": far, "command": command,
-    }[spec["what"]](spec)  # fmt: skip
+    yield from {"memory": memory, "far": far, "command": command}[spec["what"]](spec)
 
 
 # -- another engine's memory ------------------------------------------------------------------------------------
@@ -169,90 +154,6 @@ def change(made, data, name, places, value):
             array[place * array.size // 1000] = value
     except (TypeError, ValueError, OverflowError, AttributeError):
         return
-
-
-# -- plug-ins -----------------------------------------------------------------------------------------------------
-
-
-class Liar:
-    """Solves with pgs, and then does or says something else."""
-
-    def __init__(self, spec):
-        self.spec, self.kept, self.best = spec, [], None
-
-    def prepare(self, problem):
-        self.problem = problem
-        if self.spec["lie"] == "best":
-            self.best = (float("nan"), np.full(problem.m, np.nan))
-        return self
-
-    def update(self, state, problem):
-        return self.prepare(problem)
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        found = lv.solve(self.problem, "pgs", tol=1e-9, max_iter=300)
-        lie = self.spec["lie"]
-        for old in self.kept:
-            old.flags.writeable = True
-            old[:] = 3e5
-        impulse[:] = found.impulse
-        self.kept.append(impulse[:])
-        if lie == "write":
-            for array in (self.problem.b, self.problem.d, self.problem.csr.data, self.problem.cones.lower):
-                if array.flags.owndata:
-                    array.flags.writeable = True
-                    array[...] = -7.0
-        elif lie == "nan":
-            impulse[-1:] = np.nan
-        elif lie == "shape":
-            impulse.shape = (1, -1)
-        elif lie == "dtype":
-            impulse.dtype = np.int64
-        elif lie == "raise":
-            raise FloatingPointError("breaks")
-        field, value = self.spec["field"], WILD[self.spec["value"]]
-        if field == "claim":
-            return value
-        fields = {"status": lv.Status.CONVERGED, "iterations": 1}
-        return lv.Claim(**fields if field == "nothing" else fields | {field: value})
-
-
-def plug_in(spec):
-    """Nothing that a plug-in keeps, writes or says changes a problem or an earlier solution."""
-    rng = np.random.default_rng(spec["seed"])
-    m = int(rng.integers(1, 9))
-    root = rng.normal(size=(m, m))
-    a, b = root @ root.T + np.eye(m), rng.normal(size=m)
-    problem, twin = lv.Problem.lcp(a, b), lv.Problem.lcp(a, b)
-    liar = Liar(spec)
-    registry.register(
-        lv.SolverSpec("liar", lambda: liar, laws={"lcp"}, summary="", resumable=spec["resumable"]),
-        replace=True,
-    )
-    try:
-        first = lv.solve(problem, "liar")
-        before, word = first.impulse.tobytes(), str(first).rpartition(",")[0]
-        second = lv.solve(
-            problem, "liar", impulse=first.impulse if np.isfinite(first.impulse).all() else None
-        )
-    finally:
-        del registry.registered["liar"]
-    for solution in (first, second):
-        judged = lv.residual(twin, solution.impulse).relative
-        if solution.success and not np.isfinite(solution.impulse).all():
-            yield "false claim", "success with an impulse that is not finite"
-        if not (judged == solution.residual.relative or judged != judged):
-            yield "false claim", f"judged {judged}, told {solution.residual.relative}"
-        if not isinstance(solution.status, lv.Status) or not isinstance(solution.message, str):
-            yield "raw claim", f"{solution.status!r}, {solution.message!r}"
-        str(solution)
-    if first.impulse.tobytes() != before or str(first).rpartition(",")[0] != word:
-        yield "changed solution", "an earlier solution is another one now"
-    if (
-        problem != twin
-        or lv.solve(problem, "pgs").impulse.tobytes() != lv.solve(twin, "pgs").impulse.tobytes()
-    ):
-        yield "changed problem", "a plug-in has changed it"
 
 
 # -- the end of float64 --------------------------------------------------------------------------------------------

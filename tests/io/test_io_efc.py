@@ -77,6 +77,16 @@ def test_a_state_that_is_not_finite_harms_no_other():
         assert batch[i] == clean.batch[i]
 
 
+def test_a_model_in_which_nothing_moves_has_worlds_without_rows():
+    model = mj.MjModel.from_xml_string("<mujoco><worldbody><geom size='0.1'/></worldbody></mujoco>")
+    batch, impulse = lv.io.from_mujoco_many(model, np.zeros((3, 0)))
+    assert (
+        batch.velocity_shape == (0,)
+        and impulse.shape == (0,)
+        and lv.solve_many(batch).success.tolist() == 3 * [True]
+    )
+
+
 def stacked(model, states, dtype):
     """Arrays as MJX and Warp hold them: room for the most rows of all, in float32."""
     datas = [forwarded(model, s) for s in states]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import io
-import io as bytestreams
 import json
 import os
 import pickle
@@ -96,12 +95,6 @@ def test_two_saves_give_the_same_bytes(tmp_path):
 
 def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
     problem = random_lcp(1)
-    (tmp_path / "folder.npz").mkdir()
-    (tmp_path / "file").write_text("")
-    for path in ("missing/p.npz", "folder.npz", "file/p.npz"):
-        with pytest.raises(lv.InputError, match="cannot write"):
-            lavender.io.save(problem, tmp_path / path)
-    assert sorted(os.listdir(tmp_path)) == ["file", "folder.npz"]
     for name in ("p.mat", "p"):
         with pytest.raises(lv.InputError, match=r"\.npz or \.hdf5"):
             lavender.io.save(problem, tmp_path / name)
@@ -111,6 +104,7 @@ def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path):
         lavender.io.save(problem, tmp_path / "p.npz", impulse=[1.0])
     with pytest.raises(lv.InputError, match="for FCLIB"):
         lavender.io.save(problem, tmp_path / "p.npz", form="local")
+    assert not list(tmp_path.iterdir())
 
 
 # -- foreign, truncated, malicious ----------------------------------------------------------------
@@ -121,7 +115,7 @@ def archive(path, entries):
     with zipfile.ZipFile(path, "w") as out:
         for name, value in entries.items():
             if not isinstance(value, bytes):
-                stream = bytestreams.BytesIO()
+                stream = io.BytesIO()
                 np.lib.format.write_array(stream, np.asanyarray(value), allow_pickle=True)
                 value = stream.getvalue()
             out.writestr(f"{name}.npy", value)
@@ -214,10 +208,6 @@ def test_files_that_are_no_problem_are_refused(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(lv.InputError, match=sign):
             lavender.io.load(tmp_path / name)
-    with pytest.raises(lv.InputError, match="No such file"):
-        lavender.io.load(tmp_path / "nowhere.npz")
-    with pytest.raises(lv.InputError, match="cannot read"):
-        lavender.io.load(tmp_path)
     with pytest.raises(lv.InputError, match="holds x, y; a problem has"):
         lavender.io.load(archive(tmp_path / "foreign.npz", {"x": 1, "y": 2}))
     with pytest.raises(lv.InputError, match="holds nothing"):
@@ -234,6 +224,9 @@ def test_files_that_are_no_problem_are_refused(tmp_path):
         lavender.io.load(tmp_path / "twice.npz")
 
 
+# Of whom entries of these names are, before a kernel reads them.
+OF = {"A_": lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))}
+OF |= dict.fromkeys(("rows_", "compliance"), random_contact_problem(1))
 META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
 
 
@@ -256,6 +249,7 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"meta": META | {"names": [1]}}, "'meta' must hold"),
         ({"meta": META | {"more": 1}}, "'meta' must hold"),
         ({"meta": META | {"friction": "glue"}}, "'coulomb' or 'cone'"),
+        ({"meta": META | {"precision": "float16"}}, "precision in it is float64 or float32"),
         ({"meta": META | {"names": ["one"]}}, "names for 12 blocks"),
         ({"b": np.full(12, np.nan)}, "finite"),
         ({"b": np.array(["1"] * 12)}, "numbers are needed"),
@@ -266,21 +260,6 @@ META = {"operator": "dense", "friction": "coulomb", "name": "", "names": None}
         ({"impulse": np.zeros(3)}, "impulse"),
         ({"cones_ptr": np.arange(13)[::-1]}, "cones.ptr"),
         ({"cones_lower": np.full(12, np.nan)}, "NaN"),
-    ],
-)
-def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, sign):
-    changes = {
-        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v
-        for n, v in changes.items()
-    }
-    with pytest.raises(lv.InputError, match=sign) as error:
-        lavender.io.load(own(tmp_path, **changes))
-    assert "own.npz" in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "sign"),
-    [
         ({"A_indices": np.array([0, 1, 9, 3], np.int32)}, "outside"),
         ({"A_indices": np.array([0, 1, -1, 3], np.int32)}, "outside"),
         ({"A_indptr": np.array([0, 3, 2, 3, 4], np.int32)}, "pointers"),
@@ -291,18 +270,6 @@ def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, s
         ({"A_data": np.zeros((2, 2))}, "values"),
         ({"A_shape": np.array([2**31, 2**31])}, "A_shape"),
         ({"A_shape": np.array([4])}, "A_shape"),
-    ],
-)
-def test_indices_are_checked_before_a_kernel_reads_them(tmp_path, changes, sign):
-    problem = lv.Problem.linear(sp.eye_array(4, format="csr"), np.ones(4))
-    assert lavender.io.load(own(tmp_path, problem)) == problem
-    with pytest.raises(lv.InputError, match=sign):
-        lavender.io.load(own(tmp_path, problem, **changes))
-
-
-@pytest.mark.parametrize(
-    ("changes", "sign"),
-    [
         ({"rows_contact_body": np.full((8, 2), 99, np.int32)}, "body 99"),
         ({"rows_joint_body": np.full((3, 2), -2, np.int32)}, "body -2"),
         ({"rows_joint_ptr": np.array([0, 2**31 - 1], np.int32)}, "jac"),
@@ -311,9 +278,16 @@ def test_indices_are_checked_before_a_kernel_reads_them(tmp_path, changes, sign)
         ({"compliance": np.full(1, -1.0)}, "compliance"),
     ],
 )
-def test_rows_are_checked_before_a_kernel_reads_them(tmp_path, changes, sign):
-    with pytest.raises(lv.InputError, match=sign):
-        lavender.io.load(own(tmp_path, random_contact_problem(1), **changes))
+def test_an_inconsistent_file_of_our_own_is_refused_by_name(tmp_path, changes, sign):
+    changes = {
+        n: np.frombuffer(json.dumps(v).encode(), np.uint8) if isinstance(v, dict) else v
+        for n, v in changes.items()
+    }
+    problem = next((p for start, p in OF.items() if min(changes).startswith(start)), None)
+    assert problem is None or lavender.io.load(own(tmp_path, problem)) == problem
+    with pytest.raises(lv.InputError, match=sign) as error:
+        lavender.io.load(own(tmp_path, problem, **changes))
+    assert "own.npz" in str(error.value)
 
 
 # -- plain box format -----------------------------------------------------------------------------
@@ -446,16 +420,3 @@ def test_rows_in_float32_keep_their_precision_in_their_problem_and_its_file(tmp_
         assert again.precision == "float32"
     assert problem.boxed(1.0).precision == problem.relaxed().precision == "float32"
     assert lv.Problem.from_rows(boxes(np.float64), mu=0.5).precision == "float64"
-
-
-def test_a_file_with_another_precision_is_told(tmp_path):
-    path = tmp_path / "p.npz"
-    lv.Problem.lcp(np.eye(1), [1.0], precision="float32").save(path)
-    with np.load(path) as held:
-        entries = {name: held[name] for name in held}
-    entries["meta"] = np.frombuffer(entries["meta"].tobytes().replace(b'"float32"', b'"float16"'), np.uint8)
-    raw = io.BytesIO()
-    np.savez(raw, **entries)
-    path.write_bytes(raw.getvalue())
-    with pytest.raises(lv.InputError, match=r"precision in it is float64 or float32"):
-        lv.load(path)

@@ -18,7 +18,7 @@ from typing import Any
 
 from lavender.base.arrays import table_of
 from lavender.base.errors import InputError
-from lavender.io.stored import MAX_BYTES, destination, write_atomically, write_text
+from lavender.io.stored import MAX_BYTES, as_path, destination, write_atomically, write_text
 from lavender.lab.bench.lock import Lock
 from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 
@@ -175,7 +175,7 @@ class Store:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, real = Path(path), destination(path)
+        self.path, real = as_path(path), destination(path)
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = Lock(real)  # one for all names of a file
@@ -261,7 +261,7 @@ def read(path: str | Path) -> Records:
     InputError
         No such file, or a line that is not a record.
     """
-    path = Path(path)
+    path = as_path(path)
     if path.is_dir():
         path = path / "records.jsonl"
     if path.exists() and not path.is_file():

@@ -46,14 +46,14 @@ def matplotlib_figure(
     return canvas
 
 
-def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look], columns: int = 3) -> Any:
-    """Figures of the same quantities beside each other, with a legend once.
+def matplotlib_panels(figures: Sequence[Figure], look: Mapping[str, Look]) -> Any:
+    """Figures of the same quantities, three in a row, with a legend once.
 
     In an SVG a curve has the id SOLVER--PANEL, and the legend `legend`.
     """
-    rows = -(-len(figures) // columns)
+    rows = -(-len(figures) // 3)
     canvas = _canvas((10.0, 3.1 * rows), layout="constrained")
-    places = list(canvas.subplots(rows, columns, squeeze=False).flat)
+    places = list(canvas.subplots(rows, 3, squeeze=False).flat)
     for axes in places:
         axes.set_axis_off()
     shown: dict[str, Any] = {}

@@ -39,7 +39,7 @@ def environment() -> Any:
     return environment
 
 
-def page(report: Report, figures: Figures, title: str = "lavender report", saved: bool = True) -> str:
+def page(report: Report, figures: Figures, saved: bool = True) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
     Parameters
@@ -47,12 +47,11 @@ def page(report: Report, figures: Figures, title: str = "lavender report", saved
     report : Report
     figures : Figures
         Of its records: `curves.figures`.
-    title : str
     saved : bool
         The figures are beside the page as SVG and PNG.
     """
     return environment().get_template("index.html.j2").render(
-        title=title, saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
+        saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
     )  # fmt: skip
 
 

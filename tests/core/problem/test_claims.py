@@ -1,7 +1,8 @@
 """What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from fractions import Fraction
+from itertools import product
 
 import numpy as np
 import pytest
@@ -285,6 +286,59 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert solution.success  # the judge reads the impulse, whatever was said of it
     assert str(solution)
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
+
+
+@pytest.mark.parametrize("field", [f.name for f in fields(lv.Claim)])
+def test_no_word_of_a_claim_changes_the_verdict_on_its_impulse(plug_in, field):
+    problem, wild = (
+        random_lcp(12),
+        (None, "a", -1, 1.5, 10**30, True, [], {}, {"sweeps": np.inf}, [1.0, 2.0], [[1], 2]),
+    )
+    answer = lv.solve(problem, "pgs", tol=1e-9)
+    for value, resumable in product(wild, (False, True)):
+
+        def run(problem, impulse, value=value):
+            impulse[:] = answer.impulse
+            return lv.Claim(**{"status": lv.Status.CONVERGED, "iterations": 1} | {field: value})
+
+        solution = lv.solve(problem, plug_in(run, resumable=resumable))
+        assert isinstance(solution.status, lv.Status) and isinstance(solution.message, str) and str(solution)
+        assert solution.success and solution.residual.relative == answer.residual.relative
+
+
+@pytest.mark.parametrize("resumable", [False, True])
+@pytest.mark.parametrize("way", ["kept", "nan", "shape", "dtype", "best"])
+def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register, way, resumable):
+    problem, kept = random_lcp(13), []
+    answer = lv.solve(problem, "pgs", tol=1e-9).impulse
+
+    class Liar:
+        best = (np.nan, np.full(problem.m, np.nan)) if way == "best" else None
+
+        def prepare(self, problem):
+            return self
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            for old in kept:
+                old.flags.writeable = True
+                old[:] = 3e5
+            impulse[:] = answer
+            kept.append(impulse[:])
+            if way == "nan":
+                impulse[-1:] = np.nan
+            elif way in ("shape", "dtype"):
+                setattr(impulse, way, {"shape": (1, -1), "dtype": np.int64}[way])
+            return says(lv.Status.CONVERGED)
+
+    register(lv.SolverSpec("liar", Liar, laws={"lcp"}, summary="", resumable=resumable))
+    first = lv.solve(problem, "liar")
+    bits, word = first.impulse.tobytes(), str(first).rpartition(",")[0]
+    second = lv.solve(problem, "liar")
+    assert first.impulse.tobytes() == bits and str(first).rpartition(",")[0] == word
+    for solution in (first, second):
+        assert np.isfinite(solution.impulse).all() or not solution.success
+        assert (way in ("shape", "dtype")) == ("of the impulse an array of shape" in solution.message)
+        np.testing.assert_equal(solution.residual.relative, lv.residual(problem, solution.impulse).relative)
 
 
 def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register):

@@ -56,7 +56,12 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
     monkeypatch.setattr(solver, "prepare", slow)
     monkeypatch.setattr(solver, "run", None)
     late = lv.solve(problem, name, time_limit=1.0)
-    assert late.status is lv.Status.TIME_LIMIT and late.iterations == 0 and "set up" in late.message
+    assert late.status is lv.Status.TIME_LIMIT and "residual" not in vars(late)  # nor does the judge
+    assert late.iterations == 0 and "set up" in late.message and "unjudged" in late.message
+    nothing = lv.residual(problem, problem.start()).relative
+    assert np.array_equal(late.impulse, problem.start()) and late.residual.relative == nothing
+    worse = lv.solve(fresh(problem), name, impulse=1e3 * np.ones(100), time_limit=1.0)
+    assert worse.residual.relative == nothing  # who brings a start has it weighed
 
 
 def test_a_set_up_that_was_late_is_done_by_the_next_call():

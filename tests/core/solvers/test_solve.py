@@ -13,6 +13,7 @@ from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
 from lavender import registry
+from lavender.judge import many as loop
 from lavender.solving import many
 
 TINY = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
@@ -126,7 +127,7 @@ def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
 @pytest.mark.parametrize("form", ["matrix", "J and M"])
 def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
-    n, begun, solve, hand = 2000, [], many.solve, many.Hand
+    n, begun, solve, hand = 2000, [], many.solve, loop.Hand
 
     def interrupt():
         begun.append(form)
@@ -151,7 +152,7 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkey
             return self.hand.solve(*args)
 
     monkeypatch.setattr(many, "solve", slow)
-    monkeypatch.setattr(many, "Hand", SlowHand)
+    monkeypatch.setattr(loop, "Hand", SlowHand)
     problem = (
         TINY
         if form == "matrix"

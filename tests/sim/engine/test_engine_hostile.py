@@ -1,7 +1,6 @@
 """What an adversary tries on the engine: it refuses or answers, in its own words, and never half a step."""
 
 import _thread
-import os
 import threading
 
 import numpy as np
@@ -88,20 +87,6 @@ def test_a_snapshot_restored_is_the_snapshot_and_its_pairs_are_made_anew(name, s
     assert sim.constraint_problem().n_blocks > 0
     assert trajectory(sim, 5) == expected
     assert sim.constraint_problem().b.tobytes() == problem.b.tobytes()
-
-
-def test_what_is_no_file_is_refused(tmp_path):
-    sim = lv.Simulation("stack")
-    paths = [1, "\0", tmp_path, tmp_path / "none" / "state"]
-    if hasattr(os, "mkfifo"):
-        os.mkfifo(tmp_path / "pipe")
-        paths.append(tmp_path / "pipe")
-    for path in paths:
-        with pytest.raises(lv.InputError):
-            sim.load(path)
-    for path in paths[:4]:
-        with pytest.raises(lv.InputError):
-            sim.save(path)
 
 
 # -- threads -------------------------------------------------------------------------------------------

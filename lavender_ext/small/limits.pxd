@@ -1,0 +1,65 @@
+"""What Newton's method is counted to cost over J and M, and may cost [ns]: the gate of one problem and of many.
+
+    count (entry (2 Y + 4 m) + work w)                                                                     (1)
+
+Y entries, m rows, w multiply-adds of a factor of each island; count by law (`lavender/solvers/costs.py`).
+"""
+from libc.math cimport INFINITY
+from libc.stdint cimport int32_t
+
+from lavender_ext.core.generalized cimport generalized_t
+from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.generalized.newton cimport is_soft
+
+
+cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
+    double entry                # each multiply-add of a sweep, and
+    double work                 # of a factor,
+    double bounded              # factorisations by law,
+    double coulomb
+    double cone
+    double rigid                # times as many, but of bounded rows, with a rigid row,
+    double soft                 # and where none is, but of free ones
+    double start                # what a solve beside this call takes at least,
+    double sweep_row            # each row and multiply-add of one of its sweeps, under the cone law,
+    double sweep_cone
+    double sweeps               # and how many of them
+    double values               # of one island's N
+    double most                 # what all may cost to be asked at all
+
+
+cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+    """One factor of each island, of so many multiply-adds in all [ns]."""
+    return l.entry * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows) + l.work * work
+
+
+cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
+    """Is every row free?"""
+    cdef int32_t i, k
+    for i in range(p.n_blocks):
+        for k in range(p.ptr[i], p.ptr[i + 1]):
+            if not is_rows(p, i) or p.lower[k] > -INFINITY or p.upper[k] < INFINITY:
+                return False
+    return True
+
+
+cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
+    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
+    cdef double count = l.bounded
+    cdef bint linear = is_linear(p), rubs = has_friction(p), soft = is_soft(p, g)
+    if linear:
+        count = 1.0
+    elif rubs:
+        count = l.coulomb if p.law == COULOMB else l.cone
+    if soft and not linear:
+        count *= l.soft
+    elif not soft and (linear or rubs):
+        count *= l.rigid
+    return count * step_cost(p, g, l, work)
+
+
+cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l) noexcept nogil:
+    """What it may cost [ns]: where a row is rigid as much as sweeps, which may do with less."""
+    cdef double each = l.sweep_cone if p.law != COULOMB and has_friction(p) else l.entry
+    cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
+    return l.most if is_soft(p, g) else min(l.most, l.start + l.sweeps * sweep)
