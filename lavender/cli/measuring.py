@@ -202,8 +202,8 @@ class Progress:
             now = time.monotonic()
             if now - told >= EVERY:
                 told = now
-                of = f" of {event.total}" if event.total else ""
-                click.echo(f"{event.done}{of}, {now - began:.0f} s: {_words(event)}", err=True)
+                count = f"{event.done} of {event.total}, " if event.total else ""
+                click.echo(f"{count}{now - began:.0f} s: {_words(event)}", err=True)
 
         return watch
 

@@ -64,7 +64,7 @@ enum { /* what functions return; `lav_text` has these words */
   LAV_ERROR_NO_PROBLEM = -14, /* no problem is set: lav_set comes first, and must have succeeded */
   LAV_ERROR_SOLVER = -15,     /* this is no solver: not opened, or its memory was written over */
   LAV_ERROR_SELF_TEST = -16,  /* this build does not round as it must: compile with -ffp-contract=off, without -march=native or fast math */
-  LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact that moves nothing: leave it out */
+  LAV_ERROR_PAIR = -17,       /* a contact or joint of a body with itself, or a contact of the world with the world: leave it out */
   LAV_ERROR_FRAME = -18,      /* normal and tangent of a contact are no orthogonal unit vectors, to 1e-5: divide each by its length */
   LAV_ERROR_BODIES = -19,     /* newton takes 1,500 bodies at most: its factor may be full. Take sweeps or anderson, or solve islands apart */
   LAV_ERROR_FILE = -20        /* a file cannot be written, by lav_dump alone: is there such a folder, and is there room? */

@@ -271,7 +271,7 @@ static int32_t check_columns(const int32_t *ptr, const int32_t *index, int32_t r
   return LAV_OK;
 }
 
-/* Bodies of joints or contacts, none with itself; a contact moves one. */
+/* Bodies of joints or contacts, none with itself; a contact is of one body at least. */
 static int32_t check_pairs(const int32_t *body, int32_t n, int32_t n_bodies, int32_t moves, const char *name, where_t *at) {
   int32_t i;
   if (n > 0 && !body) return refuse(at, LAV_ERROR_NULL, name, 0);
