@@ -381,7 +381,7 @@ def measured_page(site, records, figures):
     structures = by_structure(records)
     site.write(
         "report.html",
-        report_page(Report(records), report_figures(records), "lavender report of these pages", saved=False),
+        report_page(Report(records), report_figures(records), saved=False),
     )
     shown = ", ".join(f"{n} {v}" for n, v in run.versions.items())
     site.write("parts/advice.md", structures.replace("REPORT", "generated/report.html"))

@@ -5,6 +5,7 @@ so are warnings that reach the caller.
 """
 
 import base64
+import contextlib
 import hashlib
 import math
 import os
@@ -141,12 +142,16 @@ def together(spec, problem, solution):
     options = dict(spec["options"])
     start = options.pop("impulse", None)
     options.pop("threads", None)  # within one problem; the bits are those of any number
-    problems_of = [problem, *(problem.updated(b=np.array(b, float)) for b in spec["others"])]
+    taken = []
+    for b in spec["others"]:
+        with contextlib.suppress(lv.InputError):  # numbers that the door refuses, it refuses here, too
+            taken.append((b, problem.updated(b=np.array(b, float))))
+    problems_of = [problem, *(other for _, other in taken)]
     starts = None if start is None else [start] * len(problems_of)
     many = lv.solve_many(problems_of, spec["solver"], impulses=starts, threads=spec["threads"], **options)
     if bits(many[0]) != bits(solution):
         yield "changed bits", f"{spec['solver']}: solve_many and solve"
-    for b, other, found in zip(spec["others"], problems_of[1:], many[1:], strict=True):
+    for (b, other), found in zip(taken, many[1:], strict=True):
         if bits(lv.solve(other, spec["solver"], **spec["options"])) != bits(found):
             yield "changed bits", f"{spec['solver']}: solve_many and solve, other right side"
         yield from claims({**spec, "problem": {**spec["problem"], "b": b}}, other, found)
