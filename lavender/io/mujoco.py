@@ -72,6 +72,7 @@ ALIKE = 1e-10  # -, least share of a joint's axis that those before it in its bo
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
 CHANGED = "MjData was changed since its forward pass, or is of another model: run mj_forward"
 OF_M = ("Euler", "RK4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
+LAYOUT = "(also where opt.jacobian, which says how efc_J is laid out, was changed)"
 OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
 _SEEN: WeakKeyDictionary[Any, Any] = (
     WeakKeyDictionary()
@@ -282,13 +283,13 @@ def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> 
     columns = columns if columns.ndim == 1 else np.ravel(columns)
     if not len(count) == len(first) == m:
         raise InputError(
-            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED}"
+            f"efc_J_rownnz and efc_J_rowadr hold {len(count)} and {len(first)} of {m} rows. {CHANGED} {LAYOUT}"
         )
     found = export.rows_of_sparse(values, count, first, columns, scale, n)
     if isinstance(found, int):
         raise InputError(
             f"row {found} of efc_J has {count[found]} entries from place {first[found]} of {len(columns)}, in columns "
-            f"of {n}: it names what is not there. {CHANGED}"
+            f"of {n}: it names what is not there. {CHANGED} {LAYOUT}"
         )
     if found is None:
         indptr = np.concatenate([[0], np.cumsum(count, dtype=np.int64)])
@@ -343,7 +344,7 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
         if not found <= SUMMED:
             raise CapabilityError(
                 f"{words} differ by {found:.1e} of their size: efc_J is not the Jacobian of this forward pass. "
-                f"{CHANGED} (also where opt.jacobian, which says how efc_J is laid out, was changed)"
+                f"{CHANGED} {LAYOUT}"
             )
 
 
