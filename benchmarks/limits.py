@@ -38,7 +38,18 @@ MEASURED = (*CASES[1:-1], "granularF(n=5) as matrix", "granularF(n=5) as J and M
 SOLVERS = ("newton", "direct", "pgs", "jacobi", "anderson", "sequential_impulses", "block_gauss_seidel")
 SWEEPS = ("sequential_impulses", "block_gauss_seidel", "pgs")  # the first that takes a problem as it is given
 RATES = {
-    setup_times: ("START", "ROW", "FORMED", "PRODUCT", "LAID_OUT", "WHOLE", "SUMMED", "BODIES", "VELOCITIES"),
+    setup_times: (
+        "START",
+        "ROW",
+        "FORMED",
+        "PRODUCT",
+        "CALLS",
+        "LAID_OUT",
+        "WHOLE",
+        "SUMMED",
+        "BODIES",
+        "VELOCITIES",
+    ),
     residuals: ("RESULT", "PASS", "WHITENED", "READ"),
 }
 

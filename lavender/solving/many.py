@@ -148,7 +148,7 @@ class Solutions(Many, Sequence[Solution]):
             first = int(self.problems.at[i, PLACE["velocity"]])  # type: ignore[attr-defined]
             self._velocity[first : first + len(v)] = v
 
-    def reading(self) -> float:
+    def _reading(self) -> float:
         """What the results take [s] where nobody has his turn."""
         if isinstance(self.problems, Batch):
             rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
@@ -254,7 +254,7 @@ def solve_many(
     made._unusable = unusable
     # What the results of those to come take is kept free.
     if deadline.is_set:
-        deadline.keep(made.reading())
+        deadline.keep(made._reading())
     more = {"tol": tol, "max_iter": max_iter, **options}
     # What `solve` would ask of one compiled call.
     together = spec.own and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf

@@ -308,15 +308,11 @@ class Prepared:
         elif self._broken:
             claim = Claim(NUMERICAL_ERROR, 0, {}, self._broken)
         elif self._late or (loop.deadline.passed() and not spec.external):
-            if (
-                loop.records is None
-                and loop.deadline.passed()
-                and (known(problem, loop.impulse) or 0.0) > loop.tol
-            ):
+            # A start that does nothing is not weighed beside another, and the judge is for who asks.
+            nothing = known(problem, loop.impulse)
+            if nothing is not None and nothing > loop.tol and loop.records is None and loop.deadline.passed():
                 start = loop.impulse if self._given is problem else self._given.cones.stretch * loop.impulse
-                words = (
-                    f"{SET_UP_LATE}: the start, unjudged"  # doing nothing, beside which nothing is weighed
-                )
+                words = f"{SET_UP_LATE}: the start, unjudged"
                 return unjudged(self._given, spec, self.options, start, loop.tol, words, setup_time)
             claim = Claim(TIME_LIMIT, 0, {}, SET_UP_LATE)
             loop.not_worse(loop.impulse)
@@ -440,7 +436,7 @@ def same_structure(p: Problem, q: Problem) -> bool:
 
 
 def judged_later(given: Problem, problem: Problem, *more: Any) -> dict[str, Any]:
-    """The fields that `Prepared._unjudged` leaves for later."""
+    """The fields that `unjudged` leaves for later."""
     spec, options, impulse, claim, tol = more
     made = finish(problem, spec, options, impulse, claim, tol, 0.0, 0.0, None)
     made = made if given is problem else made.unstretched(given)
