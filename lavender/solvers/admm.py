@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline, Stopwatch
+from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import InputError
 from lavender.base.later import load
 from lavender.base.later import sparse as sp
@@ -56,10 +56,6 @@ class _Failed(Exception):
     """A factorisation broke down; the text says how."""
 
 
-class _TooLate(Exception):
-    """A factorisation would end after the deadline."""
-
-
 class AdmmState:
     """Scaled problem, factorisation for the current rho, and the vectors of the run, which `open` makes."""
 
@@ -72,7 +68,7 @@ class AdmmState:
         self.factor: Any = None
         self.is_scaled = False
         self.seconds = _opening(problem)  # of what comes next: to open it, then of the next factor
-        with suppress(_TooLate):
+        with suppress(TooLate):
             self.open(AT_ONCE)
 
     def open(self, most: float = np.inf) -> None:
@@ -80,7 +76,7 @@ class AdmmState:
         watch = Stopwatch()
         if not self.is_scaled:
             if self.seconds > most or self.deadline.passed(self.seconds):
-                raise _TooLate
+                raise TooLate
             self._scale()
             self.is_scaled = True
             self.seconds = self._expected()
@@ -134,7 +130,7 @@ class AdmmState:
         left = self.deadline.left()
         most = most if left is None else min(most, left)
         if self.seconds > most:
-            raise _TooLate
+            raise TooLate
         made = self._make_factor(most)
         self.factorisations += 1
         self.seconds = watch.seconds
@@ -161,7 +157,7 @@ class AdmmState:
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
             if _ONE_PANEL * m**3 / 3.0 > most:
-                raise _TooLate
+                raise TooLate
             self.full = True
             self.matrix = matrix = _full(matrix)
             self.panels = panels = Panels(*rows_of(matrix)[:2])
@@ -267,7 +263,7 @@ class ADMM(Solver):
             state.open()
         except _Failed as failure:
             return Claim(Status.NUMERICAL_ERROR, 0, {}, str(failure))
-        except _TooLate:
+        except TooLate:
             return Claim(Status.TIME_LIMIT, 0, {}, _LATE)
         splitting = state.splitting
         if state.watch.total == 0:
@@ -286,7 +282,7 @@ class ADMM(Solver):
             result = claim(*state.watch.run_python(iterate, impulse, max_iter, tol))
         except _Failed as failure:
             result, message = Claim(Status.NUMERICAL_ERROR, state.watch.total), str(failure)
-        except _TooLate:
+        except TooLate:
             result, message = Claim(Status.TIME_LIMIT, state.watch.total - total), _LATE
         work = {
             "solves": result.iterations,

@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline, Stopwatch
+from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
 from lavender.judge.residuals import at_floor, quick
@@ -280,6 +280,7 @@ def _turns(
     deadline = Deadline(time_limit)
     solve, certificate, proven = system.solve, None, False
     late = interrupted = False
+    system.until(deadline)
     last = max_iter + (solve.done if again else 0)
     if not again:
         solve.start(impulse, tol, SPEC.max_iter if more else max_iter)
@@ -296,7 +297,11 @@ def _turns(
                 if left <= system.seconds:
                     late = True
                     solve.stop()
-            end = solve.step(max(1, int(min(most, last - before) if more else most)), impulse)
+            try:
+                end = solve.step(max(1, int(min(most, last - before) if more else most)), impulse)
+            except TooLate:  # the best iterate is there
+                late, end = True, OUTCOMES["spent"]
+                solve.stop()
             if solve.done > before:
                 system.took(watch.seconds / (solve.done - before))
             if end == OUTCOMES["certificate"]:

@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
+from lavender.base.deadline import NEVER, Deadline, Stopwatch, TooLate
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
+from lavender.solvers.setup_times import CALLS, SPARSE, loading, sparse_work
 from lavender_ext.newton.solve import WHATS, Layout, Solve
 
 __all__ = ["Augmented"]
@@ -34,12 +36,32 @@ class Augmented:
         self.of, self.layout = of, layout
         self.k: Any = None
         self.lu: Any = None
+        self.deadline: Deadline = NEVER
+        self.seconds = 0.0  # of the next factor: the first by structure, then as long as the last took
 
     def factor(self, _augmented: int, what: int, eps: float) -> bool:
-        """Factor (1) for the P of the last natural map, eps added to theta, or (2); whether there is a factor."""
-        s = self.of
+        """Factor (1) for the P of the last natural map, eps added to theta, or (2); whether there is a factor.
+
+        TooLate if it would end after the deadline.
+        """
         if self.k is None:
-            self._make()
+            if self.deadline.passed(CALLS):
+                raise TooLate
+            self.k = self._make()
+            # K stands in it twice, beside the small matrices.
+            entries = 2.0 * self.k.nnz + len(self.small[0])
+            self.seconds = (
+                CALLS + SPARSE * sparse_work(entries, sum(self.k.shape)) + loading("scipy.sparse.linalg")
+            )
+        if self.deadline.passed(self.seconds):
+            raise TooLate
+        watch = Stopwatch()
+        found = self._factor_of(what, eps)
+        self.seconds = watch.seconds
+        return found
+
+    def _factor_of(self, what: int, eps: float) -> bool:
+        s = self.of
         if what == WHATS["natural"]:
             p = self._small(s.p)
             own = sp.eye_array(s.m) - p + p @ sp.diags_array(s.theta + eps)
@@ -58,7 +80,7 @@ class Augmented:
         x += self.lu.solve(right - self.matrix @ x)
         return np.ascontiguousarray(x[n:])
 
-    def _make(self) -> None:
+    def _make(self) -> Any:
         sc, n = self.of, self.layout.n
         panel, _ = sc.jacobian()
         size, m = np.diff(sc.ptr), sc.m
@@ -68,11 +90,12 @@ class Augmented:
         column = np.maximum(body, 0)[:, :, None] * 6 + np.arange(6)
         used = (values != 0.0) & (body >= 0)[:, :, None]
         k = sp.csc_array((values[used], (row[used], column[used])), shape=(m, 6 * n))
-        self.k = sp.csr_array(k[:, np.flatnonzero(np.diff(k.indptr))])
+        kept = sp.csr_array(k[:, np.flatnonzero(np.diff(k.indptr))])
         square = np.repeat(size, size**2)
         inner = np.arange(int(sc.wptr[-1])) - np.repeat(sc.wptr[:-1], size**2)
         base = np.repeat(sc.ptr[:-1], size**2)
         self.small = base + inner // square, base + inner % square
+        return kept
 
     def _small(self, values: FloatArray) -> Any:
         return sp.csr_array((values, self.small), shape=(self.of.m,) * 2)

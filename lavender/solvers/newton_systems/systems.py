@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from lavender.base.deadline import Deadline
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
@@ -50,6 +51,9 @@ class System:
         """What the next factor takes, at that pace."""
         return self.pace * self.work
 
+    def until(self, deadline: Deadline) -> None:
+        """Let no factor by Python begin that is expected to end after `deadline`."""
+
     def took(self, seconds: float) -> None:
         """So long did the last factor take, with the steps around it: the next one is refused by that pace."""
         if self.work > 0.0:
@@ -73,7 +77,11 @@ class VelocitySystem(System):
         self.layout: Layout = kept or Layout(*of, PANELS, FEW_COLUMNS, ZEROS)
         self.work = self.layout.work
         solve.over_bodies(panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", WIDE)
-        solve.ask(Augmented(solve, self.layout))
+        self.augmented = Augmented(solve, self.layout)
+        solve.ask(self.augmented)
+
+    def until(self, deadline: Deadline) -> None:
+        self.augmented.deadline = deadline
 
 
 class MatrixSystem(System):

@@ -10,6 +10,8 @@ from lavender import registry, suite
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Tree
+from lavender.solvers.newton_systems import augmented
+from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.steps import Direct, Newton, setup_time
 from lavender_ext.small import checked_sweeps
 
@@ -75,6 +77,34 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
     least = np.maximum(found, 1e-9)
     assert (np.diff(least) <= 1e-12 * least[:-1]).all(), found
     assert found[-1] < found[0]
+
+
+@pytest.mark.parametrize("limit", [0.02, 0.1, 0.4])
+def test_no_factor_of_the_augmented_system_ends_late(limit, clock, monkeypatch):
+    """Bodies that roll: one turn went over to it, and the clock was asked again after its last step."""
+    problem = suite.case("drawn_rolling(seed=95402)").problem
+    monkeypatch.setattr(augmented, "loading", lambda *of: 0.0)
+    made, factor, each = [], Augmented._factor, 0.01
+
+    def played(self, *of):
+        made.append(clock.now)
+        clock.now += each
+        return factor(self, *of)
+
+    monkeypatch.setattr(Augmented, "_factor", played)
+    assert lv.solve(fresh(problem), "newton").success and len(made) > 20
+    for name in ("newton", "auto"):
+        made.clear()
+        clock.now = 0.0
+        solution = lv.solve(fresh(problem), name, time_limit=limit)
+        least = lv.residual(problem, problem.start()).relative
+        # The first is counted by structure; of those behind it the last one's time is known.
+        assert made and clock.now <= limit
+        assert solution.success or (
+            solution.status is lv.Status.TIME_LIMIT and solution.residual.relative < least
+        )
+        if name == "newton" or limit > 0.3:  # sweeps take no time here: `auto` may go on with them to the end
+            assert solution.success == (limit > 0.3)
 
 
 @pytest.mark.parametrize("name", OWN)
