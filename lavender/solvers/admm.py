@@ -20,7 +20,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
-from lavender.base.errors import InputError
+from lavender.base.errors import BREAKDOWN, InputError
 from lavender.base.later import load
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
@@ -30,24 +30,35 @@ from lavender.solvers._accelerated import LARGEST_MEMORY
 from lavender.solvers.factors import GENERAL_LIMIT, PANELS_WORK, TINY, Panels, mirrored, rows_of
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import loading
+from lavender.solvers.setup_times import (
+    CALLS,
+    DENSE,
+    EACH,
+    LAID_OUT,
+    START,
+    WHOLE,
+    compared,
+    dense_work,
+    entries_of,
+    forming,
+    loading,
+)
 from lavender.solvers.sweeping import claim, watch_over
 from lavender_ext.accelerate import admm
 from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout
 
-_FORMED_START, _FORMED = 60e-6, 2e-9  # s of A formed of J and M, and of each of its entries
 _PANELS, _BODIES = 1, 2  # as the kernel names them
 _START_RHO = 0.1  # B has unit diagonal, so 1 is its scale; measured
 _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho finds its place
 
 
 _LATE = "the next factorisation, or the analysis before it, would end after the time limit"
-AT_ONCE = (
-    5e-3  # s, that scaling, analysis and the first factor may be expected to take for `prepare` to do them
-)
-_ENTRY = 4e-8  # s, of the first two, for each entry of A
+AT_ONCE = 5e-3  # s, that scaling may be expected to take for `prepare` to do it
+# s: scaled, each entry of A; analysed, each entry of a row of blocks, or each of A if there are no others.
+_SCALED, _ANALYSED, _WHOLE = 1e-8, 6e-8, 1e-9
+_JACOBIAN, _NORMAL = 24, 18  # entries: two for each of a row over bodies; of J^T J for each velocity
 # s for each multiply-add of a factor by panels, and of L U in one panel.
 _PANELS_WORK, _ONE_PANEL = 1e-9 * PANELS_WORK, 4e-10
 
@@ -66,22 +77,26 @@ class AdmmState:
         self.factorisations = self.reported = 0  # factors: all, and those that an earlier run has told
         self.watch: Any = None
         self.factor: Any = None
-        self.is_scaled = False
-        self.seconds = _opening(problem)  # of what comes next: to open it, then of the next factor
-        with suppress(TooLate):
-            self.open(AT_ONCE)
-
-    def open(self, most: float = np.inf) -> None:
-        """Scale, analyse and factor within `most` [s], as far as that can be told; what is left, the next call does."""
-        watch = Stopwatch()
-        if not self.is_scaled:
-            if self.seconds > most or self.deadline.passed(self.seconds):
-                raise TooLate
+        self.is_scaled = self.is_analysed = False
+        self.seconds = _scaling(problem)  # of what comes next: scaling, analysis, then each factor
+        if self.seconds <= AT_ONCE:
             self._scale()
-            self.is_scaled = True
+
+    def open(self) -> None:
+        """Scale, analyse and factor; what is expected to end after the deadline is not begun."""
+        if not self.is_scaled:
+            self._ask()
+            self._scale()
+        if not self.is_analysed:
+            self._ask()
             self.seconds = self._expected()
+            self.is_analysed = True
         if self.factor is None:
-            self.factor = self._factor(most - watch.seconds)
+            self.factor = self._factor()
+
+    def _ask(self) -> None:
+        if self.deadline.passed(self.seconds):
+            raise TooLate
 
     def _scale(self) -> None:
         problem = self.problem
@@ -95,6 +110,7 @@ class AdmmState:
             form = problem.velocity_form()
             # In the metric of D = diag d of the judge, which is the scale of the form.
             self.kind, self.theta, self.jacobian = _BODIES, form.theta, form.jacobian
+            self.is_scaled, self.seconds = True, 0.0  # no matrix to analyse before the first factor
             return
         a = problem.csr
         values = scaled_entries(a.indptr, a.indices, a.data, 1.0 / np.sqrt(problem.d))
@@ -104,15 +120,17 @@ class AdmmState:
         if problem.m:
             self.matrix = mirrored(self.matrix)
             self.panels = Panels(*rows_of(self.matrix)[:2])
+        self.is_scaled, self.seconds = True, _analysis(problem, self.matrix.nnz)
 
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
-        problem, m = self.problem, self.problem.m
+        problem = self.problem
         if self.kind == _BODIES:
             assert problem.rows is not None
-            rows = problem.rows
-            return float(_PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
-        return _PANELS_WORK * _analysed(self.panels, self.lu).work if m else 0.0
+            rows, n = problem.rows, 6 * problem.rows.n_bodies
+            made = CALLS + LAID_OUT * _JACOBIAN * problem.m + _ANALYSED * _NORMAL * n
+            return float(made + EACH * n + _PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
+        return EACH * problem.m + _PANELS_WORK * _analysed(self.panels, self.lu).work if problem.m else 0.0
 
     @property
     def best(self) -> tuple[float, FloatArray | None]:
@@ -124,19 +142,15 @@ class AdmmState:
         """Iterations in which the residual falls tenfold; NaN where it does not."""
         return np.nan if self.watch is None else float(self.watch.sweeps_per_decade)
 
-    def _factor(self, most: float = np.inf) -> tuple[int, int, tuple[Any, ...]]:
-        # Within `most` [s], as far as that can be told.
+    def _factor(self) -> tuple[int, int, tuple[Any, ...]]:
+        self._ask()
         watch = Stopwatch()
-        left = self.deadline.left()
-        most = most if left is None else min(most, left)
-        if self.seconds > most:
-            raise TooLate
-        made = self._make_factor(most)
+        made = self._make_factor()
         self.factorisations += 1
         self.seconds = watch.seconds
         return made
 
-    def _make_factor(self, most: float) -> tuple[int, int, tuple[Any, ...]]:
+    def _make_factor(self) -> tuple[int, int, tuple[Any, ...]]:
         m, rho = self.problem.m, self.splitting.rho
         if m == 0:
             return self.kind, 0, ()
@@ -156,7 +170,7 @@ class AdmmState:
             done = _factored(panels, matrix, shift, True)
         if not done and self.lu and not self.full and m <= GENERAL_LIMIT:
             # It needs pivots across panels: of a full matrix there is one panel.
-            if _ONE_PANEL * m**3 / 3.0 > most:
+            if self.deadline.passed(_ONE_PANEL * dense_work(m)):
                 raise TooLate
             self.full = True
             self.matrix = matrix = _full(matrix)
@@ -172,18 +186,20 @@ def _is_over_bodies(problem: Problem) -> bool:
     return rows is not None and 0 < 6 * rows.n_bodies < problem.m
 
 
-def _opening(problem: Problem) -> float:
-    """What scaling and analysis are expected to take [s], by the entries that they pass over."""
-    if problem.matrix is not None:
-        entries = problem.matrix.size if isinstance(problem.matrix, np.ndarray) else problem.matrix.nnz
-    elif problem.rows is None:
-        entries = problem.metric.entries_of_a
-    else:
-        entries = 24 * problem.m if _is_over_bodies(problem) else int(problem._meetings)
-    formed = 0.0
-    if problem.generalized is not None:
-        formed = _FORMED_START + _FORMED * float(problem.metric.entries_of_a)
-    return _ENTRY * entries + formed
+def _scaling(problem: Problem) -> float:
+    """What scaling is expected to take [s]."""
+    if _is_over_bodies(problem):
+        return 3.0 * CALLS + LAID_OUT * _JACOBIAN * problem.m  # J, the root of M^-1, and their product
+    entries, formed = entries_of(problem), forming(problem)
+    if problem.generalized is not None and entries == float(problem.m) ** 2:  # one product of dense matrices
+        formed = min(formed, START + WHOLE * entries + DENSE * float(problem.metric.products_of_a))
+    return START + formed + compared(problem) + _SCALED * entries
+
+
+def _analysis(problem: Problem, entries: int) -> float:
+    """What the analysis of a matrix of so many entries is expected to take [s]: rows of a block are one node."""
+    m = problem.m
+    return _WHOLE * entries if entries == m * m else _ANALYSED * entries * problem.n_blocks / m
 
 
 def _analysed(panels: Panels, lu: bool) -> SparsePanels:
@@ -231,34 +247,32 @@ class ADMM(Solver):
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
     def setup_time(self, problem: Problem) -> float:
-        """What `prepare` takes [s], as counted; what it leaves is begun by `run` if it fits there."""
-        return min(_opening(problem), AT_ONCE) + loading("scipy.sparse", "scipy.linalg.lapack")
+        """What `prepare` takes [s], as counted; what it leaves is begun behind it if it fits there."""
+        scaling = _scaling(problem)
+        return (scaling if scaling <= AT_ONCE else 0.0) + loading("scipy.sparse", "scipy.linalg.lapack")
 
-    def prepare(self, problem: Problem) -> AdmmState | str:
-        """Scale and factor; a text where the factorisation broke down."""
+    def prepare(self, problem: Problem) -> AdmmState:
+        """Scale, where that takes little."""
         load()
-        try:
-            return AdmmState(problem, self.memory, self.relaxation)
-        except _Failed as failure:
-            return str(failure)
+        return AdmmState(problem, self.memory, self.relaxation)
 
-    def until(self, state: AdmmState | str, deadline: Deadline) -> None:
-        """Let no factor begin that is expected to end after `deadline`."""
-        if not isinstance(state, str):
-            state.deadline = deadline
+    @np.errstate(all="ignore")  # what overflows is judged
+    def until(self, state: AdmmState, deadline: Deadline) -> None:
+        """Let nothing begin that is expected to end after `deadline`; what ends before it is set up here."""
+        state.deadline = deadline
+        with suppress(TooLate, _Failed, *BREAKDOWN):  # which `run` meets again, and tells
+            state.open()
 
     @np.errstate(all="ignore")  # what overflows is judged
     def run(
         self,
-        state: AdmmState | str,
+        state: AdmmState,
         impulse: FloatArray,
         max_iter: int,
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
         """n iterations, or fewer where a check ends them."""
-        if isinstance(state, str):
-            return Claim(Status.NUMERICAL_ERROR, 0, {}, state)
         try:
             state.open()
         except _Failed as failure:

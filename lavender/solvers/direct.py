@@ -163,7 +163,7 @@ class _Run:
         self.max_iter, self.tol = max_iter, tol
         self.deadline = deadline
         self.kept: measure.Judged | None = None
-        self.late = False  # no sweeps were begun, which would have ended after the deadline
+        self.late = False  # no round was begun, as it would have ended after the deadline
         self.iterations = 0
         self.work: dict[str, int] = {}
         self.told: dict[str, int] = {}  # what the rows did in the runs before
@@ -282,14 +282,16 @@ class _Run:
         """Turns of the kernel, on from where the last run of this state has stopped."""
         rows, before = pivot.rows, pivot.rows.n_rounds
         pivot.until(self.deadline)
+        late = False
         if self.state.is_running:
             self.told = rows.work
         else:
-            self.late = pivot.too_late_to_sweep(self.deadline)
-            rows.begin(self.impulse, self.least, 0 if self.late else pivot.sweeps)
+            late = pivot.too_late_to_sweep(self.deadline)
+            rows.begin(self.impulse, self.least, 0 if late else pivot.sweeps)
             self.state.is_running = True
         while True:
-            code = rows.turn(0 if self.late else min(BATCH, self.max_iter - self.iterations))
+            most = 0 if late else min(BATCH, self.max_iter - self.iterations)
+            code, self.late = pivot.turn(self.deadline, most)
             self.iterations = rows.n_rounds - before
             if code == SMALL and rows.passes == 0:
                 self.note_singular(pivot, self.patient or pivot.symmetric)

@@ -10,6 +10,7 @@ from lavender.base.later import lapack, load
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 from lavender.solvers.factors import (
+    BAND,
     SMALL_SIZE,
     TINY,
     DenseFactor,
@@ -76,6 +77,8 @@ class PivotState:
         self.is_sparse = self.form == "sparse" or (isinstance(factor, LUFactor) and factor.sparse)
         self.outside = None if factor is None else Timed(factor, self._expected())
         reference(problem)
+        # Of one round [s], all rows free, where the factor is compiled; then as long as the last took.
+        self.seconds = 1e-9 * BAND * problem.m * (band + 1.0) ** 2 + SWEEP * problem.csr_data.work
         self.rows = Pivoting(
             problem.csr_data, band, order, TINY, problem.metric, self.outside, problem.law == "linear", self.symmetric
         )  # fmt: skip
@@ -99,8 +102,20 @@ class PivotState:
         return int(min(max(SWEEPS, SHARE * factor / (2.0 * data.work)), MOST_SWEEPS))
 
     def too_late_to_sweep(self, deadline: Deadline) -> bool:
-        """Whether the sweeps before a factor by Python would end after the deadline."""
-        return self.outside is not None and deadline.passed(self.sweeps * SWEEP * self.problem.csr_data.work)
+        """Whether the sweeps before the first factor would end after the deadline."""
+        return deadline.passed(self.sweeps * SWEEP * self.problem.csr_data.work)
+
+    def turn(self, deadline: Deadline, most: int) -> tuple[int, bool]:
+        """`Pivoting.turn` of those of `most` rounds that are expected to end before the deadline; whether none is."""
+        left, before, watch = deadline.left(), self.rows.n_rounds, Stopwatch()
+        if left is None or self.outside is not None:  # which asks the clock itself
+            return self.rows.turn(most), most == 0
+        n = int(left / self.seconds)
+        n = min(most, max(1, n // 2) if n else 0)  # then it is asked again
+        code = self.rows.turn(n)
+        if self.rows.n_rounds > before:
+            self.seconds = watch.seconds / (self.rows.n_rounds - before)
+        return code, n == 0
 
     def until(self, deadline: Deadline) -> None:
         """Let no factor by Python begin that is expected to end after `deadline`."""

@@ -14,6 +14,7 @@ from lavender.problem import Problem
 from lavender.solvers.registry import SMALL_ROWS
 
 __all__ = [
+    "compared",
     "dense_work",
     "entries_of",
     "factored",
@@ -67,16 +68,19 @@ def loading(*modules: str) -> float:
     return LOADING * sum(module not in sys.modules for module in modules)
 
 
+def compared(problem: Problem) -> float:
+    """Whether A is symmetric, where it is not known yet."""
+    known = problem.matrix is None or "_scan" in problem.__dict__
+    return 0.0 if known else residuals.READ * entries_of(problem)
+
+
 def over_rows(problem: Problem) -> float:
     """A, whether it is symmetric, and a matrix that a solver makes of it."""
     entries = entries_of(problem)
-    compared = (
-        residuals.READ * entries if problem.matrix is not None and "_scan" not in problem.__dict__ else 0.0
-    )
     loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
     full = entries == float(problem.m) ** 2
     laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
-    return START + forming(problem) + compared + laid_out + loaded
+    return START + forming(problem) + compared(problem) + laid_out + loaded
 
 
 def summed(problem: Problem) -> float:

@@ -89,8 +89,11 @@ class Loop:
         claim = NOTHING_DONE
         if self.deadline.is_set:
             chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
-            self.solver.until(self.state, self.deadline)
         try:
+            if self.deadline.is_set:
+                watch = Stopwatch()
+                self.solver.until(self.state, self.deadline)
+                self.time += watch.seconds
             if records and self._record():
                 return self._total(Claim(INTERRUPTED, 0, {}, "stopped by the callback"))
             while self.done < max_iter:

@@ -8,8 +8,11 @@ from hypothesis import assume, example, given
 from random_problems import good, seeds, without_solution
 
 import lavender as lv
+from benchmarks.made import fresh
 from lavender.base.lu import sparse_lu
 from lavender.judge.certificates import check_certificate
+from lavender.judge.residuals import judging_time
+from lavender.solvers import pivoting
 from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
 from lavender_ext.factor.sparse import SparsePanels
@@ -26,9 +29,9 @@ def symmetric(a):
     return 0.5 * (a + a.T)
 
 
-def laplacian(n):
+def laplacian(n, diagonal=2.5):
     """n x n grid: half bandwidth n, sparse."""
-    t = sp.diags_array([-np.ones(n - 1), 2.5 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    t = sp.diags_array([-np.ones(n - 1), diagonal * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
     return sp.csr_array(sp.kron(sp.eye_array(n), t) + sp.kron(t, sp.eye_array(n)))
 
 
@@ -319,6 +322,33 @@ def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
     assert refused.status is lv.Status.TIME_LIMIT
     assert "factorisations" not in refused.work
     assert prepared.solve(lv.Problem.lcp(y @ y.T, problem.b)).success
+
+
+@pytest.mark.parametrize("share", [0.3, 1.5, 2.5, 4.0, 20.0])
+def test_rounds_on_a_compiled_band_end_before_the_deadline(share, clock, monkeypatch):
+    """All were one turn: 4.2 ms under a limit of 1 ms."""
+    rng = np.random.default_rng(0)
+    problem = lv.Problem.lcp(laplacian(40, 2.0), rng.normal(size=1600))
+    free = lv.solve(fresh(problem), "direct")
+    each = 6e-4  # s a round
+
+    class Played(direct.Pivoting):
+        def turn(self, n):
+            before = self.n_rounds
+            code = super().turn(n)
+            clock.now += each * (self.n_rounds - before)
+            return code
+
+    monkeypatch.setattr(pivoting, "Pivoting", Played)
+    limit = judging_time(fresh(problem)) + 5e-4 + share * each
+    found = lv.solve(fresh(problem), "direct", time_limit=limit)
+    assert clock.now <= limit
+    assert found.residual.relative <= lv.residual(problem, problem.start()).relative
+    assert free.iterations > 4 and free.solver.form == "band"
+    if share == 20.0:
+        assert found.success and found.impulse.tobytes() == free.impulse.tobytes()
+    else:
+        assert found.status is lv.Status.TIME_LIMIT and (found.iterations > 0) == (share > 1.0)
 
 
 @given(seed=seeds, m=st.integers(2, 40), part=st.integers(1, 9))
