@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import CHUNK_TIME, NEVER, Deadline
+from lavender.base.deadline import CHUNK_TIME, NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, last_words
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -36,6 +36,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 FIRST = 32  # sweeps before the first prediction of their remaining number
 MOST = 2**30  # iterations of one call
 PROBE = 0.5  # share of the time left that iterations of unknown pace may take
+AT_MOST = 4.0  # times its count, that a sweep takes: of blocks that are solved exactly
 FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
 
 
@@ -174,7 +175,7 @@ class Sweeps(Step):
     def until(self, deadline: Deadline, n: int, checked: bool) -> None:
         """As many as end in time; `checked`: and are judged in it."""
         log = self.log
-        room = self.each, PROBE, CHUNK_TIME, checked
+        room = PROBE, CHUNK_TIME, checked
         pace = self.state.within(self.impulse, self.relative, n, log.tol, FIRST, deadline.left, *room)
         last = self.state.now
         if last is not None:
@@ -190,10 +191,15 @@ class Sweeps(Step):
         """Between looks at the clock, until more than `least` are predicted to be left."""
         log, state, end = self.log, self.state, self.state.done + n
         chunk, at, before = max(1, int(CHUNK_TIME / self.each)), state.done, self.relative
+        pace = AT_MOST * self.each
         while state.done < end:
             due = min(end, at + max(at // 2, FIRST))
             k = min(chunk, due - state.done)
+            left, watch = log.deadline.left(), Stopwatch()
+            if left is not None:
+                k = min(k, max(1, int(PROBE * left / pace)))
             state.run(self.impulse, self.relative, k, log.tol, k, FIRST, np.inf)
+            pace = max(watch.seconds, 1e-9) / k
             self.relative = log.take(state.now)
             ended = STATUS[state.status] is not Status.MAX_ITERATIONS
             if ended or self.relative <= log.tol or log.late:

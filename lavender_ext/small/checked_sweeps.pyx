@@ -101,16 +101,15 @@ cdef class CheckedSweeps:
             before = now
             sweeps = min(max(self.done // 2, first), end - self.done)
 
-    def within(self, lam, double before, int n, double tol, int first, left, double each, double share, double chunk,
-               bint checked):
-        """The same for as long as `left()` [s] says, a sweep counted for `each` [s]; returns what one has taken [s].
+    def within(self, lam, double before, int n, double tol, int first, left, double share, double chunk, bint checked):
+        """The same for as long as `left()` [s] says; returns what a sweep has taken [s].
 
-        For `share` of the time before the clock is asked, then as many as fit at the pace of the last, none longer than
-        `chunk` [s]. `checked`: the last sweeps end with a check.
+        One, as sweeps that solve blocks exactly are no steady work, then as many as fit into `share` of what is left, at
+        most `chunk` [s], at the pace of the last. `checked`: the last sweeps end with a check.
         """
-        cdef double time = left(), was, pace = each
+        cdef double time = left(), was, pace
         cdef int32_t at = self.done, end = at + n, due = at + first, step
-        cdef double fit = min(share * time, chunk) / each
+        cdef double fit = 1.0
         cdef bint is_due
         if self.done:
             self.over.start(lam)
@@ -128,7 +127,7 @@ cdef class CheckedSweeps:
             pace = max(was - time, 1e-9) / (step + is_due)
             if self.done >= end or 2.0 * time <= pace:
                 break
-            fit = min(time, chunk) / pace
+            fit = min(share * time, chunk) / pace
         if checked and self.done > at:
             self.check(lam, before, self.done - at, tol)
         return pace

@@ -10,6 +10,7 @@ from lavender import registry, suite
 from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers.auto import Tree
+from lavender.solvers.costs import sweep_cost
 from lavender.solvers.newton_systems import augmented
 from lavender.solvers.steps import Direct, Newton, setup_time
 from lavender_ext.small import checked_sweeps
@@ -76,6 +77,23 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
     least = np.maximum(found, 1e-9)
     assert (np.diff(least) <= 1e-12 * least[:-1]).all(), found
     assert found[-1] < found[0]
+
+
+@pytest.mark.parametrize("limit", [1e-3, 1.5e-3])
+def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
+    """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
+    problem = suite.case("drawn_rolling(seed=97112)").problem
+    sweep, each = checked_sweeps.run, 4.5e-9 * sweep_cost(problem)
+
+    def swept(*of):
+        found = sweep(*of)
+        clock.now += each * found[1]
+        return found
+
+    monkeypatch.setattr(checked_sweeps, "run", swept)
+    solution = lv.solve(fresh(problem), tol=1e-12, time_limit=limit)
+    assert 0.7 * limit < clock.now <= limit
+    assert solution.residual.relative < 0.1
 
 
 @pytest.mark.parametrize("limit", [0.02, 0.1, 0.4])
