@@ -12,6 +12,7 @@ theta is equal on all tangents of a disk, which makes (1) a closed form.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
+from libc.string cimport memset
 
 from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
@@ -56,21 +57,23 @@ cdef struct flow_t:
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
     int32_t plain               # bounded rows alone
-    int32_t thin                # S serves every step; L is not known
+    const int32_t* few          # (n_islands) A of its bounded rows is less work than N
+    int32_t sparse              # one at least is not few: L is known
     const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
     const int32_t* lidx         # columns in their island, ascending
     const int32_t* pblock       # (n_panels + 1) first block of each panel
     const int32_t* vptr         # (k + 1) V of each block: its diagonal for bounded rows, else square
     int32_t island              # the present one
+    int32_t formed              # it is few: y, u, grad and step hold numbers of its rows (`normal.pxd`)
     int32_t still               # its y is 0
     double* theta               # (m) theta', > 0
     double* soft                # (m) 1 / theta'
     double* root                # (m) theta'^1/2
     double* rho                 # (m) >= 0
-    double* y                   # (n)
-    double* u                   # (n) Y^T lambda
-    double* grad                # (n) G
-    double* step                # (n) p
+    double* y                   # (max(n, m)) y, or mu
+    double* u                   # Y^T lambda, or A lambda
+    double* grad                # G, or h
+    double* step                # p, or pi
     double* s                   # (m) Y y - b + phi
     double* q                   # (m) Y p
     double* phi                 # (m)
@@ -90,8 +93,20 @@ cdef struct flow_t:
     double* turned              # (rows of a panel, columns) V times Y
     double* line                # (columns)
     double* local_rhs           # (s)
-    int32_t* swap               # (s); or row and panel of each row that answers
-    int32_t n_answering         # rows of S, whose factor stands in `factor`; -1: it is that of N
+    int32_t* swap               # (s)
+    int32_t n_answering         # rows of S
+    int32_t rows                # of an island that is few, and one more where their number is odd
+    int32_t* listed             # (m) those rows
+    int32_t n_own               # velocities of the island, or rows where it is few,
+    const int32_t* own          # and which they are
+    int32_t* places             # (m) of rows that answer, in the island,
+    int32_t* columns            # (m) and where their columns of A begin
+    int32_t* picks              # (m) scratch
+    int32_t* reached            # of each panel, where rows of Y^T begin
+    int32_t* home               # (m) panel of each; -1 - panel where its column of A is not known
+    double* a                   # (rows, rows) A, symmetric
+    double* across              # (s, rows) Y^T
+    double* sum                 # (2 rows) scratch
     double energy_limit         # sqrt J of one island
     double velocity_limit       # m/s
     int32_t steps               # Newton steps left
@@ -192,10 +207,106 @@ cdef inline void respond_all(const flow_t* f, int32_t island, const double* s, d
         respond(f, block_from(f, a), block_end(f, a), s, lam, f.v)
 
 
+# -- A of an island that is few --------------------------------------------------------------------------
+
+
+cdef enum:
+    NOWHERE = -2147483647       # `home` of the first row, until Y^T is there
+
+
+cdef inline void lay_across(const flow_t* f, int32_t island) noexcept nogil:
+    """Y^T; no column of A is known."""
+    cdef int32_t a, b, _i, q, nc, row = 0, size = f.cptr[island + 1] - f.cptr[island]
+    cdef const int32_t* cols
+    cdef int32_t* at
+    cdef const double* y
+    cdef double* x
+    memset(f.across, 0, <size_t>size * f.rows * sizeof(double))
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for b in range(f.run[2 * a], f.run[2 * a + 1]):
+            cols = f.g.cols + f.g.pcol[b]
+            nc = f.g.pcol[b + 1] - f.g.pcol[b]
+            y = f.g.y + f.g.pval[b]
+            at = f.reached + f.g.pcol[b]
+            for q in range(nc):
+                at[q] = f.local[cols[q]] * f.rows
+            for _i in range(f.g.prow[b], f.g.prow[b + 1]):
+                x = f.across + row
+                for q in range(nc):
+                    x[at[q]] = y[q]
+                f.home[row] = -1 - b
+                y += nc
+                row += 1
+
+
+cdef inline void combine(const double* rows, int32_t n, const int32_t* at, const double* x, int32_t count,
+                         double* out) noexcept nogil:
+    """out (n) = sum of x_i times the row that begins at at_i."""
+    cdef int32_t i = count & 3, k
+    cdef const double* a = rows + at[0]
+    cdef const double* b
+    cdef const double* c
+    cdef const double* d
+    cdef double p = x[0], q, r, s
+    if count == 0:
+        for k in range(n):
+            out[k] = 0.0
+    elif i == 1:
+        for k in range(n):
+            out[k] = p * a[k]
+    elif i > 1:
+        b, c, q, r = rows + at[1], rows + at[i - 1], x[1], x[2] if i == 3 else 0.0
+        for k in range(n):
+            out[k] = (p * a[k] + q * b[k]) + r * c[k]
+    else:
+        i = 4
+        b, c, d = rows + at[1], rows + at[2], rows + at[3]
+        q, r, s = x[1], x[2], x[3]
+        for k in range(n):
+            out[k] = (p * a[k] + q * b[k]) + (r * c[k] + s * d[k])
+    while i < count:
+        a, b, c, d = rows + at[i], rows + at[i + 1], rows + at[i + 2], rows + at[i + 3]
+        p, q, r, s = x[i], x[i + 1], x[i + 2], x[i + 3]
+        for k in range(n):
+            out[k] += (p * a[k] + q * b[k]) + (r * c[k] + s * d[k])
+        i += 4
+
+
+cdef inline void find_column(const flow_t* f, int32_t place) noexcept nogil:
+    """Of A, of the row at this place of the island."""
+    cdef int32_t b, nc
+    if f.home[0] == NOWHERE:
+        lay_across(f, f.island)
+    b = -1 - f.home[place]
+    if b >= 0:
+        nc = f.g.pcol[b + 1] - f.g.pcol[b]
+        combine(f.across, f.rows, f.reached + f.g.pcol[b], f.g.y + f.g.pval[b] + (f.own[place] - f.g.prow[b]) * nc, nc,
+                f.a + place * f.rows)
+        f.home[place] = b
+
+
+cdef inline bint times_a(const flow_t* f, const double* x, double* out) noexcept nogil:
+    """out = A x on the island's rows; whether any x is other than 0."""
+    cdef int32_t a, count = 0
+    cdef double* given = f.sum + f.rows
+    for a in range(f.n_own):
+        if x[f.own[a]] != 0.0:
+            find_column(f, a)
+            f.picks[count] = a * f.rows
+            given[count] = x[f.own[a]]
+            count += 1
+    combine(f.a, f.rows, f.picks, given, count, f.sum)
+    for a in range(f.n_own):
+        out[f.own[a]] = f.sum[a]
+    return count > 0
+
+
 cdef inline bint gather(const flow_t* f, int32_t island, const double* lam, double* x) noexcept nogil:
-    """x = Y^T lam on the island's columns; whether any lam is other than 0."""
+    """x = Y^T lam on the island's columns, or A lam; whether any lam is other than 0."""
     cdef int32_t a, b, k
     cdef bint moves = False
+    if f.formed:
+        return times_a(f, lam, x)
     for a in range(f.cptr[island], f.cptr[island + 1]):
         x[f.icols[a]] = 0.0
     for a in range(f.iptr[island], f.iptr[island + 1]):
@@ -218,6 +329,14 @@ cdef inline void spread(const flow_t* f, int32_t island, const double* x, double
             panel_times(f.g, b, x, out)
 
 
+cdef inline void keep(const flow_t* f, int32_t island, const double* x, double* to) noexcept nogil:
+    """to = x on the island's rows."""
+    cdef int32_t a, k
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            to[k] = x[k]
+
+
 cdef inline void blank(const flow_t* f, int32_t island, double* out) noexcept nogil:
     """out = 0 on the island's rows."""
     cdef int32_t a, k
@@ -234,6 +353,8 @@ cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
     cdef const double* b = f.p.b
     if f.still:
         blank(f, island, s)
+    elif f.formed:
+        times_a(f, f.y, s)
     else:
         spread(f, island, f.y, s)
     for a in range(f.iptr[island], f.iptr[island + 1]):
@@ -243,7 +364,7 @@ cdef inline void renew(const flow_t* f, int32_t island) noexcept nogil:
 
 cdef inline double measure(const flow_t* f, int32_t island, const double* lam, bint moves,
                            double* velocity) noexcept nogil:
-    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u = Y^T lam, 0 unless it `moves`; NaN: not finite."""
+    """Energy [sqrt J] and velocity [m/s] of the errors of lam, with u of `gather`, 0 unless it `moves`; NaN: not finite."""
     cdef int32_t a, i, k, end, last
     cdef const int32_t* ptr = f.p.ptr
     cdef const double* lower = f.p.lower
@@ -254,10 +375,12 @@ cdef inline double measure(const flow_t* f, int32_t island, const double* lam, b
     cdef const double* compliance = f.g.compliance
     cdef double* w = f.w
     cdef tally_t t = nothing()
-    if moves:
-        spread(f, island, f.u, w)
-    else:
+    if not moves:
         blank(f, island, w)
+    elif f.formed:
+        keep(f, island, f.u, w)
+    else:
+        spread(f, island, f.u, w)
     for a in range(f.iptr[island], f.iptr[island + 1]):
         for k in range(row_from(f, a), row_end(f, a)):
             w[k] += compliance[k] * lam[k] - b[k] + phi[k]

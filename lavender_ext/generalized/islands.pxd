@@ -143,51 +143,47 @@ cdef enum:
 
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
+    int32_t rows                # of the island that has most of those that are few, and one more
     int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
+    double formed               # of A and Y^T, of the island that has most
     double work                 # multiply-adds of N and of its factors, of all islands
 
 
-cdef inline bint is_thin(const flow_t* f) noexcept nogil:
-    """Are bounded rows so few in every island that they have less work than its N, whichever answer?
+cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexcept nogil:
+    """Has A of bounded rows less work than N? Then what it asks for is counted, else the work of N without its factor.
 
-    All entries that the columns of one panel have with each other are in L.
+    By multiply-adds of one step of three, half of the rows pushing; constants fitted to dense rows and to trees.
     """
-    cdef int32_t i, a, b, nc, wide
-    cdef double rows
-    if not f.plain:
+    cdef int32_t a, b
+    cdef double rows = 0.0, values = 0.0, normal = 0.0, added = 0.0, formed, size = f.cptr[island + 1] - f.cptr[island], v, nc
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        rows += row_end(f, a) - row_from(f, a)
+        for b in range(f.run[2 * a], f.run[2 * a + 1]):
+            v = f.g.pval[b + 1] - f.g.pval[b]
+            nc = f.g.pcol[b + 1] - f.g.pcol[b]
+            values += v
+            added += ADDED * 0.5 * v * nc
+            normal += nc * (28.0 + 2.0 * nc + 0.5 * v)
+    formed = rows * (values / 6.0 + rows + rows * rows / 24.0)
+    if not f.plain or formed > normal or rows * (rows + size) > 1e9:
+        need.work += added
         return False
-    for i in range(f.n_islands):
-        rows = wide = 0
-        for a in range(f.iptr[i], f.iptr[i + 1]):
-            rows += row_end(f, a) - row_from(f, a)
-            for b in range(f.run[2 * a], f.run[2 * a + 1]):
-                nc = f.g.pcol[b + 1] - f.g.pcol[b]
-                if nc > wide:
-                    wide = nc
-        if rows * rows > 0.5 * wide * (wide - 1.0):
-            return False
+    need.work += formed
+    rows += 1.0
+    if 0.5 * rows * rows > need.values:
+        need.values = 0.5 * rows * rows
+    if rows * (rows + size) > need.formed:
+        need.formed = rows * (rows + size)
+    if rows > need.rows:
+        need.rows = <int32_t>rows
     return True
-
-
-cdef inline void count_rows(const flow_t* f, need_t* need) noexcept nogil:
-    """What S of all rows asks for."""
-    cdef int32_t i, a, values
-    cdef double rows
-    for i in range(f.n_islands):
-        rows = values = 0
-        for a in range(f.iptr[i], f.iptr[i + 1]):
-            rows += row_end(f, a) - row_from(f, a)
-            values += f.g.pval[f.run[2 * a + 1]] - f.g.pval[f.run[2 * a]]
-        need.work += ADDED * 0.5 * rows * values + rows * rows * rows / 6.0
-        if 0.5 * rows * (rows + 1.0) > need.values:
-            need.values = 0.5 * rows * (rows + 1.0)
 
 
 cdef inline ssize_t marks_of(const blocks_t* p, const generalized_t* g, int32_t per) noexcept nogil:
     """int32 that `settle` needs, with room for `per` entries in a row of L."""
     cdef ssize_t n = g.n, panels = g.n_panels
-    return (3 * n + (n if n > panels else panels) + 5 * panels + p.n_blocks + 8
+    return (3 * n + (n if n > panels else panels) + 6 * panels + 5 * <ssize_t>p.n_rows + g.pcol[panels] + p.n_blocks + 8
             + pattern_marks(n, g.pcol[panels], per))
 
 
@@ -196,6 +192,7 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     """Islands of a problem, in w (`marks_of`), and where L of each has entries."""
     cdef ssize_t n = g.n, panels = g.n_panels, at = n + (n if n > panels else panels)
     cdef int32_t i, size
+    cdef int32_t* few
     cdef double values
     cdef const int32_t* lptr
     f.p = p[0]
@@ -212,6 +209,14 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
     f.local = w + at + n
     f.vptr = w + at + 2 * n
     at += 2 * n + p.n_blocks + 1
+    f.listed = w + at
+    f.places, f.columns = f.listed + p.n_rows, f.listed + 2 * <ssize_t>p.n_rows
+    f.picks, f.home = f.columns + p.n_rows, f.columns + 2 * <ssize_t>p.n_rows
+    f.reached = f.home + p.n_rows
+    at += 5 * <ssize_t>p.n_rows + g.pcol[panels]
+    few = w + at
+    f.few = few
+    at += panels
     f.n_islands = find_islands(p, g, w, w + n, <int32_t*>f.iptr, <int32_t*>f.run, <int32_t*>f.cptr,
                                <int32_t*>f.icols, <int32_t*>f.local, <int32_t*>f.pblock, <int32_t*>f.vptr, need.most)
     f.swap = w                                          # scratch of before
@@ -221,19 +226,20 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
         if not is_rows(p, i):
             f.plain = False
             break
-    f.thin = is_thin(f)
-    need.values = 0.0
-    need.work = 0.0
-    need.crowded = 0
-    if f.thin:
-        count_rows(f, need)
+    f.sparse = False
+    need.values = need.work = need.formed = 0.0
+    need.crowded = need.rows = 0
+    for i in range(f.n_islands):
+        few[i] = count_few(f, i, need)
+        f.sparse = f.sparse or not few[i]
+    if not f.sparse:
         return
     need.crowded = find_pattern(g, f.n_islands, f.iptr, f.run, f.cptr, f.local, per, w + at) < 0
     f.lptr = w + at
     f.lidx = w + at + f.cptr[f.n_islands] + 1
-    for i in range(panels):
-        need.work += ADDED * 0.5 * (g.pval[i + 1] - g.pval[i]) * (g.pcol[i + 1] - g.pcol[i])
     for i in range(0 if need.crowded else f.n_islands):
+        if few[i]:
+            continue
         size = f.cptr[i + 1] - f.cptr[i]
         lptr = f.lptr + f.cptr[i]
         values = lptr[size] - lptr[0] + size
@@ -248,15 +254,15 @@ cdef inline void settle(flow_t* f, const blocks_t* p, const generalized_t* g, in
 
 cdef inline ssize_t numbers_of(const flow_t* f, const need_t* need) noexcept nogil:
     """float64 that `furnish` needs."""
-    cdef ssize_t size = need.most[0], values = <ssize_t>need.values
-    return (4 * <ssize_t>f.g.n + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks] + 2 * values
-            + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1)
+    cdef ssize_t size = max(need.most[0], need.rows), values = <ssize_t>need.values
+    return (4 * max(<ssize_t>f.g.n, <ssize_t>f.p.n_rows) + 15 * <ssize_t>f.p.n_rows + 2 * <ssize_t>f.vptr[f.p.n_blocks]
+            + 2 * values + 2 * size + need.most[2] + need.most[1] + need.most[3] + 1 + <ssize_t>need.formed + 2 * need.rows)
 
 
 cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogil:
     """Arrays of the iterate, of V and of N in x (`numbers_of`)."""
-    cdef ssize_t n = f.g.n, m = f.p.n_rows, nv = f.vptr[f.p.n_blocks]
-    cdef ssize_t size = need.most[0], values = <ssize_t>need.values
+    cdef ssize_t m = f.p.n_rows, n = max(<ssize_t>f.g.n, m), nv = f.vptr[f.p.n_blocks]
+    cdef ssize_t size = max(need.most[0], need.rows), values = <ssize_t>need.values
     f.y = x
     f.u = x + n
     f.grad = x + 2 * n
@@ -288,6 +294,10 @@ cdef inline void furnish(flow_t* f, const need_t* need, double* x) noexcept nogi
     f.local_rhs = x + size
     f.turned = x + 2 * size
     f.line = x + 2 * size + need.most[2]
+    x += 2 * size + need.most[2] + need.most[1] + need.most[3] + 1
+    f.sum = x
+    f.across = x + 2 * need.rows
+    f.a = NULL
 
 
 cdef inline void aim_at(flow_t* f, double tol, int32_t steps, double start_energy, double start_velocity) noexcept nogil:

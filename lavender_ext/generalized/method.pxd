@@ -38,7 +38,7 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r
         settle(&s.f, &v.p, v.g, per, r.index + sizeof(state_t) // sizeof(int32_t), need)
         r.laid = not need.crowded
         r.work, r.islands = need.work, s.f.n_islands
-        if (need.crowded and <double>per * v.g.n > o.most) or (r.laid and need.values > o.most):
+        if (need.crowded and <double>per * v.g.n > o.most) or (r.laid and max(need.values, need.formed) > o.most):
             return UNFIT
         least.tries = r.tries = r.tries + (1 - r.laid)  # L has more entries than that in a row
     if not grant(r, r.n_index, numbers_of(&s.f, need)):

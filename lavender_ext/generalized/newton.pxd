@@ -29,8 +29,8 @@ from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.method cimport BROKEN, LOST, MORE, REACHED, STUCK
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.start cimport is_nothing
-from lavender_ext.generalized.flow cimport (blank, block_end, block_from, descent_t, flow_t, gather, measure, renew,
-                                            respond_all, row_end, row_from, wait_t)
+from lavender_ext.generalized.flow cimport (NOWHERE, blank, block_end, block_from, descent_t, flow_t, gather, keep,
+                                            measure, renew, respond_all, row_end, row_from, wait_t)
 from lavender_ext.generalized.normal cimport factor, form, is_held, newton_step
 
 
@@ -88,10 +88,11 @@ cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
     cdef int32_t a, c, n
     cdef double py = 0.0, pp = 0.0, pg = 0.0, low = 0.0, high, at_low, at_high, t, x, enough
     cdef int32_t side = 0
-    for a in range(f.cptr[island], f.cptr[island + 1]):
-        c = f.icols[a]
-        py += f.step[c] * f.y[c]
-        pp += f.step[c] * f.step[c]
+    cdef const double* p = f.q if f.formed else f.step
+    for a in range(f.n_own):
+        c = f.own[a]
+        py += p[c] * f.y[c]
+        pp += p[c] * f.step[c]
         pg += f.step[c] * f.grad[c]
     if not pg < 0.0:
         return 0.0
@@ -231,13 +232,6 @@ cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
     return False
 
 
-cdef inline void keep(const flow_t* f, int32_t island, const double* lam, double* to) noexcept nogil:
-    cdef int32_t a, k
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
-            to[k] = lam[k]
-
-
 cdef inline double excess(const flow_t* f, double energy, double velocity) noexcept nogil:
     """How many times over its limits an error is; at most 1 where the test is met, NaN where it is lost."""
     cdef double x = 0.0, v = 0.0
@@ -301,11 +295,15 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         if x.idle > IDLE_STEPS:
             return STUCK
         size = 0.0
-        for a in range(f.cptr[island], f.cptr[island + 1]):
-            c = f.icols[a]
-            f.grad[c] = f.y[c] - f.u[c]
-            size += f.grad[c] * f.grad[c]
-        size = sqrt(size)
+        for a in range(f.n_own):
+            c = f.own[a]
+            if f.formed:
+                f.grad[c] = (f.s[c] + f.p.b[c]) - f.u[c]
+                size += (f.y[c] - f.lam[c]) * f.grad[c]
+            else:
+                f.grad[c] = f.y[c] - f.u[c]
+                size += f.grad[c] * f.grad[c]
+        size = sqrt(size) if size > 0.0 else size * 0.0     # of h, rounding may leave less than 0; NaN stays
         if rigid and (size <= 0.1 * energy or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
             follow(f, island)
@@ -340,8 +338,8 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             x.fresh = x.stale = 1                       # s anew, once: rounding may be in the way
             renew(f, island)
             continue
-        for a in range(f.cptr[island], f.cptr[island + 1]):
-            c = f.icols[a]
+        for a in range(f.n_own):
+            c = f.own[a]
             f.y[c] += t * f.step[c]
         f.still = False
         x.fresh = x.n % RENEW == 0
@@ -386,9 +384,9 @@ cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept 
     keep(f, island, lam, f.best)                        # errors that overflow are no better than infinity
     follow(f, island)
     f.still = not gather(f, island, lam, f.u)
-    for a in range(f.cptr[island], f.cptr[island + 1]):
-        c = f.icols[a]
-        f.y[c] = f.u[c]
+    for a in range(f.n_own):
+        c = f.own[a]
+        f.y[c] = lam[c] if f.formed else f.u[c]
 
 
 cdef inline bint offer(flow_t* f, int32_t island, const double* lam) noexcept nogil:
@@ -459,12 +457,30 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
     return STUCK
 
 
+cdef inline void enter(flow_t* f, int32_t island) noexcept nogil:
+    """What y counts, velocities or rows, of which no column of A is known."""
+    cdef int32_t a, k
+    f.formed = f.few[island]
+    f.own, f.n_own = f.icols + f.cptr[island], f.cptr[island + 1] - f.cptr[island]
+    if not f.formed:
+        return
+    f.own, f.n_own, f.rows = f.listed, 0, f.n_own       # rows: of Y^T
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            f.listed[f.n_own] = k
+            f.n_own += 1
+    k, f.rows = f.rows, f.n_own + (f.n_own & 1)
+    f.a = f.across + k * f.rows
+    f.home[0] = NOWHERE
+
+
 cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noexcept nogil:
     """One island from `impulse`, or from where it waits, into it; how it ended."""
     cdef int32_t end
     cdef bint waits = f.wait.island == island
     f.island = island
     if not waits:
+        enter(f, island)
         restart(f, island, impulse)
         level(f, island)
         f.wait.at, f.wait.rounds = BEGINS, 0

@@ -1,18 +1,20 @@
 """N = I + Y^T V Y of one island and its factor: in the pattern of L, or whole under Coulomb's law (`newton.pxd`).
 
-Where fewer rows than velocities answer, k bounded rows Y_a alone, less work does by the matrix inversion lemma:
+Where an island has few rows, all bounded, A = Y Y^T serves every step, its columns formed when their rows first push.
+y is kept as Y^T mu and p as Y^T pi; by the matrix inversion lemma, a the rows that answer:
 
-    N^-1 = I - Y_a^T S^-1 Y_a,    S = Theta_a + Y_a Y_a^T                                                 (1)
+    h = A (mu - lambda) = s + b - A lambda,    S = Theta_a + A_aa,    z = S^-1 h_a                        (1)
+    pi = lambda - mu + E_a z,    q = A pi = A E_a z - h,    q_a = -Theta_a z                              (2)
 """
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
 
-from lavender_ext.core.generalized cimport dot, whitened_dot, whitened_push
+from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.tree cimport ldl_solve
 from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
-from lavender_ext.generalized.flow cimport block_end, block_from, flow_t, spread
-from lavender_ext.generalized.sparse cimport sparse_factor
+from lavender_ext.generalized.flow cimport block_end, block_from, combine, find_column, flow_t, spread
+from lavender_ext.generalized.sparse cimport sparse_factor, take_row, take_two
 
 
 cdef inline void scale_row(double* out, const double* x, double f, int32_t n) noexcept nogil:
@@ -172,91 +174,87 @@ cdef inline void hold(const flow_t* f, int32_t island) noexcept nogil:
             f.held[k] = f.v[k]
 
 
-# -- S of (1) ----------------------------------------------------------------------------------------------------
-
-
-cdef inline int32_t answering(const flow_t* f, int32_t island) noexcept nogil:
-    """How many rows answer, each with its panel in `swap`; -1 where N is less work, or where a contact answers."""
-    cdef int32_t a, b, i, k, n = 0, at, last
-    cdef int32_t entries = 0 if f.thin else f.lptr[f.cptr[island + 1]] - f.lptr[f.cptr[island]]
-    for a in range(f.iptr[island], f.iptr[island + 1]):
-        for b in range(f.run[2 * a], f.run[2 * a + 1]):
-            last = f.pblock[b + 1]
-            for i in range(f.pblock[b], last):
-                at = f.vptr[i] - f.p.ptr[i]
-                if not is_rows(&f.p, i):
-                    for k in range(f.vptr[i], f.vptr[i + 1]):
-                        if f.v[k] != 0.0:
-                            return -1
-                    continue
-                for k in range(f.p.ptr[i], f.p.ptr[i + 1]):
-                    if f.v[at + k] != 0.0:
-                        if not f.thin and (n + 1) * (n + 1) > entries:
-                            return -1
-                        f.swap[2 * n] = k
-                        f.swap[2 * n + 1] = b
-                        n += 1
-    return n
-
-
-cdef inline void form_rows(const flow_t* f, int32_t island) noexcept nogil:
-    """The lower triangle of S, row by row, in `factor`; `step` is scratch."""
-    cdef int32_t a, b
-    cdef const int32_t* row = f.swap
-    cdef double* to = f.factor
-    cdef double* x = f.step
-    for a in range(f.cptr[island], f.cptr[island + 1]):
-        x[f.icols[a]] = 0.0
-    for a in range(f.n_answering):
-        whitened_push(f.g, row[2 * a + 1], row[2 * a], 1.0, x)
-        for b in range(a + 1):
-            to[b] = whitened_dot(f.g, row[2 * b + 1], row[2 * b], x)
-        to[a] += f.theta[row[2 * a]]
-        to += a + 1
-        whitened_push(f.g, row[2 * a + 1], row[2 * a], -1.0, x)
+# -- S of (1), where A is formed ---------------------------------------------------------------------------------
 
 
 cdef inline int32_t factor_rows(const flow_t* f) noexcept nogil:
-    """S = L D L^T in place, inv = 1 / D; 0 where a pivot is not positive."""
-    cdef int32_t a, b
-    cdef double* row = f.factor
-    cdef const double* other
-    cdef double x, pivot
-    for a in range(f.n_answering):
-        other = f.factor
-        for b in range(a):
-            row[b] -= dot(row, other, b)
-            other += b + 1
-        pivot = row[a]
-        for b in range(a):
-            x = row[b] * f.inv[b]
-            pivot -= x * row[b]
-            row[b] = x
-        if not pivot > 0.0:
+    """S = L^T D L in place, inv = 1 / D; 0 where a pivot is not positive. Two rows at a time, as `sparse_factor`."""
+    cdef int32_t a, k = f.n_answering - 1
+    cdef double* row
+    cdef double* up
+    cdef double* to
+    cdef double x, y, r, s
+    while k >= 0:
+        row = f.factor + <ssize_t>k * (k + 1) // 2
+        if not row[k] > 0.0:
             return 0
-        f.inv[a] = 1.0 / pivot
-        row += a + 1
+        f.inv[k] = r = 1.0 / row[k]
+        if k == 0:
+            return 1
+        up = row - k
+        x = row[k - 1] * r
+        take_row(up, row, x, k)
+        row[k - 1] = x
+        if not up[k - 1] > 0.0:
+            return 0
+        f.inv[k - 1] = s = 1.0 / up[k - 1]
+        to = up
+        for a in range(k - 2, -1, -1):
+            to -= a + 1
+            x, y = row[a] * r, up[a] * s
+            take_two(to, row, x, up, y, a + 1)
+            row[a], up[a] = x, y
+        k -= 2
     return 1
 
 
-cdef inline void step_by_rows(const flow_t* f, int32_t island) noexcept nogil:
-    """p = -N^-1 G by (1)."""
-    cdef int32_t a, b, n = f.n_answering
-    cdef const int32_t* row = f.swap
-    cdef double* z = f.local_rhs
-    cdef const double* l = f.factor
-    for a in range(f.cptr[island], f.cptr[island + 1]):
-        f.step[f.icols[a]] = -f.grad[f.icols[a]]
-    for a in range(n):
-        z[a] = whitened_dot(f.g, row[2 * a + 1], row[2 * a], f.grad) - dot(l, z, a)
-        l += a + 1
-    for a in range(n):
-        z[a] *= f.inv[a]
+cdef inline void solve_rows(const flow_t* f, double* z) noexcept nogil:
+    """z <- S^-1 z."""
+    cdef int32_t a, n = f.n_answering
+    cdef const double* l = f.factor + <ssize_t>n * (n + 1) // 2
     for a in range(n - 1, -1, -1):
         l -= a + 1
-        for b in range(a):
-            z[b] -= l[b] * z[a]
-        whitened_push(f.g, row[2 * a + 1], row[2 * a], z[a], f.step)
+        take_row(z, l, z[a], a)
+    for a in range(n):
+        z[a] = z[a] * f.inv[a] - dot(l, z, a)
+        l += a + 1
+
+
+cdef inline void form_rows(flow_t* f) noexcept nogil:
+    """The lower triangle of S, row by row, in `factor`."""
+    cdef int32_t a, b, n = 0
+    cdef const double* column
+    cdef double* to = f.factor
+    for a in range(f.n_own):
+        if f.v[f.own[a]] != 0.0:
+            find_column(f, a)
+            f.places[n], f.columns[n] = a, a * f.rows
+            n += 1
+    for a in range(n):
+        column = f.a + f.columns[a]
+        for b in range(a + 1):
+            to[b] = column[f.places[b]]
+        to[a] += f.theta[f.own[f.places[a]]]
+        to += a + 1
+    f.n_answering = n
+
+
+cdef inline void step_by_rows(const flow_t* f) noexcept nogil:
+    """pi and q of (2)."""
+    cdef int32_t a, k
+    cdef double* z = f.local_rhs
+    for a in range(f.n_answering):
+        z[a] = f.grad[f.own[f.places[a]]]
+    solve_rows(f, z)
+    combine(f.a, f.rows, f.columns, z, f.n_answering, f.sum)
+    for a in range(f.n_own):
+        k = f.own[a]
+        f.step[k] = f.lam[k] - f.y[k]
+        f.q[k] = f.sum[a] - f.grad[k]
+    for a in range(f.n_answering):
+        k = f.own[f.places[a]]
+        f.step[k] += z[a]
+        f.q[k] = -f.theta[k] * z[a]                     # without what (2) cancels
 
 
 # -- N -----------------------------------------------------------------------------------------------------------
@@ -268,9 +266,8 @@ cdef inline void form(flow_t* f, int32_t island, bint square) noexcept nogil:
     cdef double* normal = f.normal
     cdef const double* y
     hold(f, island)
-    f.n_answering = -1 if square else answering(f, island)
-    if f.n_answering >= 0:
-        form_rows(f, island)
+    if f.formed:
+        form_rows(f)
         return
     if square:
         for a in range(size):
@@ -303,7 +300,7 @@ cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogi
     cdef int32_t size = f.cptr[island + 1] - f.cptr[island]
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     f.factorisations += 1
-    if f.n_answering >= 0:
+    if f.formed:
         return factor_rows(f)
     if square:
         memcpy(f.factor, f.normal, <ssize_t>size * size * sizeof(double))
@@ -315,11 +312,8 @@ cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogi
 cdef inline void newton_step(const flow_t* f, int32_t island, bint square) noexcept nogil:
     """p of (1) and q = Y p."""
     cdef int32_t a, c0 = f.cptr[island], size = f.cptr[island + 1] - c0
-    if f.n_answering >= 0:
-        step_by_rows(f, island)
-        spread(f, island, f.step, f.q)
-        for a in range(f.n_answering):                  # Y_a p = -Theta_a z, without what (1) cancels
-            f.q[f.swap[2 * a]] = -f.theta[f.swap[2 * a]] * f.local_rhs[a]
+    if f.formed:
+        step_by_rows(f)
         return
     for a in range(size):
         f.local_rhs[a] = -f.grad[f.icols[c0 + a]]

@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -345,6 +346,31 @@ def test_newton_whose_steps_are_used_up_goes_on_with_the_bits_of_one_run(frictio
     assert once.step(90, whole) == end
     assert kernel.counts == once.counts
     np.testing.assert_array_equal(cut, whole)
+
+
+@given(seed=seeds, steps=st.integers(1, 4), compliance=st.sampled_from([0.0, 0.1]))
+@settings(max_examples=15)
+def test_newton_on_bounded_rows_of_islands_that_alternate(seed, steps, compliance):
+    """From any start: the judge's end, the velocities of another solver, and cut anywhere the bits of one run."""
+    rng = np.random.default_rng(seed)
+    jac, half = np.zeros((20, 14)), rng.normal(size=(2, 7, 7))
+    jac[::2, :7], jac[1::2, 7:] = rng.normal(size=(2, 10, 7))
+    mass = scipy.linalg.block_diag(*(half @ half.swapaxes(1, 2) + np.eye(7)))
+    cones = lv.Cones.bounded(np.zeros(20), 1.0)
+    problem = lv.Problem.from_jacobian(jac, mass, rng.normal(size=14), cones=cones, compliance=compliance)
+    start = rng.uniform(0.0, 1.0, 20)
+    whole, cut = start.copy(), start.copy()
+    once, kernel = general.prepare(problem), general.prepare(problem)
+    once.start(whole, 1e-9, 300)
+    kernel.start(cut, 1e-9, 300)
+    assert once.step(300, whole) == OUTCOMES["reached"]
+    while kernel.step(steps, cut) == OUTCOMES["more"]:
+        pass
+    assert kernel.counts == once.counts
+    np.testing.assert_array_equal(cut, whole)
+    assert lv.residual(problem, whole).relative <= 1e-9
+    other = lv.solve(problem, "direct", tol=1e-9)
+    np.testing.assert_allclose(problem.velocity(whole), problem.velocity(other.impulse), atol=1e-6)
 
 
 def test_newton_that_waits_begins_anew_where_it_is_started_anew():
