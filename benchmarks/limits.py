@@ -40,13 +40,14 @@ SWEEPS = ("sequential_impulses", "block_gauss_seidel", "pgs")  # the first that 
 RATES = {
     setup_times: (
         "START",
-        "ROW",
+        "EACH",
         "FORMED",
         "PRODUCT",
         "CALLS",
         "LAID_OUT",
         "WHOLE",
         "SUMMED",
+        "ANALYSED",
         "BODIES",
         "VELOCITIES",
     ),

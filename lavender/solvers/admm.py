@@ -31,12 +31,14 @@ from lavender.solvers.factors import GENERAL_LIMIT, PANELS_WORK, TINY, Panels, m
 from lavender.solvers.newton_systems.sparse import BACKWARD
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import (
+    ANALYSED,
     CALLS,
     DENSE,
     EACH,
     LAID_OUT,
     START,
     WHOLE,
+    analysed,
     compared,
     dense_work,
     entries_of,
@@ -56,8 +58,7 @@ _PATIENCE = 5000  # iterations: on mass ratios the residual rises while rho find
 
 _LATE = "the next factorisation, or the analysis before it, would end after the time limit"
 AT_ONCE = 5e-3  # s, that scaling may be expected to take for `prepare` to do it
-# s: scaled, each entry of A; analysed, each entry of a row of blocks, or each of A if there are no others.
-_SCALED, _ANALYSED, _WHOLE = 1e-8, 6e-8, 1e-9
+_SCALED = 1e-8  # s for each entry of A
 _JACOBIAN, _NORMAL = 24, 18  # entries: two for each of a row over bodies; of J^T J for each velocity
 # s for each multiply-add of a factor by panels, and of L U in one panel.
 _PANELS_WORK, _ONE_PANEL = 1e-9 * PANELS_WORK, 4e-10
@@ -120,7 +121,7 @@ class AdmmState:
         if problem.m:
             self.matrix = mirrored(self.matrix)
             self.panels = Panels(*rows_of(self.matrix)[:2])
-        self.is_scaled, self.seconds = True, _analysis(problem, self.matrix.nnz)
+        self.is_scaled, self.seconds = True, analysed(problem) if problem.m else 0.0
 
     def _expected(self) -> float:
         # What the first factor takes, from structure; the next ones take as long as it did.
@@ -128,7 +129,7 @@ class AdmmState:
         if self.kind == _BODIES:
             assert problem.rows is not None
             rows, n = problem.rows, 6 * problem.rows.n_bodies
-            made = CALLS + LAID_OUT * _JACOBIAN * problem.m + _ANALYSED * _NORMAL * n
+            made = CALLS + LAID_OUT * _JACOBIAN * problem.m + ANALYSED * _NORMAL * n
             return float(made + EACH * n + _PANELS_WORK * Layout(rows.block_bodies, rows.n_bodies, 6).work)
         return EACH * problem.m + _PANELS_WORK * _analysed(self.panels, self.lu).work if problem.m else 0.0
 
@@ -194,12 +195,6 @@ def _scaling(problem: Problem) -> float:
     if problem.generalized is not None and entries == float(problem.m) ** 2:  # one product of dense matrices
         formed = min(formed, START + WHOLE * entries + DENSE * float(problem.metric.products_of_a))
     return START + formed + compared(problem) + _SCALED * entries
-
-
-def _analysis(problem: Problem, entries: int) -> float:
-    """What the analysis of a matrix of so many entries is expected to take [s]: rows of a block are one node."""
-    m = problem.m
-    return _WHOLE * entries if entries == m * m else _ANALYSED * entries * problem.n_blocks / m
 
 
 def _analysed(panels: Panels, lu: bool) -> SparsePanels:

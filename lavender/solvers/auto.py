@@ -161,8 +161,9 @@ class Tree:
         if name == "newton" and "states" in vars(self):
             return not self.deadline.passed(needed)
         set_up, p = setup_time(name, self.problem), self.problem
-        if p.matrix is not None and FILLS * p.m < len(p._compressed[1]) < SPARSE * p.m**2:
-            set_up *= SURE  # an analysis of what fills in takes longer than is counted
+        fills = p.matrix is not None and FILLS * p.m < len(p._compressed[1]) < SPARSE * p.m**2
+        if fills and name == "direct":
+            set_up *= SURE  # a factor of what fills in takes longer than is counted
         return not self.deadline.passed(set_up + needed)
 
     def is_short(self, newton: float) -> bool:

@@ -38,9 +38,16 @@ from lavender.judge.solution import Claim, Status, counted
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, make_system
+from lavender.solvers.newton_systems.systems import System, is_dense, make_system
 from lavender.solvers.registry import Solver, SolverSpec
-from lavender.solvers.setup_times import formed_once, over_bodies, over_rows, over_velocities
+from lavender.solvers.setup_times import (
+    analysed,
+    entries_of,
+    formed_once,
+    over_bodies,
+    over_rows,
+    over_velocities,
+)
 from lavender.solvers.small import NEWTON
 from lavender.solvers.warm_start import claim_of, warm_start
 from lavender_ext.core.method import OUTCOMES
@@ -119,7 +126,10 @@ class Newton(Solver):
         if problem.generalized is not None and self.form != "impulse":
             return over_velocities(problem)
         bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
-        return over_bodies(problem) if bodies else over_rows(problem)
+        if bodies:
+            return over_bodies(problem)
+        few = not is_dense(entries_of(problem), problem.m, problem.law == "cone")
+        return over_rows(problem) + (analysed(problem) if few else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:
         """The system of a problem."""

@@ -12,8 +12,10 @@ from math import inf
 from lavender.judge import residuals
 from lavender.problem import Problem
 from lavender.solvers.registry import SMALL_ROWS
+from lavender_ext.factor.sparse import bandwidth
 
 __all__ = [
+    "analysed",
     "compared",
     "dense_work",
     "entries_of",
@@ -35,6 +37,9 @@ EACH, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bo
 # s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.
 LAID_OUT, WHOLE, SUMMED = 3e-8, 9e-9, 6e-9
 CALLS = 3e-4  # s of SciPy's calls where A is laid out by its entries
+# s for each entry of A with an order of its own and what it fills, as many times more as its band has some thousand
+# rows; where every entry is there, which is one panel.
+ANALYSED, BAND, PANEL = 6e-8, 1500.0, 1e-9
 # s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
 BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
@@ -81,6 +86,16 @@ def over_rows(problem: Problem) -> float:
     full = entries == float(problem.m) ** 2
     laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
     return START + forming(problem) + compared(problem) + laid_out + loaded
+
+
+def analysed(problem: Problem) -> float:
+    """An order of elimination of A, and what it fills; rows of one block are one node."""
+    entries, m = entries_of(problem), float(problem.m)
+    if entries == m * m:
+        return PANEL * entries
+    is_known = problem.matrix is not None or "_compressed" in problem.__dict__
+    band = max(bandwidth(*problem._compressed[:2])) if is_known else m
+    return ANALYSED * entries * (problem.n_blocks / m) * (1.0 + band / BAND)
 
 
 def summed(problem: Problem) -> float:

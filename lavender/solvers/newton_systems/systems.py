@@ -29,9 +29,14 @@ DENSE_FILL, EARLY_FILL = 0.4, 0.25
 PANELS, FEW_COLUMNS, ZEROS = 2e6, 6, 0.1
 
 
-def is_full(nnz: int, m: int, cones: bool) -> bool:
+def is_full(nnz: float, m: int, cones: bool) -> bool:
     """Whether a dense factor of m rows and nnz entries is there sooner than panels; `cones`: of the cone law."""
     return nnz > (DENSE_FILL if cones else EARLY_FILL) * m * m
+
+
+def is_dense(nnz: float, m: int, cones: bool) -> bool:
+    """Whether H of m rows and nnz entries is held as a full matrix."""
+    return m <= DENSE_ROWS or (is_full(nnz, m, cones) and m <= DENSE_LIMIT)
 
 
 class System:
@@ -97,9 +102,7 @@ class MatrixSystem(System):
         if not solve.whole:
             a = a[solve.keep][:, solve.keep]
         self.symmetric = problem.is_symmetric
-        self.dense = m <= DENSE_ROWS or (
-            is_full(a.nnz, m, solve.has_friction and problem.law == "cone") and m <= DENSE_LIMIT
-        )
+        self.dense = is_dense(a.nnz, m, solve.has_friction and problem.law == "cone")
         self.entries = float(a.nnz)
         self.pace = 0.3e-9 if self.dense else 1e-9
         self.h: Any
