@@ -52,6 +52,7 @@ DIFFICULTY = (
     "sweeps of pgs to a thousandth of doing nothing; condition of A scaled to a diagonal of 1; share of blocks on the "
     "border of two states; solvers with the same bits and no iteration, whose times are of one shortcut"
 )
+IN_TURNS, ALONE = "in turns", "alone"  # lines of a recommendation, timed again; runs one after the other
 NOT_COMPARED = "no case has the same numbers in both (steps of sequences are not compared)"
 
 
@@ -80,9 +81,9 @@ def sections(report: Report) -> list[Section]:
         ]
     else:
         by_structure = (
-            "to a level: mean time (cold, if not carried), share of cases that get there, budget; in a time or with "
-            "sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good within "
-            "noise"
+            f"to a level: mean time, {ALONE} (cold, if not carried), share of cases that get there, budget; in a time "
+            "or with sweeps: share of cases served, nine of ten at least, residual at the 90th percentile; ≈ as good "
+            "within noise"
         )
         by_sweeps = "share of cases served, residual at the 90th percentile"
         inside = "its own answers, judged like ours; its time holds no copy of the problem and no judge"
@@ -115,15 +116,29 @@ def short_table(report: Report) -> Table:
         return found.without(*(head for head in found.heads if "iterations" in head), "hardest")
     by_motion = any(run.plan.get("speed_levels") for run in report.every.runs.values())
     if len(report.lines) == 1 and not by_motion:
-        ranking = report.lines[0].by_level[report.levels[middle]].ranking
-        rows: Rows = [
-            [c.solver, seconds(c.score) + share(c.solved, c.cases), c.how] for c in ranking if c.solved
-        ]
-        return Table(["solver", f"to {level_name(report.levels[middle])}", "asked"], rows)
+        return _solver_table(report, report.levels[middle])
     found = speed_table(report) if by_motion else advice_table(report)
     column = 1 + (len(report.speeds) // 2 if by_motion else middle)
     rows = [[str(row[0]), replace(row[column], after="")] for row in found.rows]  # type: ignore[type-var]
-    return Table(["structure", found.heads[column]], rows, words=WORDS | {found.heads[column]})
+    head = f"{found.heads[column]}, timed {ALONE}"
+    return Table(["structure", head], rows, words=WORDS | {head})
+
+
+def _solver_table(report: Report, level: float) -> Table:
+    """Solvers of the only structure to a level: first those of the first sentence, with its times."""
+    raced = {choice.solver: (final.line, choice) for final, choice in report.verdict.raced if choice.solved}
+    alone = [c for c in report.lines[0].by_level[level].ranking if c.solved and c.solver not in raced]
+    rows: Rows = [
+        [
+            c.solver,
+            seconds(c.score) + share(c.solved, c.cases),
+            f"{line.asked}, {line.start}",
+            IN_TURNS if line.turns else ALONE,
+        ]
+        for line, c in raced.values()
+    ]
+    rows += [[c.solver, seconds(c.score) + share(c.solved, c.cases), c.how, ALONE] for c in alone]
+    return Table(["solver", f"to {level_name(level)}", "asked", "timed"], rows)
 
 
 # -- recommendations ---------------------------------------------------------------------------------------

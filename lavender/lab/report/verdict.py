@@ -48,6 +48,8 @@ class Verdict:
 
     told: tuple[Told, ...]
     leaders: tuple[str, ...]  # solvers that the page draws in colour, the recommended one first
+    # Of the only subject, the lines that the first sentence was chosen from, with the times that it tells.
+    raced: tuple[tuple[Final, Choice], ...] = ()
 
     @property
     def text(self) -> str:
@@ -83,7 +85,7 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
             reached = _until(speeds[len(speeds) // 2])
             told.append(Told(f"By motion error {best.solver}: {seconds(best.score)} {reached}."))
     leaders = dict.fromkeys(name for part in parts for name in part.leaders)
-    return Verdict(tuple(told), tuple(leaders)[:3])
+    return Verdict(tuple(told), tuple(leaders)[:3], parts[0].raced if len(parts) == 1 else ())
 
 
 def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequence[int]) -> Verdict:
@@ -131,7 +133,7 @@ def _of(records: Records, subject: Subject, times: Sequence[float], sweeps: Sequ
     if foreign and subject.way == "call":
         said = f"By their own interface, on data given before, some are faster than all of ours: {', '.join(foreign)}."
         told.append(Told(said))
-    return Verdict(tuple(told), tuple(dict.fromkeys(leaders))[:3])
+    return Verdict(tuple(told), tuple(dict.fromkeys(leaders))[:3], race.ranking)
 
 
 def _what(records: Records, subject: Subject, n: int) -> str:

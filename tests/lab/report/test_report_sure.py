@@ -13,6 +13,7 @@ from lavender.lab.report import tables
 from lavender.lab.report.findings import Report
 from lavender.lab.report.tables.finals import in_time, lines, to_level
 from lavender.lab.report.terminal import print_report
+from lavender.lab.report.text import seconds
 from lavender.lab.report.verdict import verdict
 from tests.lab.report.test_report import record, records_of
 
@@ -225,3 +226,31 @@ def test_the_headline_is_of_all_sequences():
     assert len(told.code) == 5  # with the loop that carries impulses, which a terminal shows on request
     print_report(Report(found), Console(file=out, width=400))
     assert out.getvalue().splitlines()[1] == f"    {told.line}  # the lines around it: --tables"
+
+
+@pytest.mark.parametrize("way", ["call", "steps"])
+def test_the_first_screen_has_one_time_for_each_solver(way):
+    """That of the lines in turns: the table below had the runs that these were chosen from, at half the time."""
+    made = in_turns({"newton": 1.0, "auto": 1.5}, 0, repeats=3)
+    for i, case in enumerate(CASES):
+        for solver, t in (("newton", 5e-4), ("auto", 7e-4), ("pgs", 9e-2)):
+            made.add(record(case, solver, t * (1 + i), 1e-10, tol=1e-9))
+        step = {"sequence": "walk", "step": i} if way == "steps" else {"structure": ("pile",)}
+        made.add(bench.CaseInfo(**{**vars(made.cases[case]), **step}))
+    if way == "steps":
+        more = {"start": "carried", "way": "steps"}
+        made.records = [
+            bench.Record(**{**vars(r), **more, "step": CASES.index(r.case)}) for r in made.records
+        ]
+    found, out = Report(made), io.StringIO()
+    first, second = (choice for _, choice in found.verdict.raced)
+    assert first.solver == "newton" and f"in {seconds(first.score)} on average" in found.verdict.told[0].text
+    (line,) = found.lines
+    assert line.by_level[1e-6].ranking[0].score < 0.7 * first.score  # alone it was quicker
+    print_report(found, Console(file=out, width=200))
+    table = [re.split(r"  +", row.strip()) for row in out.getvalue().partition("\n\n")[2].splitlines()]
+    start = "carried" if way == "steps" else "cold"
+    assert table[0] == ["solver", "to 1e-6", "asked", "timed"]
+    assert table[1] == ["newton", seconds(first.score), f"to 1e-6, {start}", "in turns"]
+    assert table[2] == ["auto", seconds(second.score), f"to 1e-6, {start}", "in turns"]
+    assert table[3][0] == "pgs" and table[3][-1] == "alone"
