@@ -49,7 +49,6 @@ COLD = (
     "_utility",
     "host/",
     "engine/arrays",
-    "generalized/export",
     "core/blocks",
     "core/checks",
     "core/order",

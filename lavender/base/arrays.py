@@ -103,7 +103,9 @@ def as_array(
         raise InputError(f"{what} holds numbers beyond 32 bits")
     if given.dtype.itemsize > 8:
         given = _narrowed(given)
-    array: np.ndarray = np.array(given, dtype, order="C") if copy else np.ascontiguousarray(given, dtype)
+    array: np.ndarray = (
+        np.array(given, dtype, order="C") if copy else np.require(given, dtype, ["C", "A", "E"])
+    )
     if finite and array.dtype.kind == "f":
         check_inside(what, array, unit)
     return read_only(array)

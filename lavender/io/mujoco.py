@@ -127,7 +127,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     m, n, dt = int(data.nefc), int(model.nv), _timestep(opt)
     smooth, before = data.qacc_smooth, _SEEN.get(model)
     mass = _mass(mj, model, data, smooth, NO_TRIANGLE if before is None else before.mass[:2])
-    cones, scale, key, held = _blocks(mj, model, data, dt)
+    cones, scale, key = _blocks(mj, model, data, dt)
     jac = _rows(mj, model, data, m, n, scale)
     rhs, softness, v_free, sound, gap, gaps = export.numbers(
         *jac, scale, dt, _before(model, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
@@ -136,7 +136,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     _check_jacobian(*gaps)
     if not gap <= SAME:
         softness, sound = _compliance(data) * scale * scale, False
-    names = Names(cones.n_blocks, lambda: _words(mj, model, held, m))
+    names = Names(cones.n_blocks, lambda: _words(mj, model, cones._blocks.ints[2 * m + 1 :], m))
     general = Generalized.compressed(jac, mass, v_free, like=before)
     if before is None or before.n != n:
         _SEEN[model] = general.operator
@@ -239,7 +239,7 @@ def _mass(mj: Any, model: Any, data: Any, smooth: Any, like: Any) -> Any:
         parts = model.M_rowadr, model.M_rownnz, model.M_colind, data.M
     except AttributeError:  # an earlier MuJoCo
         parts = _whole_mass(mj, model, data)
-    made = export.lower(*parts, smooth, data.qfrc_smooth, like)
+    made = export.lower(*parts, smooth, data.qfrc_smooth, ROUNDING, like)
     if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
     mass, gap = made
@@ -348,8 +348,8 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArray, Any, IntArray]:
-    """Cones, factor of each row, key of each block; type and id of rows, dim and geoms of contacts, for their names."""
+def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArray, Any]:
+    """Cones, factor of each row, key of each block."""
     contact = data.contact if data.ncon else NO_CONTACT
     contacts, tendons = len(contact.dim), model.ntendon
     most = (model.neq, model.nv, tendons, model.njnt, tendons, contacts, contacts, contacts)
@@ -367,10 +367,10 @@ def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArra
             f"constraint row {found} of {len(types)} is of type {of} and names number {which} of {there}{dim}: "
             f"that is not there, or has not so many rows. {CHANGED}"
         )
-    blocks, scale, key, held = found
+    blocks, scale, key = found
     if blocks is None:
         raise InputError(f"efc_frictionloss or a contact's friction is no bound. {CHANGED}")
-    return Cones._of(blocks), scale, key, held
+    return Cones._of(blocks), scale, key
 
 
 def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = export.JOINED) -> list[str]:

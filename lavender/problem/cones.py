@@ -19,7 +19,7 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -65,6 +65,7 @@ __all__ = [
 
 ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE = kernels.KINDS
 
+FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius", "rolling")
 REACH = "mu patch_radius (of boxes and ellipses mu_2)"
 # Of each kind of contact: least and most rows, what it is called, and what it may have.
 SIZES = {
@@ -125,7 +126,7 @@ class Cones:
     upper: FloatArray  # (m,) N s, read on ROW blocks, +inf allowed
     mu: FloatArray  # (k,) -, read on contacts
     patch_radius: FloatArray  # (k,) m, read on contacts with spin; on boxes and ellipses mu_2 / mu_1
-    rolling: FloatArray = ()  # type: ignore[assignment]  # (k,) m, read on CONTACT_ROLLING; (): 0
+    rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (k,) m, read on CONTACT_ROLLING; (): 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
     def __post_init__(self) -> None:
@@ -140,10 +141,15 @@ class Cones:
         self._take(made)
 
     def _take(self, made: kernels.Blocks) -> None:
-        put = self.__dict__
-        put["_blocks"] = made
-        put["ptr"], put["kind"], put["lower"], put["upper"], *coefficients = made.arrays
-        put["mu"], put["patch_radius"], put["rolling"] = coefficients
+        self.__dict__.clear()
+        self.__dict__["_blocks"] = made
+
+    def __getattr__(self, name: str) -> Any:
+        # Views are cut when one is first asked for.
+        if name not in FIELDS:
+            raise AttributeError(f"Cones have no {name}")
+        self.__dict__.update(zip(FIELDS, self._blocks.arrays, strict=True))
+        return self.__dict__[name]
 
     @classmethod
     def _of(cls, made: kernels.Blocks) -> Cones:
@@ -296,12 +302,12 @@ class Cones:
     @property
     def n_blocks(self) -> int:
         """Number of blocks, k."""
-        return len(self.kind)
+        return int(self._blocks.n_blocks)
 
     @property
     def n_rows(self) -> int:
         """Number of rows, m."""
-        return len(self.lower)
+        return int(self._blocks.n_rows)
 
     @property
     def is_contact(self) -> npt.NDArray[np.bool_]:

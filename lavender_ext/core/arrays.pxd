@@ -1,11 +1,36 @@
 """Addresses of arrays: a typed view costs as much as a pass over 500 numbers, which is most of what small arrays cost."""
-from cpython.buffer cimport PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBUF_STRIDES, PyBuffer_Release, PyObject_GetBuffer
 from cython cimport view
 from libc.stdint cimport int32_t
 from libc.stdlib cimport calloc, free
-from libc.string cimport strchr
 
 import numpy as np
+
+cdef extern from *:
+    """
+    /* What NumPy's own inline functions read of an array and its type: an ABI that has not changed since 1.0. */
+    typedef struct { PyObject_HEAD PyObject *typeobj; char kind, type, byteorder, old; int type_num; } lav_descr;
+    typedef struct {
+        PyObject_HEAD char *data; int nd; Py_ssize_t *dimensions, *strides; PyObject *base; lav_descr *descr; int flags;
+    } lav_array;
+    """
+    ctypedef struct lav_descr:
+        char byteorder
+        int type_num
+    ctypedef class numpy.ndarray [object lav_array, check_size ignore]:
+        cdef char* data
+        cdef int nd
+        cdef Py_ssize_t* dimensions
+        cdef Py_ssize_t* strides
+        cdef lav_descr* descr
+        cdef int flags
+
+cdef enum:                          # NumPy's
+    TOGETHER = 1                    # flags: C-contiguous
+    ALIGNED = 256
+    WRITEABLE = 1024
+    INT = 5                         # types, as in C
+    LONG = 7
+    DOUBLE = 12
 
 
 cdef inline object zeros(Py_ssize_t n):
@@ -18,39 +43,47 @@ cdef inline object zeros(Py_ssize_t n):
     return np.asarray(made)
 
 
-cdef inline char* spread(object array, Py_ssize_t n, Py_ssize_t width, const char* kinds, Py_ssize_t size,
-                         Py_ssize_t* stride) except? NULL:
-    """Of (n,) or (n, width) numbers of `size` bytes, of kinds that `struct` has, that the caller keeps.
+cdef inline bint is_of(ndarray x, int kind) noexcept:
+    """Whether all numbers are DOUBLE, or INT of 32 bits, as the processor reads them."""
+    return x.flags & ALIGNED and x.descr.byteorder == c"=" and (
+        x.descr.type_num == kind or kind == INT and sizeof(long) == sizeof(int32_t) and x.descr.type_num == LONG)
+
+
+cdef inline char* spread(object array, Py_ssize_t n, Py_ssize_t width, int kind, Py_ssize_t* stride) except? NULL:
+    """Of (n,) or (n, width) numbers, DOUBLE or INT of 32 bits, that the caller keeps.
 
     `stride`: bytes from one to the next; where it is NULL all lie together, in any shape. ValueError of other arrays.
     """
-    cdef Py_buffer held
-    cdef bint fits
-    cdef Py_ssize_t i, count = 1
-    cdef char* at
-    PyObject_GetBuffer(array, &held, PyBUF_FORMAT | (PyBUF_STRIDES if stride != NULL else PyBUF_C_CONTIGUOUS))
-    at = <char*>held.buf
-    fits = held.itemsize == size and held.format[1] == 0 and strchr(kinds, held.format[0]) != NULL
-    for i in range(held.ndim):
-        count *= held.shape[i]
-    fits = fits and count == n * width
-    if stride != NULL and fits:
-        fits = held.ndim == (2 if width > 1 else 1) and held.shape[0] == n and (width == 1 or held.strides[1] == size)
-        stride[0] = held.strides[0]
-    PyBuffer_Release(&held)
-    if not fits:
-        raise ValueError(f"{n * width} numbers of {size} bytes are needed")
-    return at
+    cdef ndarray x
+    cdef Py_ssize_t i, count = 1, size = sizeof(double) if kind == DOUBLE else sizeof(int32_t)
+    if isinstance(array, ndarray):
+        x = <ndarray>array
+        for i in range(x.nd):
+            count *= x.dimensions[i]
+        if count == n * width and is_of(x, kind):
+            if stride == NULL:
+                if x.flags & TOGETHER:
+                    return x.data
+            elif x.nd == (2 if width > 1 else 1) and x.dimensions[0] == n and (width == 1 or n == 0 or x.strides[1] == size):
+                stride[0] = x.strides[0]
+                return x.data
+    raise ValueError(f"{n * width} numbers of {size} bytes are needed")
 
 
 cdef inline double* doubles(object array, Py_ssize_t n) except? NULL:
     """Of n float64 that lie together."""
-    return <double*>spread(array, n, 1, "d", sizeof(double), NULL)
+    return <double*>spread(array, n, 1, DOUBLE, NULL)
 
 
 cdef inline int32_t* ints(object array, Py_ssize_t n) except? NULL:
     """Of n int32 that lie together."""
-    return <int32_t*>spread(array, n, 1, "il", sizeof(int32_t), NULL)
+    return <int32_t*>spread(array, n, 1, INT, NULL)
+
+
+cdef inline object frozen(object array):
+    """The array itself, which nobody but who made it may write to from here on."""
+    (<ndarray>array).flags &= ~WRITEABLE
+    return array
 
 
 cdef inline void* address(object array) except? NULL:

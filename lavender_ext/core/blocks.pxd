@@ -6,7 +6,8 @@ from lavender_ext.core.parts cimport blocks_t
 
 cdef class Blocks:
     cdef blocks_t at                                    # without law, b, d, nu and step
-    cdef readonly tuple arrays                          # ptr, kind, lower, upper, mu, patch_radius, rolling
+    cdef readonly object ints, numbers                  # what `at` points into, and what its maker laid behind
+    cdef tuple _arrays
     cdef readonly bint is_free                          # every row is unbounded
     cdef readonly bint is_bounded_rows                  # every row has constant bounds
     cdef readonly bint has_round                        # some contact has more than two tangents
@@ -19,3 +20,6 @@ cdef class Blocks:
                     const double[::1] rolling)
     cdef bint check(self) noexcept
     cdef void spell(self) noexcept
+
+
+cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=*, Py_ssize_t numbers=*)

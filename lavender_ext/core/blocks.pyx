@@ -7,6 +7,7 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport frozen, ndarray
 from lavender_ext.core.door cimport is_number, is_size
 from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, lay_frictions
 
@@ -17,7 +18,7 @@ cdef enum:
 KINDS = (ROW, CONTACT, CONTACT_SPIN, ROUND, CONTACT_BOX, CONTACT_ROLLING, CONTACT_ELLIPSE)
 
 cdef double INF = 1.0 / 0.0, WIDEST = 2.0 ** 60          # of mu_2 / mu_1 of an ellipse, and of mu_1 / mu_2
-cdef object ndarray = np.ndarray, new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
+cdef object new = np.empty, F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
 
 cdef class Blocks:
@@ -26,7 +27,25 @@ cdef class Blocks:
     def __init__(self, ptr, kind, lower, upper, mu, patch_radius, rolling):
         if not self.point(ptr, kind, lower, upper, mu, patch_radius, rolling) or not self.check():
             raise ValueError("arrays that do not fit each other, or hold what no block can have")
-        self.arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
+        self._arrays = (ptr, kind, lower, upper, mu, patch_radius, rolling)
+
+    @property
+    def arrays(self):
+        """ptr, kind, lower, upper, mu, patch_radius, rolling: views, made at first use."""
+        cdef Py_ssize_t k = self.at.n_blocks, m = self.at.n_rows, at = self.at.mu - self.at.lower
+        cdef Py_ssize_t kind = self.at.kind - self.at.ptr, stride = self.at.patch_radius - self.at.mu
+        if self._arrays is None:
+            x = [self.numbers[at + i * stride:at + i * stride + k] for i in range(3)]
+            self._arrays = (self.ints[:k + 1], self.ints[kind:kind + k], self.numbers[:m], self.numbers[m:2 * m], *x)
+        return self._arrays
+
+    @property
+    def n_blocks(self):
+        return self.at.n_blocks
+
+    @property
+    def n_rows(self):
+        return self.at.n_rows
 
     cdef bint point(self, const int32_t[::1] ptr, const int32_t[::1] kind, const double[::1] lower,
                     const double[::1] upper, const double[::1] mu, const double[::1] radius, const double[::1] rolling):
@@ -108,24 +127,17 @@ cdef class Blocks:
                     upper[j] = INF
 
 
-cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m):
-    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written."""
+cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ssize_t numbers=0):
+    """Blocks over new arrays, read-only for everybody else, whose numbers are still to be written; behind them more room."""
     cdef Blocks made = Blocks.__new__(Blocks)
-    whole, numbers = new(2 * k + 1, I4), new(2 * m + 3 * k)
-    cdef int32_t[::1] i = whole
-    cdef double[::1] x = numbers
+    made.ints, made.numbers = frozen(new(2 * k + 1 + ints, I4)), frozen(new(2 * m + 3 * k + numbers))
     made.at.n_blocks = <int32_t>k
     made.at.n_rows = <int32_t>m
-    made.at.ptr = &i[0]
-    if m:
-        made.at.kind = &i[k + 1]
-        made.at.lower = &x[0]
-        made.at.upper = &x[m]
-        lay_frictions(&made.at, &x[2 * m], k)
-    whole.setflags(False)
-    numbers.setflags(False)
-    made.arrays = (whole[:k + 1], whole[k + 1:], numbers[:m], numbers[m:2 * m], numbers[2 * m:2 * m + k],
-                   numbers[2 * m + k:2 * m + 2 * k], numbers[2 * m + 2 * k:])
+    made.at.ptr = <int32_t*>(<ndarray>made.ints).data
+    made.at.kind = made.at.ptr + k + 1
+    made.at.lower = <double*>(<ndarray>made.numbers).data
+    made.at.upper = made.at.lower + m
+    lay_frictions(&made.at, made.at.upper + m, k)
     return made
 
 

@@ -2,18 +2,14 @@
 
 Nothing is said here of what is wrong: where a function says no, the long way checks again, decides, and finds the words.
 """
-from cpython.buffer cimport PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
-import numpy as np
-
-from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.arrays cimport DOUBLE, TOGETHER, doubles, is_of, ndarray
 from lavender_ext.core.door cimport first_unsized, least, most
 
 #: The largest and the least size that a number of a problem may have.
 MOST, LEAST = most(), least()
-cdef object ndarray = np.ndarray
 
 
 def plain(value, tuple shape, bint finite, bint copy):
@@ -21,27 +17,19 @@ def plain(value, tuple shape, bint finite, bint copy):
 
     None in `shape` stands for any length; `finite`: what core/door.pxd (1) excludes is left to the long way.
     """
-    cdef Py_buffer view
+    cdef ndarray held
     cdef Py_ssize_t i, n = 1
-    cdef bint fits
     if type(value) is not ndarray:
         return None
-    try:
-        PyObject_GetBuffer(value, &view, PyBUF_FORMAT | PyBUF_C_CONTIGUOUS)
-    except ValueError:                                  # not contiguous; dates have no buffer
+    held = <ndarray>value
+    if held.nd != len(shape) or not held.flags & TOGETHER or not is_of(held, DOUBLE):
         return None
-    fits = view.format[0] == 100 and view.format[1] == 0 and view.ndim == len(shape)    # "d"
-    if fits:
-        for i in range(view.ndim):
-            wanted = shape[i]
-            n *= view.shape[i]
-            if wanted is not None and wanted != view.shape[i]:
-                fits = False
-                break
-    if fits and finite:
-        fits = are_inside(<const double*>view.buf, n)
-    PyBuffer_Release(&view)
-    if not fits:
+    for i in range(held.nd):
+        wanted = shape[i]
+        n *= held.dimensions[i]
+        if wanted is not None and wanted != held.dimensions[i]:
+            return None
+    if finite and not are_inside(<const double*>held.data, n):
         return None
     made = value.copy() if copy else value
     made.setflags(False)

@@ -7,14 +7,15 @@ whose coefficients f differ has the rows of its tangents scaled by f_j / f_0, so
 """
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, uint64_t
-from libc.string cimport memcmp, memcpy
+from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles, ints, spread
-from lavender_ext.core.blocks cimport Blocks
+from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarray, spread
+from lavender_ext.core.blocks cimport Blocks, room_of
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport ROW, contact_kind, lay_frictions
+from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind
+from lavender_ext.core.problem cimport Room, room_for
 
 
 cpdef enum:
@@ -116,9 +117,9 @@ cdef public int32_t lav_export_blocks(int32_t m, const int32_t* type_, const int
 
 
 def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
-    """(blocks, scale, key, held), or the number of a row that is unknown, or names what is not there.
+    """(blocks, scale, key), or the number of a row that is unknown, or names what is not there.
 
-    The blocks are None where some bound is no number; held is a copy of type, id, dim and geom, one after the other.
+    The blocks are None where some bound is no number; behind them, in `ints` from 2 m + 1 on, stand type, id, dim and geom.
     """
     cdef int32_t m = <int32_t>len(type_), c = <int32_t>len(dim), k, i
     cdef int32_t limits[CODES]
@@ -126,45 +127,33 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
     cdef const int32_t* of = ints(type_, m)
     cdef const int32_t* which = ints(id_, m)
     cdef const double* losses = doubles(loss, m)
-    cdef const char* dims = spread(dim, c, 1, "il", sizeof(int32_t), &step[0])
-    cdef const char* pair = spread(geom, c, 2, "il", sizeof(int32_t), &step[1])
-    cdef const char* rub = spread(friction, c, 5, "d", sizeof(double), &step[2])
-    cdef Blocks made = Blocks.__new__(Blocks)
+    cdef const char* dims = spread(dim, c, 1, INT, &step[0])
+    cdef const char* pair = spread(geom, c, 2, INT, &step[1])
+    cdef const char* rub = spread(friction, c, 5, DOUBLE, &step[2])
+    cdef Blocks made = room_of(m, m, 2 * m + 3 * c, m + 5 * c)
+    cdef blocks_t* p = &made.at
+    cdef int32_t* held = <int32_t*>p.kind + m
+    cdef double* scale = <double*>p.rolling + m
+    cdef double* x = scale + m
     for k in range(CODES):
         limits[k] = most[k]
-    whole, copy, numbers, keys = new(2 * m + 1, I4), new(2 * m + 3 * c + 1, I4), new(6 * m + 5 * c + 1), new(m + 1, U8)
-    cdef int32_t* w = ints(whole, 2 * m + 1)
-    cdef int32_t* held = ints(copy, 2 * m + 3 * c + 1)
-    cdef double* x = doubles(numbers, 6 * m + 5 * c + 1)
-    cdef uint64_t* key = <uint64_t*>spread(keys, m + 1, 1, "LQ", sizeof(uint64_t), NULL)
+    keys = new(m, U8)
     memcpy(held, of, m * sizeof(int32_t))
     memcpy(held + m, which, m * sizeof(int32_t))
-    for i in range(m):
-        x[4 * m + i] = x[5 * m + i] = 0.0               # no patch, nothing rolls by itself
+    memset(<double*>p.patch_radius, 0, 2 * m * sizeof(double))
     for i in range(c):
         memcpy(&held[2 * m + i], dims + i * step[0], sizeof(int32_t))
         memcpy(&held[2 * m + c + 2 * i], pair + i * step[1], 2 * sizeof(int32_t))
-        memcpy(&x[6 * m + 5 * i], rub + i * step[2], 5 * sizeof(double))
-    k = lav_export_blocks(m, held, held + m, ints(codes, CODES), limits, held + 2 * m, x + 6 * m, held + 2 * m + c,
-                          losses, dt, w, w + m + 1, x, x + m, x + 3 * m, x + 2 * m, key)
+        memcpy(&x[5 * i], rub + i * step[2], 5 * sizeof(double))
+    k = lav_export_blocks(m, held, held + m, ints(codes, CODES), limits, held + 2 * m, x, held + 2 * m + c, losses, dt,
+                          <int32_t*>p.ptr, <int32_t*>p.kind, <double*>p.lower, <double*>p.upper, <double*>p.mu, scale,
+                          <uint64_t*>(<ndarray>keys).data)
     if k < 0:
         return -1 - k
-    made.at.n_blocks = k
-    made.at.n_rows = m
-    made.at.ptr = w
-    if m:
-        made.at.kind = w + m + 1
-        made.at.lower = x
-        made.at.upper = x + m
-        lay_frictions(&made.at, x + 3 * m, m)
+    p.n_blocks = k
     fits = made.check()
     made.spell()
-    whole.setflags(False)
-    numbers.setflags(False)
-    keys.setflags(False)
-    made.arrays = (whole[:k + 1], whole[m + 1:m + 1 + k], numbers[:m], numbers[m:2 * m], numbers[3 * m:3 * m + k],
-                   numbers[4 * m:4 * m + k], numbers[5 * m:5 * m + k])
-    return made if fits else None, numbers[2 * m:3 * m], keys[:k], copy
+    return made if fits else None, made.numbers[5 * m:6 * m], frozen(keys if k == m else keys[:k])
 
 
 def rows_of_dense(values, int32_t m, int32_t n, scale):
@@ -173,11 +162,15 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
     cdef double x
     cdef const double* value = doubles(values, values.size)
     cdef const double* factor = doubles(scale, m)
-    whole, data_ = new(m + 1 + m * n, I4), new(m * n)
-    cdef int32_t* indptr = ints(whole, m + 1 + m * n)
-    cdef int32_t* indices = indptr + m + 1
-    cdef double* data = doubles(data_, m * n)
-    indptr[0] = 0
+    cdef int32_t* indptr
+    cdef int32_t* indices
+    cdef double* data
+    for i in range(m):
+        for j in range(n):
+            at += value[i * n + j] * factor[i] != 0.0
+    indptr_, indices_, data_ = new(m + 1, I4), new(at, I4), new(at)
+    indptr, indices, data = ints(indptr_, m + 1), ints(indices_, at), doubles(data_, at)
+    at = indptr[0] = 0
     for i in range(m):
         for j in range(n):
             x = value[i * n + j] * factor[i]
@@ -186,7 +179,7 @@ def rows_of_dense(values, int32_t m, int32_t n, scale):
                 data[at] = x
                 at += 1
         indptr[i + 1] = at
-    return whole[:m + 1], whole[m + 1:m + 1 + at], data_[:at]
+    return indptr_, indices_, data_
 
 
 def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
@@ -207,9 +200,9 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
         if not 0 <= count[i] <= room or not 0 <= first[i] <= room - count[i]:
             return i
         total += count[i]
-    whole, data_ = new(m + 1 + total, I4), new(total)
-    cdef int32_t* indptr = ints(whole, m + 1 + total)
-    cdef int32_t* indices = indptr + m + 1
+    indptr_, indices_, data_ = new(m + 1, I4), new(total, I4), new(total)
+    cdef int32_t* indptr = ints(indptr_, m + 1)
+    cdef int32_t* indices = ints(indices_, total)
     cdef double* data = doubles(data_, total)
     indptr[0] = 0
     for i in range(m):
@@ -226,21 +219,25 @@ def rows_of_sparse(values, count_, first_, columns, scale, int32_t n):
         ascend &= not stray
         for q in range(begin, end):
             x = value[q] * factor
-            indices[at] = column[q]
-            data[at] = x
-            at += x != 0.0                              # what is zero is written over
+            if x != 0.0:
+                indices[at] = column[q]
+                data[at] = x
+                at += 1
         indptr[i + 1] = <int32_t>at
-    return (whole[:m + 1], whole[m + 1:m + 1 + at], data_[:at]) if ascend else None
+    if not ascend:
+        return None
+    return (indptr_, indices_, data_) if at == total else (indptr_, indices_[:at], data_[:at])
 
 
-def lower(first_, count_, columns, values, x, y, tuple like):
+def lower(first_, count_, columns, values, x, y, double bound, tuple like):
     """M's rows by first place and length as (indptr, indices, data), and max |M x - y| over max (|M| |x| + |y|).
 
-    Columns ascend to the diagonal entry. None where these are no lower triangle, row behind row. `like` is (indptr,
-    indices) of such a triangle, which are shared where they are these.
+    The latter over max |y| where that is within `bound` already. Columns ascend to the diagonal entry. None where these
+    are no lower triangle, row behind row. `like` is (indptr, indices) of such a triangle, shared where they are these.
     """
-    cdef int32_t i, q, j, end, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
-    cdef double gap = 0.0, big = 0.0, own, size, z, w, term
+    cdef int32_t i, q, last, n = <int32_t>len(first_), nnz = <int32_t>len(columns)
+    cdef double gap = 0.0, big = 0.0
+    cdef Room scratch
     cdef const int32_t* first = ints(first_, n)
     cdef const int32_t* given = ints(columns, nnz)
     cdef const int32_t* count
@@ -249,7 +246,6 @@ def lower(first_, count_, columns, values, x, y, tuple like):
     cdef int32_t* whole
     cdef double* out
     cdef double* made
-    cdef double* sizes
     cdef const double* v
     cdef const double* right
     if not n == len(count_) == len(x) == len(y) or nnz != len(values) or n == 0:
@@ -273,30 +269,38 @@ def lower(first_, count_, columns, values, x, y, tuple like):
         if whole[n] != nnz:
             return None
         for made_ in like:
-            made_.setflags(False)
+            frozen(made_)
     at, column = ints(like[0], n + 1), ints(like[1], nnz)
-    copy, scratch = new(nnz), new(2 * n)
-    out, made = doubles(copy, nnz), doubles(scratch, 2 * n)
-    sizes = made + n                                    # M x, |M| |x|
+    copy, scratch = new(nnz), room_for(n * sizeof(double))
+    out, made = doubles(copy, nnz), <double*>scratch.at
     memcpy(out, doubles(values, nnz), nnz * sizeof(double))
+    multiply(n, at, column, out, v, False, made)
     for i in range(n):
-        own = size = 0.0
-        z = v[i]
-        w = fabs(z)
+        gap = widest(gap, made[i] - right[i])
+        big = widest(big, right[i])
+    if not gap <= bound * big:
+        big = 0.0
+        multiply(n, at, column, out, v, True, made)
+        for i in range(n):
+            big = widest(big, made[i] + fabs(right[i]))
+    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
+
+
+cdef inline void multiply(int32_t n, const int32_t* at, const int32_t* column, const double* data, const double* x,
+                          bint sizes, double* y) noexcept nogil:
+    """y = M x of M's lower triangle, or the sizes |M| |x|."""
+    cdef int32_t i, q, j, end
+    cdef double own, z, term
+    for i in range(n):
+        own = 0.0
+        z = fabs(x[i]) if sizes else x[i]
         end = at[i + 1] - 1
         for q in range(at[i], end):
             j = column[q]
-            own += out[q] * v[j]
-            term = fabs(out[q])
-            size += term * fabs(v[j])
-            made[j] += out[q] * z
-            sizes[j] += term * w
-        made[i] = own + out[end] * z
-        sizes[i] = size + fabs(out[end]) * w
-    for i in range(n):
-        gap = widest(gap, made[i] - right[i])
-        big = widest(big, sizes[i] + fabs(right[i]))
-    return (like[0], like[1], copy), gap / big if big > 0.0 else gap
+            term = fabs(data[q]) if sizes else data[q]
+            own += term * (fabs(x[j]) if sizes else x[j])
+            y[j] += term * z
+        y[i] = own + (fabs(data[end]) if sizes else data[end]) * z
 
 
 cdef bint is_seen(tuple like, int32_t n, int32_t nnz, const int32_t* first, const int32_t* count, const int32_t* columns):
@@ -321,39 +325,52 @@ def motion_gap(parent, body, axis, spatial, v_):
     0 where s is all zeros: a copy did not fill it. -1 where these are not the arrays of one tree.
     """
     cdef Py_ssize_t i, j, k, n = len(v_), bodies = len(spatial)
-    cdef double term, z, big = 0.0, gap = 0.0, filled = 0.0, lost = 0.0     # lost: 0, or NaN
+    cdef double term, z
+    cdef double[6] big, gap, lost                       # of each component; lost: 0, or NaN
     if not len(body) == len(axis) == n or len(parent) != bodies or bodies == 0:
         return -1.0, 0.0
-    scratch = new(6 * bodies)
-    cdef double* made = doubles(scratch, 6 * bodies)
+    cdef Room scratch = room_for(6 * bodies * sizeof(double))
+    cdef double* made = <double*>scratch.at
     cdef const double* c = doubles(spatial, 6 * bodies)
     cdef const double* s = doubles(axis, 6 * n)
     cdef const double* v = doubles(v_, n)
     cdef const int32_t* of = ints(body, n)
     cdef const int32_t* up = ints(parent, bodies)
+    cdef double* row
+    cdef const double* before
     for i in range(bodies):
         if not 0 <= up[i] < bodies:
             return -1.0, 0.0
     for j in range(n):
         if not 0 <= of[j] < bodies:
             return -1.0, 0.0
-    for i in range(6 * bodies):
+    for k in range(6):
+        big[k] = gap[k] = lost[k] = made[k] = 0.0
+    for i in range(6, 6 * bodies):
         made[i] = -c[i]
     for j in range(n):
         z = v[j]
+        row = made + 6 * of[j]
         for k in range(6):
             term = s[6 * j + k] * z
-            made[6 * of[j] + k] += term
-            big = larger(big, term)
-            filled = larger(filled, s[6 * j + k])
-            lost += 0.0 * term
+            row[k] += term
+            big[k] = larger(big[k], term)
     for i in range(1, bodies):
+        row = made + 6 * i
+        before = c + 6 * up[i]
         for k in range(6):
-            term = made[6 * i + k] + c[6 * up[i] + k]
-            gap = larger(gap, term)
-            big = larger(big, c[6 * i + k])
-            lost += 0.0 * term
-    return (gap + lost if filled != 0.0 else 0.0), big + lost
+            term = row[k] + before[k]
+            gap[k] = larger(gap[k], term)
+            big[k] = larger(big[k], c[6 * i + k])
+            lost[k] += 0.0 * term
+    for k in range(6):
+        gap[0] = larger(gap[0], gap[k])
+        big[0] = larger(big[0], big[k])
+        lost[0] += lost[k] + 0.0 * made[k]
+    i = 0
+    while i < 6 * n and not fabs(s[i]) > 0.0:
+        i += 1
+    return (gap[0] + lost[0] if i < 6 * n else 0.0), big[0] + lost[0]
 
 
 def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const double[:, ::1] axis,
@@ -443,11 +460,12 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     cdef double big_1 = 0.0, big_2 = 0.0, big_3 = 0.0, said_1 = 0.0, said_2 = 0.0, said_3 = 0.0
     cdef double top_v = 0.0, top_free = 0.0, top_b = 0.0
     cdef bint sound = True
-    made = new(2 * m + 4 * n + 1)
-    cdef double* rhs = doubles(made, 2 * m + 4 * n + 1)
-    cdef double* compliance = rhs + m
-    cdef double* free = compliance + m
-    cdef double* pushed = free + n                      # J^T f, and the same of absolute values
+    rhs_, compliance_, free_ = new(m), new(m), new(n)
+    cdef double* rhs = doubles(rhs_, m)
+    cdef double* compliance = doubles(compliance_, m)
+    cdef double* free = doubles(free_, n)
+    cdef Room scratch = room_for(3 * n * sizeof(double))
+    cdef double* pushed = <double*>scratch.at           # J^T f, and the same of absolute values
     cdef double* change = pushed + 2 * n                # dt a0
     for j in range(n):
         change[j] = dt * smooth[j]
@@ -486,8 +504,7 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
     for j in range(n):
         gap_3 = widest(gap_3, pushed[j] - push[j])
         big_3 = widest(big_3, pushed[n + j] + fabs(push[j]))
-    made.setflags(False)
-    return made[:m], made[m:2 * m], made[2 * m:2 * m + n], sound and is_size(top_b), gap_0, (
+    return frozen(rhs_), frozen(compliance_), frozen(free_), sound and is_size(top_b), gap_0, (
         gap_1 / big_1 if said_1 != 0.0 and big_1 != 0.0 else 0.0,
         gap_2 / big_2 if said_2 != 0.0 and big_2 != 0.0 else 0.0,
         gap_3 / big_3 if said_3 != 0.0 and big_3 != 0.0 else 0.0, finite)

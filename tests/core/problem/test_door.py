@@ -219,3 +219,27 @@ def test_a_row_of_dust_is_an_empty_row(form):
     found = lv.solve(asked, "auto")
     assert not found.success or found.residual.relative <= 1e-6
     assert found.status is not lv.Status.INFEASIBLE or not found.contradicted
+
+
+LAYOUTS = {
+    "other bytes": lambda x: x.astype(x.dtype.newbyteorder()),
+    "whole numbers": lambda x: x.astype(np.int64),
+    "every other": lambda x: np.repeat(x, 2, axis=-1)[..., ::2],
+    "columns": np.asfortranarray,
+    "at an odd byte": lambda x: (
+        np.frombuffer(b" " + x.tobytes(), np.uint8)[1:].view(x.dtype).reshape(x.shape)
+    ),
+}
+
+
+@pytest.mark.parametrize("copy", [True, False])
+@pytest.mark.parametrize("laid", LAYOUTS.values(), ids=LAYOUTS)
+def test_arrays_in_any_layout_hold_the_same_problem(laid, copy):
+    a, b, reach = np.array([[3.0, 1.0], [1.0, 2.0]]), np.array([1.0, -2.0]), np.array([4.0, 5.0])
+
+    def made(way):
+        cones = lv.Cones.bounded(way(-reach), way(reach))
+        return lv.Problem(way(b), cones, way(a), copy=copy)
+
+    assert made(laid) == made(np.copy)
+    assert np.array_equal(lv.residual(made(laid), laid(b)).velocity, lv.residual(made(np.copy), b).velocity)
