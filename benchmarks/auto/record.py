@@ -33,7 +33,7 @@ LEVELS = (1e-3, 1e-6, 1e-9)
 GROWTH = 0.25  # of the iterations so far, between two points of a curve
 SHORT = 0.03  # s of CPU time below which a run is made three times
 FAR, LEAST = 12.0, 0.05  # times the least time to the middle level, and s, after which a solver is given up
-SOLVERS: dict[str, tuple[str, dict[str, Any]]] = METHODS | {"admm": ("admm", {}), "auto": ("auto", {})}
+SOLVERS: dict[str, tuple[str, dict[str, Any]]] = METHODS | {"auto": ("auto", {})}
 Points = list[tuple[int, float, float]]
 
 

@@ -52,37 +52,21 @@ def two_lines(tree: Tree) -> Iterator[Stage]:
         yield Stage("anderson", MOST * 2**k * tree.newton / tree.sweep, 0.0, "")
 
 
-def sweeps_if_cheap(tree: Tree) -> Iterator[Stage]:
-    """Sweeps first only where 100 of them cost no more than Newton's method."""
-    for stage in tree:
-        first = stage.solver == "anderson" and stage.least < math.inf
-        if not first or costs.SWEEPS * tree.sweep <= tree.newton:
-            yield stage
-
-
-def with_admm(tree: Tree) -> Iterator[Stage]:
-    """`admm` after the sweeps of each turn."""
-    for stage in tree:
-        yield stage
-        if stage.solver == "anderson" and stage.least == math.inf:
-            yield replace(stage, solver="admm")
-
-
 RULES: dict[str, Rule] = {
     "the tree": iter,
     "the two-line rule": two_lines,
     "without `direct` on bounded rows": without("direct"),
     "without rows of A over J and M": without("newton over rows"),
     "without the prediction of sweeps": lambda tree: (replace(s, least=math.inf) for s in tree),
-    "sweeps first only if 100 cost no more": sweeps_if_cheap,
     "without `nncg`": without("nncg"),
-    "with `admm` at the end": with_admm,
+    "without `admm` at the end": without("admm"),
 }
 
 
 def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
     """What the lines of this rule would take to `level` [s]; inf where none gets there."""
     total, at = CALL, dict[str, tuple[float, float]]()  # iterations and s of each solver so far
+    tree.best = 1.0
     for stage in islice(rule(tree), 60):
         curve, (before, spent) = curves.get(stage.solver), at.get(stage.solver, (0.0, 0.0))
         if curve is None or not curve.points or before >= curve.points[-1][0]:
@@ -98,6 +82,7 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
         if n >= end:
             return total
         at[stage.solver] = n, now
+        tree.best = min(tree.best, *(relative for k, _, relative in known if k <= n))
     return math.inf
 
 

@@ -7,11 +7,11 @@
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it
     Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile of bodies
-                                that do not roll, the first under the cone law
+                                that do not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
-    all in turn                 with doubled work: sweeps, `newton`, under friction `nncg`; all together LAST times
-                                Newton's cost
+    all in turn                 with doubled work, until nobody gains: sweeps, `newton`, under friction `admm` or, of J
+                                and M, `nncg`; all together LAST times Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -23,9 +23,8 @@ have the first half; whoever factors begins only if a result would be there in t
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, nan
 
 import numpy as np
 
@@ -37,11 +36,11 @@ from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
 from lavender.solvers.certify import certify
-from lavender.solvers.newton import ROWS, NewtonState
+from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
-from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.solve_log import GAIN, SolveLog
 from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Step, Sweeps, setup_time
 from lavender_ext.factor import graph
 
@@ -80,6 +79,7 @@ class Tree:
     begun = 0.0  # ns, of sweeps before Newton's method
     left = 0.0  # ns, for turns; who takes the lines gives back what did not run
     tried = False  # velocities of J and M, in the compiled call
+    best = nan  # relative residual, as who takes the lines tells
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
@@ -130,16 +130,6 @@ class Tree:
             over_rows(self.problem) + 3.0 * forming(self.problem)
         )
 
-    def add_rows(self) -> None:
-        """Rows of A, where velocities of J and M have failed."""
-        problem, name = self.problem, "newton over rows"
-        over_velocities = self.states and problem.generalized is not None and name not in self.states
-        if over_velocities and problem.m <= ROWS and not problem.cones.has_round and not self.is_late:
-            if self._forms_late():
-                return
-            with suppress(*BREAKDOWN):
-                self.states[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
-
     @cached_property
     def newton(self) -> float:
         """Newton's method, inf where there is none."""
@@ -188,13 +178,16 @@ class Tree:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Bodies under Coulomb's law that do not roll, nearly each contact between another pair: sweeps then decide
-        what sticks.
+        """Blocks under Coulomb's law that do not roll, nearly each between another pair of bodies, or of few entries of
+        A: sweeps then decide what sticks.
         """
-        rows = self.problem.rows
-        if rows is None or not rows.n_bodies or self.law != "coulomb" or self.problem.cones.has_more_parts:
+        p = self.problem
+        if self.law != "coulomb" or p.cones.has_more_parts or p.generalized is not None:
             return False
-        return 4 * graph.body_pairs(rows.block_bodies, rows.n_bodies, True) > 3 * self.problem.n_blocks
+        if p.rows is None:
+            return len(p._compressed[1]) < SPARSE * p.m**2
+        pairs = graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) if p.rows.n_bodies else 0
+        return 4 * pairs > 3 * p.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
         """The lines."""
@@ -213,17 +206,18 @@ class Tree:
         yield from self.sweeps_first(self.least)
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
-        # What follows where these fail has its line here.
-        self.add_rows()
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
         self.left = (LAST - MOST) * unit - self.begun
         for k in range(TURNS):
+            before = self.best
             for stage in self.in_turn(2.0**k):
                 if self.left < 1.0:  # ns
                     return
                 share = min(1.0, self.left / stage.cost)
                 self.left -= share * stage.cost
                 yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
+            if self.best > GAIN * before:
+                return
 
     def factorisations(self, times: float) -> Iterator[Stage]:
         """Newton's method for so many times its counted cost."""
@@ -243,16 +237,15 @@ class Tree:
             why = f"{words(cost)} of what newton costs"
             yield self.sweeps(cost, why, inf if short else newton)
             if self.law == "coulomb":
-                yield self.gradients(cost, why)
+                yield self.iterations("nncg from the cone law" if self.is_loose else "nncg", cost, why)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""
         return Stage("anderson", cost / self.sweep, cost, why, most / self.sweep)
 
-    def gradients(self, cost: float, why: str) -> Stage:
-        """Two sweeps of each iteration, forwards and backwards."""
-        name = "nncg from the cone law" if self.is_loose else "nncg"
-        return Stage(name, 0.5 * cost / self.sweep, cost, why)
+    def iterations(self, name: str, cost: float, why: str) -> Stage:
+        """Of two sweeps, or of `admm`, which cost as much as four."""
+        return Stage(name, (0.25 if name == "admm" else 0.5) * cost / self.sweep, cost, why)
 
     def in_turn(self, times: float) -> Iterator[Stage]:
         """All, with so many times the work of Newton's method before."""
@@ -262,7 +255,7 @@ class Tree:
             yield self.sweeps(cost, why)
         yield from self.factorisations(times * MOST)
         if self.law in ("coulomb", "cone"):
-            yield self.gradients(cost, why)
+            yield self.iterations("admm" if self.problem.generalized is None else "nncg", cost, why)
 
 
 def words(ns: float) -> str:
@@ -345,9 +338,8 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         sweeps.begin(log)
         sweeps.finish()
         return
-    idle = 0  # lines in a row that had nothing to do
     lines = iter(tree)
-    while not log.done() and idle <= len(METHODS):  # before the next line counts what it needs
+    while not log.done():  # before the next line counts what it needs
         stage = next(lines, None)
         if stage is None:
             break
@@ -363,12 +355,12 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
                 step.over = not tree.has_time(METHODS[stage.solver][0], cost)
             elif isinstance(step, Iterations):
                 step.over = step.state is None and not sets_up_in_time(stage.solver, log)
-        idle = idle + 1 if step.over else 0
         if step.over:
             tree.left += stage.cost
         else:
             step.least, step.cost = stage.least, stage.cost
             step.run(stage.iterations)
+            tree.best = log.best
             if isinstance(step, Sweeps) and step.nearly_there and not log.done():
                 step.finish()
                 return

@@ -19,11 +19,9 @@ from lavender.solvers.small import NO_TIME, NOTHING, told
 from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
 
-__all__ = ["SolveLog"]
+__all__ = ["GAIN", "SolveLog"]
 
-# `auto` gives up after STILL turns in a row that reduced the residual by less than the factor GAIN.
-STILL = 32
-GAIN = 0.99
+GAIN = 0.99  # of the residual, of which turns in vain leave more
 
 
 class SolveLog:
@@ -118,11 +116,6 @@ class SolveLog:
         return self.deadline.passed(1e-9 * cost)
 
     @property
-    def still(self) -> bool:
-        """The last turns hardly reduced the residual."""
-        return len(self.turns) > STILL and self.best > GAIN * self.turns[-STILL].before
-
-    @property
     def vain(self) -> bool:
         """The last turn gained next to nothing."""
         return bool(self.turns) and self.best > GAIN * self.turns[-1].before
@@ -130,8 +123,7 @@ class SolveLog:
     def done(self) -> bool:
         """Solved, proved infeasible, or out of time, iterations or progress."""
         return (
-            self.still
-            or self.best <= self.tol
+            self.best <= self.tol
             or self.certificate is not None
             or self.left <= 0
             or self.late

@@ -32,6 +32,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "nncg": ("nncg", NNCG),
     # On a loose pile: the convex relaxation has one answer, and where contacts stick it is Coulomb's.
     "nncg from the cone law": ("nncg", NNCG | {"convex": int(SWEEPS)}),
+    "admm": ("admm", {}),
 }
 FIRST = 32  # sweeps before the first prediction of their remaining number
 MOST = 2**30  # iterations of one call
@@ -131,6 +132,7 @@ class Iterations(Step):
     def begin(self) -> None:
         """From where the log is."""
         self.state, self.impulse = self.solver.prepare(self.log.problem), self.log.impulse.copy()
+        self.solver.until(self.state, self.log.deadline)
 
     def some(self, done: int, n: int) -> Claim:
         """As many as end soon, of n of which so many are done."""
