@@ -9,6 +9,7 @@ Rows that stand together and reach the same columns share a panel: one list of c
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
+from libc.string cimport memcmp
 
 from lavender_ext.core.tree cimport ldl_solve, take_from
 
@@ -115,11 +116,11 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
                                int32_t* n_cols, double* n_values) noexcept nogil:
     """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
-    cdef int32_t i, q, k, c, first, last, count = 0, at = 0, n = 0, top, nv = g.n, end
+    cdef int32_t i, q, k, c, first, last, count = 0, before = -1, at = 0, n = 0, top = -1, nv = g.n, end, entries
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
     cdef const int32_t* parent = g.parent
-    cdef uint64_t on, held = 0
+    cdef uint64_t on = 0, held = 0
     cdef double values = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -131,14 +132,17 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
     for i in range(n_blocks):
         first = ptr[i]
         last = ptr[i + 1]
-        on = 0
-        top = -1
         end = jptr[last]
-        for q in range(jptr[first], end):
-            k = jidx[q]
-            on |= above[k]
-            if k > top:
-                top = k
+        entries = end - jptr[first]
+        if entries != before or memcmp(jidx + jptr[first], jidx + jptr[first] - before, entries * sizeof(int32_t)) != 0:
+            on = 0
+            top = -1
+            for q in range(jptr[first], end):
+                k = jidx[q]
+                on |= above[k]
+                if k > top:
+                    top = k
+        before = entries
         if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                              # the panel grows
         else:

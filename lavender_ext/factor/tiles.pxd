@@ -1,9 +1,11 @@
 """C <- C - A B^T on dense columns, tile by tile: the loop in which a supernodal factor spends its time.
 
 Lanes run over rows of C, the sum over columns of A and B in their order, each product rounded before it is subtracted:
-every width gives the same bits. `wide` asks for four lanes in one instruction (AVX2), which the caller has found.
-With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, plain loops.
+every width gives the same bits. `combine` adds rows of a matrix in the same way. `wide` asks for four lanes in one
+instruction (AVX2), which the caller has found. With LAVENDER_ONE_LANE, and for other compilers than gcc and clang, plain loops.
 """
+from libc.stdint cimport int32_t
+
 
 cdef extern from *:
     """
@@ -31,6 +33,22 @@ cdef extern from *:
     }
     LAVENDER_TILE(lavender_tile_4, lavender_quad)
     LAVENDER_TILE(lavender_tile_2, lavender_two)
+    /* 4 n values of the sum, in registers */
+    #define LAVENDER_SUM(NAME, T)                                                                                 \
+    LAVENDER_INLINE void NAME(const int n, int count, const double* rows, const int* at, const double* x,         \
+                              double* out) {                                                                      \
+        enum { LANES = sizeof(T) / sizeof(double), PARTS = 4 / LANES };                                           \
+        T sum[PARTS * 6];                                                                                         \
+        for (int i = 0; i < n * PARTS; i++) sum[i] = (T){0.0};                                                    \
+        for (int t = 0; t < count; t++) {                                                                         \
+            const double* a = rows + at[t];                                                                       \
+            const double f = x[t];                                                                                \
+            for (int i = 0; i < n * PARTS; i++) sum[i] += *(const T*)(a + LANES * i) * f;                         \
+        }                                                                                                         \
+        for (int i = 0; i < n * PARTS; i++) *(T*)(out + LANES * i) = sum[i];                                      \
+    }
+    LAVENDER_SUM(lavender_sum_4, lavender_quad)
+    LAVENDER_SUM(lavender_sum_2, lavender_two)
     #else
     #define LAVENDER_OWN
     #define LAVENDER_INLINE static
@@ -43,6 +61,13 @@ cdef extern from *:
     }
     LAVENDER_TILE(lavender_tile_4, 4)
     LAVENDER_TILE(lavender_tile_2, 2)
+    #define lavender_sum_4 lavender_sum_2
+    LAVENDER_INLINE void lavender_sum_2(const int n, int count, const double* rows, const int* at, const double* x,
+                                        double* out) {
+        for (int i = 0; i < 4 * n; i++) out[i] = 0.0;
+        for (int t = 0; t < count; t++)
+            for (int i = 0; i < 4 * n; i++) out[i] += rows[at[t] + i] * x[t];
+    }
     #endif
     LAVENDER_INLINE void lavender_rest(const int columns, int m, int k, const double* a, long long lda,
                                        const double* b, long long ldb, double* c, long long ldc) {
@@ -63,6 +88,14 @@ cdef extern from *:
         int i, j = 0;                                                                                             \
         for (; j + 3 <= n; j += 3) { LAVENDER_STRIP(TILE, LANES, 3) }                                             \
         for (; j < n; j++) { LAVENDER_STRIP(TILE, LANES, 1) }
+    #define LAVENDER_COMBINE(SUM)                                                                                  \
+        for (; n >= 24; n -= 24, rows += 24, out += 24) SUM(6, count, rows, at, x, out);                          \
+        for (; n >= 12; n -= 12, rows += 12, out += 12) SUM(3, count, rows, at, x, out);                          \
+        for (; n >= 4; n -= 4, rows += 4, out += 4) SUM(1, count, rows, at, x, out);
+    static void lavender_combine_narrow(int n, int count, const double* rows, const int* at, const double* x,
+                                        double* out) {
+        LAVENDER_COMBINE(lavender_sum_2)
+    }
     static void lavender_less_narrow(int m, int n, int k, const double* a, long long lda, const double* b,
                                      long long ldb, double* c, long long ldc) {
         LAVENDER_LESS(lavender_tile_2, 2)
@@ -73,15 +106,25 @@ cdef extern from *:
                                                                    long long ldc) {
         LAVENDER_LESS(lavender_tile_4, 4)
     }
+    __attribute__((target("avx2"))) static void lavender_combine_wide(int n, int count, const double* rows,
+                                                                      const int* at, const double* x, double* out) {
+        LAVENDER_COMBINE(lavender_sum_4)
+    }
     #define LAVENDER_HAS_WIDE() (__builtin_cpu_supports("avx2") ? 1 : 0)
     #else
     #define lavender_less_wide lavender_less_narrow
+    #define lavender_combine_wide lavender_combine_narrow
     #define LAVENDER_HAS_WIDE() 0
     #endif
     static inline void lavender_less(int wide, int m, int n, int k, const double* a, long long lda, const double* b,
                                      long long ldb, double* c, long long ldc) {
         if (wide) lavender_less_wide(m, n, k, a, lda, b, ldb, c, ldc);
         else lavender_less_narrow(m, n, k, a, lda, b, ldb, c, ldc);
+    }
+    static inline void lavender_combine(int wide, int n, int count, const double* rows, const int* at, const double* x,
+                                        double* out) {
+        if (wide) lavender_combine_wide(n, count, rows, at, x, out);
+        else lavender_combine_narrow(n, count, rows, at, x, out);
     }
     /* y <- y - x a (n) */
     static inline void lavender_take(int n, double x, const double* a, double* y) {
@@ -106,6 +149,9 @@ cdef extern from *:
     # C (m, n) <- C - A B^T with A (m, k), B (n, k); columns are lda, ldb, ldc apart
     void less "lavender_less"(int wide, int m, int n, int k, const double* a, long long lda, const double* b,
                               long long ldb, double* c, long long ldc) noexcept nogil
+    # out (n) = sum of x_i times the row that begins at at_i; n a multiple of 4
+    void combine "lavender_combine"(int wide, int n, int count, const double* rows, const int32_t* at, const double* x,
+                                    double* out) noexcept nogil
     void take "lavender_take"(int n, double x, const double* a, double* y) noexcept nogil
     int has_wide "LAVENDER_HAS_WIDE"() noexcept nogil
     void add "lavender_add"(int n, const double* a, double* y) noexcept nogil

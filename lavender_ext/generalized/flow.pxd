@@ -18,6 +18,7 @@ from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
 from lavender_ext.core.generalized cimport generalized_t, panel_push, panel_times
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
+from lavender_ext.factor.tiles cimport combine
 from lavender_ext.judge.score cimport nothing, tally_block, tally_row, tally_t
 
 
@@ -95,7 +96,8 @@ cdef struct flow_t:
     double* local_rhs           # (s)
     int32_t* swap               # (s)
     int32_t n_answering         # rows of S
-    int32_t rows                # of an island that is few, and one more where their number is odd
+    int32_t rows                # of an island that is few, and up to three more, which are 0
+    int32_t wide                # as `core/method.pxd` has it
     int32_t* listed             # (m) those rows
     int32_t n_own               # velocities of the island, or rows where it is few,
     const int32_t* own          # and which they are
@@ -239,39 +241,6 @@ cdef inline void lay_across(const flow_t* f, int32_t island) noexcept nogil:
                 row += 1
 
 
-cdef inline void combine(const double* rows, int32_t n, const int32_t* at, const double* x, int32_t count,
-                         double* out) noexcept nogil:
-    """out (n) = sum of x_i times the row that begins at at_i."""
-    cdef int32_t i = count & 3, k
-    cdef const double* a = rows + at[0]
-    cdef const double* b
-    cdef const double* c
-    cdef const double* d
-    cdef double p = x[0], q, r, s
-    if count == 0:
-        for k in range(n):
-            out[k] = 0.0
-    elif i == 1:
-        for k in range(n):
-            out[k] = p * a[k]
-    elif i > 1:
-        b, c, q, r = rows + at[1], rows + at[i - 1], x[1], x[2] if i == 3 else 0.0
-        for k in range(n):
-            out[k] = (p * a[k] + q * b[k]) + r * c[k]
-    else:
-        i = 4
-        b, c, d = rows + at[1], rows + at[2], rows + at[3]
-        q, r, s = x[1], x[2], x[3]
-        for k in range(n):
-            out[k] = (p * a[k] + q * b[k]) + (r * c[k] + s * d[k])
-    while i < count:
-        a, b, c, d = rows + at[i], rows + at[i + 1], rows + at[i + 2], rows + at[i + 3]
-        p, q, r, s = x[i], x[i + 1], x[i + 2], x[i + 3]
-        for k in range(n):
-            out[k] += (p * a[k] + q * b[k]) + (r * c[k] + s * d[k])
-        i += 4
-
-
 cdef inline void find_column(const flow_t* f, int32_t place) noexcept nogil:
     """Of A, of the row at this place of the island."""
     cdef int32_t b, nc
@@ -280,7 +249,7 @@ cdef inline void find_column(const flow_t* f, int32_t place) noexcept nogil:
     b = -1 - f.home[place]
     if b >= 0:
         nc = f.g.pcol[b + 1] - f.g.pcol[b]
-        combine(f.across, f.rows, f.reached + f.g.pcol[b], f.g.y + f.g.pval[b] + (f.own[place] - f.g.prow[b]) * nc, nc,
+        combine(f.wide, f.rows, nc, f.across, f.reached + f.g.pcol[b], f.g.y + f.g.pval[b] + (f.own[place] - f.g.prow[b]) * nc,
                 f.a + place * f.rows)
         f.home[place] = b
 
@@ -295,7 +264,7 @@ cdef inline bint times_a(const flow_t* f, const double* x, double* out) noexcept
             f.picks[count] = a * f.rows
             given[count] = x[f.own[a]]
             count += 1
-    combine(f.a, f.rows, f.picks, given, count, f.sum)
+    combine(f.wide, f.rows, count, f.a, f.picks, given, f.sum)
     for a in range(f.n_own):
         out[f.own[a]] = f.sum[a]
     return count > 0

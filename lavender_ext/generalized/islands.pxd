@@ -143,7 +143,7 @@ cdef enum:
 
 cdef struct need_t:             # what the islands of a problem ask for
     int32_t most[4]             # as `find_islands` tells
-    int32_t rows                # of the island that has most of those that are few, and one more
+    int32_t rows                # of the island that has most of those that are few, and three more
     int32_t crowded             # L has more than `per` entries in a row: settle again, with more
     double values               # of N, of the island that has most; its factor has as many
     double formed               # of A and Y^T, of the island that has most
@@ -170,7 +170,7 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
         need.work += added
         return False
     need.work += formed
-    rows += 1.0
+    rows += 3.0
     if 0.5 * rows * rows > need.values:
         need.values = 0.5 * rows * rows
     if rows * (rows + size) > need.formed:

@@ -44,6 +44,7 @@ cdef inline int32_t general_start(const view_t* v, const options_t* o, room_t* r
     if not grant(r, r.n_index, numbers_of(&s.f, need)):
         return ROOM
     furnish(&s.f, need, r.real)
+    s.f.wide = o.wide
     aim_at(&s.f, o.tol, 0, o.e0, o.v0)
     s.done = 0
     return MORE

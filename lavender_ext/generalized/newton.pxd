@@ -469,7 +469,7 @@ cdef inline void enter(flow_t* f, int32_t island) noexcept nogil:
         for k in range(row_from(f, a), row_end(f, a)):
             f.listed[f.n_own] = k
             f.n_own += 1
-    k, f.rows = f.rows, f.n_own + (f.n_own & 1)
+    k, f.rows = f.rows, f.n_own + 3 & ~3
     f.a = f.across + k * f.rows
     f.home[0] = NOWHERE
 

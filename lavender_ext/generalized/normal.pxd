@@ -13,7 +13,8 @@ from lavender_ext.core.generalized cimport dot
 from lavender_ext.core.tree cimport ldl_solve
 from lavender_ext.core.parts cimport is_rows
 from lavender_ext.factor.dense_lu cimport lu_factor, lu_solve
-from lavender_ext.generalized.flow cimport block_end, block_from, combine, find_column, flow_t, spread
+from lavender_ext.factor.tiles cimport combine
+from lavender_ext.generalized.flow cimport block_end, block_from, find_column, flow_t, spread
 from lavender_ext.generalized.sparse cimport sparse_factor, take_row, take_two
 
 
@@ -246,7 +247,7 @@ cdef inline void step_by_rows(const flow_t* f) noexcept nogil:
     for a in range(f.n_answering):
         z[a] = f.grad[f.own[f.places[a]]]
     solve_rows(f, z)
-    combine(f.a, f.rows, f.columns, z, f.n_answering, f.sum)
+    combine(f.wide, f.rows, f.n_answering, f.a, f.columns, z, f.sum)
     for a in range(f.n_own):
         k = f.own[a]
         f.step[k] = f.lam[k] - f.y[k]

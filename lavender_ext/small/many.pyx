@@ -20,6 +20,7 @@ from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
+from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
@@ -136,7 +137,7 @@ cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
 
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef view_t v
-    cdef options_t o = options_t(NEWTON, MOST, 0, 0, 0, tol, 0.0, 0.0, limits.values)
+    cdef options_t o = options_t(NEWTON, MOST, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
     cdef room_t r
     cdef int32_t m = j.p.n_rows, code = ROOM
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
