@@ -8,11 +8,9 @@ level.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from time import process_time
 from typing import Any
 
@@ -27,7 +25,7 @@ from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
 from lavender.solvers.steps import METHODS
 
-__all__ = ["LEVELS", "SOLVERS", "Record", "as_line", "read", "records"]
+__all__ = ["LEVELS", "SOLVERS", "Record", "records"]
 
 LEVELS = (1e-3, 1e-6, 1e-9)
 GROWTH = 0.25  # of the iterations so far, between two points of a curve
@@ -42,13 +40,9 @@ class Record:
     """One solver on one problem."""
 
     case: str
-    rows: int
-    law: str
-    operator: str
     solver: str  # of SOLVERS
     setup: float  # s
     points: Points
-    told: str  # its last message
 
     def to(self, level: float) -> tuple[float, float]:
         """(s, iterations) to that level; inf where it was not reached."""
@@ -57,23 +51,11 @@ class Record:
         )
 
 
-def read(paths: Iterable[Path]) -> Iterator[Record]:
-    """What `as_line` made, line by line."""
-    for path in paths:
-        for line in path.read_text(encoding="utf-8").splitlines():
-            yield Record(**json.loads(line))
-
-
-def as_line(record: Record) -> str:
-    """As JSON."""
-    return json.dumps(asdict(record)) + "\n"
-
-
 def takes(problem: Problem, name: str) -> bool:
     """Whether the solver is one for this problem, and not another's twin on it."""
     if name == "newton over rows" and (problem.generalized is None or problem.cones.has_round):
         return False
-    return registry.get(SOLVERS[name][0]).refuses(problem) is None
+    return problem.m > 0 and registry.get(SOLVERS[name][0]).refuses(problem) is None
 
 
 def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> Iterator[Record]:
@@ -83,20 +65,15 @@ def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> It
     try:
         for case, problem in cases:
             least = math.inf
-            for name in SOLVERS:
-                if not problem.m or not takes(problem, name):
-                    continue
+            for name in filter(lambda name: takes(problem, name), SOLVERS):
                 run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
                 limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else 3.0 * time_limit
                 found = [run(problem, name, limit)]
                 if found[0][1] and found[0][1][-1][1] < SHORT:
                     found += [run(problem, name, limit) for _ in range(2)]
-                runs = zip(*(points for _, points, _ in found), strict=False)
+                runs = zip(*(points for _, points in found), strict=False)
                 points = [(some[0][0], min(t for _, t, _ in some), some[0][2]) for some in runs]
-                setup = min(setup for setup, _, _ in found)
-                made = Record(
-                    case, problem.m, problem.law, problem.operator, name, setup, points, found[0][2]
-                )
+                made = Record(case, name, min(setup for setup, _ in found), points)
                 least = min(least, made.to(LEVELS[1])[0])
                 yield made
     finally:
@@ -104,7 +81,7 @@ def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> It
 
 
 @np.errstate(all="ignore")
-def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points, str]:
+def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points]:
     """One curve; what judges its points takes no time of it."""
     fresh = replace(problem.disk, copy=False)
     reference(fresh)
@@ -123,12 +100,12 @@ def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points, s
             points.append((done + claim.iterations, spent, best))
             ended = claim.status is not Status.MAX_ITERATIONS or claim.iterations < 1
             if ended or best <= LEVELS[-1] or spent > limit:
-                return setup, points, claim.status.name
+                return setup, points
 
 
-def repeated(problem: Problem, name: str, limit: float) -> tuple[float, Points, str]:
+def repeated(problem: Problem, name: str, limit: float) -> tuple[float, Points]:
     """One run from the beginning for each level."""
-    points, setup, told, most = Points(), 0.0, "", 0.0
+    points, setup, most = Points(), 0.0, 0.0
     for level in LEVELS:
         fresh = replace(problem.disk, copy=False)
         reference(fresh)
@@ -140,7 +117,6 @@ def repeated(problem: Problem, name: str, limit: float) -> tuple[float, Points, 
             most = max(most, process_time() - begun)
         proven = found.status in (Status.FLOOR, Status.INFEASIBLE) and not found.contradicted
         points.append((found.iterations, most, min(found.residual.relative, level if proven else math.inf)))
-        told = found.message or found.status.name
         if points[-1][2] > level or most > limit:
             break
-    return setup, points, told
+    return setup, points

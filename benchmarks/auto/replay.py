@@ -59,7 +59,6 @@ RULES: dict[str, Rule] = {
     "without rows of A over J and M": without("newton over rows"),
     "without the prediction of sweeps": lambda tree: (replace(s, least=math.inf) for s in tree),
     "without `nncg`": without("nncg"),
-    "without `admm` at the end": without("admm"),
 }
 
 
@@ -111,32 +110,30 @@ def regrets(cases: Iterable[tuple[Problem, Curves]], rule: Rule | None) -> list[
         for level in LEVELS:
             best = min(curve.to(level)[0] for curve in curves.values())
             nothing = rule is not None and problem.metric.start_relative <= level  # to choose, either
-            if math.isfinite(best) and not nothing:
-                t = (
-                    curves["auto"].to(level)[0]
-                    if rule is None
-                    else replayed(Tree(problem), curves, level, rule)
-                )
-                extra = SHIFT + (0.0 if rule is None else CALL)
-                found.append(((t + SHIFT) / (best + extra), next(iter(curves.values())).case, level))
+            if not math.isfinite(best) or nothing:
+                continue
+            if rule is None:
+                t, more = curves["auto"].to(level)[0], SHIFT
+            else:
+                t, more = replayed(Tree(problem), curves, level, rule), SHIFT + CALL
+            found.append(((t + SHIFT) / (best + more), next(iter(curves.values())).case, level))
     return found
 
 
 def summary(found: list[tuple[float, str, float]]) -> str:
-    """How many, geometric mean (with what is lost), 95 %, worst, unsolved."""
-    every = np.array([regret for regret, _, _ in found])
-    some = every[np.isfinite(every)]
-    if not len(some):
-        return f"{len(found)}: none solved"
-    mean, lost = (np.exp(np.log(x).mean()) for x in (some, np.minimum(every, LOST)))
-    high = f"95 % {np.quantile(some, 0.95):.2f}  worst {some.max():.1f}  unsolved {len(every) - len(some)}"
-    return f"{len(every):4d}  mean {mean:.2f} ({lost:.2f} with the unsolved as {LOST:.0f})  {high}"
+    """How many, geometric mean, 95 %, worst, unsolved."""
+    if not found:
+        return "none"
+    every = np.minimum([regret for regret, _, _ in found], LOST)
+    mean, lost = np.exp(np.log(every).mean()), sum(regret == math.inf for regret, _, _ in found)
+    high = f"95 % {np.quantile(every, 0.95):.2f}  worst {every.max():.1f}"
+    return f"{len(every):4d}  mean {mean:.2f}  {high}  unsolved {lost}, counted as {LOST:.0f}"
 
 
 def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
-    """The twelve rates: medians of counts; of times least squares in the logarithm, to 1e-6."""
-    forms, kinds = ("bodies", "dense", "panels", "velocities"), ("rows", "cone", "coulomb")
-    newton, sweeps, counts = list[Any](), list[Any](), {kind: list[float]() for kind in kinds}
+    """The twelve rates: medians of counts; of times least squares in the logarithm, of Newton's method to 1e-6."""
+    kinds, rows, newton = ("rows", "cone", "coulomb"), list[Any](), list[Any]()
+    counts = {kind: list[float]() for kind in kinds}
     for problem, curves in cases:
         kind = problem.law if problem.law in kinds else "rows"
         points = curves["anderson"].points if "anderson" in curves else []
@@ -144,46 +141,29 @@ def fit(cases: Iterable[tuple[Problem, Curves]]) -> dict[str, Any]:
             (n, t, _), (last, end, _) = points[len(points) // 2], points[-1]
             cone, work = problem.law == "cone", costs.sweep_work(problem)
             if end - t > LINE * len(points):  # else it is Python's share
-                sweeps.append((problem.m, work * (not cone), work * cone, 1e9 * (end - t) / max(1, last - n)))
+                each = 1e9 * (end - t) / max(1, last - n)
+                rows.append((0, 0, work * (not cone), 0, 0, 0, 0, problem.m, work * cone, 0, each))
         for name, state in Tree(problem).states.items():
             time, n = curves[name].to(1e-6) if name in curves else (math.inf, math.inf)
             compiled, linear = state.general is not None, problem.law == "linear"
             if name in curves and n > 0.0 and not compiled and not linear and not who(problem):
                 counts[kind].append(n)  # inf: never; without these the median would be of the easy ones
             if math.isfinite(time) and problem.m > 20:
-                newton.append((state.count, 1e9 * time, 1.0 if linear else kind if compiled else max(n, 1.0)))
-    x = np.array(sweeps, float)
-    row, entry, cone_entry = positive(lambda q: x[:, :3] @ q, x[:, 3], [12.0, 0.5, 1.7])
+                newton.append((state.count, 1.0 if linear else kind if compiled else max(n, 1.0), 1e9 * time))
     # What no record is of keeps its count.
     count: dict[Any, float] = {
         kind: float(np.median(found or costs.RATES["count"][kind])) for kind, found in counts.items()
     }
-
-    def model(q: Any) -> Any:
-        start, each, work = q[0], q[1], dict(zip(forms, q[2:], strict=True))
-        steps = (
-            (c.steps * count[n] if n in count else n)
-            * (each * c.rows + entry * c.entries + work[c.form] * c.work)
-            for c, _, n in newton
-        )
-        return np.array(
-            [start * (c.rows > 0) + c.set_up + s for (c, _, _), s in zip(newton, steps, strict=True)]
-        )
-
-    start, each, *work = positive(
-        model, np.array([t for _, t, _ in newton]), [8e4, 300.0, 0.2, 0.03, 0.5, 0.2]
+    works: dict[str, float] = costs.RATES["work"]
+    for c, n, time in newton:
+        k = c.steps * count.get(n, n)
+        work = (k * c.work * (c.form == form) for form in works)
+        rows.append((c.rows > 0, k * c.rows, k * c.entries, *work, 0, 0, c.set_up, time))
+    x, r = np.array(rows, float), costs.RATES
+    first = [r["start"], r["row"], r["entry"], *works.values(), r["sweep row"], r["sweep cone"]]
+    found = optimize.least_squares(
+        lambda q: np.log((x[:, :9] @ np.exp(q) + x[:, 9]) / x[:, 10]), np.log(first), loss="soft_l1"
     )
-    rates = {
-        "start": start,
-        "row": each,
-        "entry": entry,
-        "work": dict(zip(forms, work, strict=True)),
-        "count": count,
-    }
-    return rates | {"sweep row": row, "sweep cone": cone_entry}
-
-
-def positive(model: Callable[[Any], Any], time: Any, start: list[float]) -> list[float]:
-    """Rates above 0 by least squares of log(model / time), to three digits."""
-    found = optimize.least_squares(lambda q: np.log(model(np.exp(q)) / time), np.log(start), loss="soft_l1")
-    return [float(f"{rate:.3g}") for rate in np.exp(found.x)]
+    start, row, entry, *each, sweep, cone = (float(f"{rate:.3g}") for rate in np.exp(found.x))
+    rates = {"start": start, "row": row, "entry": entry, "work": dict(zip(works, each, strict=True))}
+    return rates | {"count": count, "sweep row": sweep, "sweep cone": cone}

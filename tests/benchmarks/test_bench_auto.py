@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from benchmarks.auto import command
-from benchmarks.auto.record import LEVELS, Record, as_line, read, records
+from benchmarks.auto.record import LEVELS, Record, records
 from benchmarks.auto.replay import CALL, LINE, LOST, RULES, SHIFT, fit, regrets, replayed, summary
 from lavender import suite
 from lavender.judge.residuals import reference
@@ -17,7 +17,7 @@ from lavender.solvers.costs import RATES
 
 
 def curve(solver, points, setup=0.0, case="a"):
-    return Record(case, 200, "lcp", "rows", solver, setup, points, "")
+    return Record(case, solver, setup, points)
 
 
 @pytest.fixture(scope="module")
@@ -32,20 +32,14 @@ def recorded(stack):
     return list(records([("stack(n=200)", stack)], 0.2))
 
 
-def test_records_are_of_every_solver_that_takes_the_problem_and_come_back_as_written(recorded, tmp_path):
+def test_records_are_of_every_solver_that_takes_the_problem(recorded):
     assert {"anderson", "newton", "direct", "auto"} <= {r.solver for r in recorded}
     assert "newton over rows" not in {r.solver for r in recorded}
-    path = tmp_path / "records.jsonl"
-    path.write_text("".join(map(as_line, recorded)))
-    back = list(read([path]))
-    assert [(r.solver, [tuple(p) for p in r.points]) for r in back] == [
-        (r.solver, r.points) for r in recorded
-    ]
     for r in recorded:
         assert (np.diff([t for _, t, _ in r.points]) >= 0.0).all()
         assert r.to(1e-3)[0] <= r.to(1e-9)[0]
     auto = next(r for r in recorded if r.solver == "auto")
-    assert auto.to(1e-6)[0] < math.inf and auto.told
+    assert auto.to(1e-6)[0] < math.inf
 
 
 def test_a_line_that_solves_ends_the_replay(stack):
@@ -75,7 +69,7 @@ def test_regret_is_over_the_best_with_the_shift(stack):
     first, second, third = regrets([(stack, curves)], None)
     assert first[0] == second[0] == pytest.approx((3e-3 + SHIFT) / (1e-3 + SHIFT))
     assert third[0] == math.inf
-    assert "unsolved 1" in summary([first, second, third]) and f"{LOST:.0f}" in summary([first])
+    assert "unsolved 1" in summary([first, second, third]) and f"{LOST:.0f}" in summary([third])
 
 
 def test_the_fit_writes_twelve_rates_that_count_what_is_recorded(stack, recorded):
