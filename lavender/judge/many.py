@@ -8,7 +8,7 @@ the way of a single one. `lavender/solving/many.py` solves by the same loop.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -137,18 +137,29 @@ class Many:
                 if i >= 0:
                     single(i)
 
-        others = min(threads, len(self)) - 1
-        if others < 1:
+        failed: list[BaseException] = []
+
+        def beside() -> None:
+            try:
+                work()
+            except BaseException as error:
+                failed.append(error)
+
+        # A pool of one takes twice as long to start: as several worlds to solve.
+        others = [Thread(target=beside) for _ in range(min(threads, len(self)) - 1)]
+        try:
+            for other in others:
+                other.start()
             work()
-        else:
-            with ThreadPoolExecutor(others) as pool:
-                try:
-                    tasks = [pool.submit(work) for _ in range(others)]
-                    work()
-                    for task in tasks:
-                        task.result()
-                finally:
-                    stop[0] = 1  # of Ctrl-C the other threads hear nothing
+            for other in others:
+                other.join()
+        finally:
+            stop[0] = 1  # of Ctrl-C the other threads hear nothing
+            for other in others:
+                if other.ident is not None:
+                    other.join()
+        if failed:
+            raise failed[0]
         stop[0] = 0
         for i in np.flatnonzero(self._worlds.code[:-1] == CODE["bad"]).tolist():
             single(i)  # which finds the words

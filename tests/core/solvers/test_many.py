@@ -358,3 +358,18 @@ def test_threads_take_worlds_as_they_come(monkeypatch):
 
     monkeypatch.setattr(many_module, "solve", first_waits)
     assert lv.solve_many(lv.Batch(jac, mass, free, cones=DISKS), "pgs", threads=2, max_iter=5).impulse.any()
+
+
+def test_what_goes_wrong_on_another_thread_is_raised():
+    both, seen = threading.Barrier(2, timeout=10.0), set()
+
+    def callback(*_):
+        here = threading.current_thread()
+        if here not in seen:
+            seen.add(here)
+            both.wait()  # each thread has a world
+        if here is not threading.main_thread():
+            raise ZeroDivisionError("planted")
+
+    with pytest.raises(ZeroDivisionError, match="planted"):
+        lv.solve_many(list(lv.Batch(*worlds(2), cones=DISKS)), "pgs", threads=2, callback=callback)
