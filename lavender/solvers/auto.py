@@ -103,31 +103,28 @@ class Tree:
         if get("newton").refuses(problem) is not None or self.is_late:
             return found
         for name in ("newton", "newton over rows"):
-            if name == "newton over rows" and (
-                self.is_late or not self._rows_may_pay(found.get("newton")) or self._forms_late()
-            ):
+            if name == "newton over rows" and not self._rows_may_pay(found.get("newton")):
                 continue
             try:
                 found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
             except BREAKDOWN:
                 continue
-        return dict(sorted(found.items(), key=self._order))
-
-    def _order(self, named: tuple[str, NewtonState]) -> tuple[bool, float]:
-        # The cheaper first; last what has failed.
-        return self.tried and named[1].general is not None, named[1].cost
+        # Last what has failed.
+        return dict(
+            sorted(found.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
+        )
 
     def _rows_may_pay(self, over: NewtonState | None) -> bool:
-        """Whether rows of an A that is formed of J and M are counted to cost less than what velocities still have."""
-        if over is None or over.general is None or self.problem.cones.has_round:
+        """Whether rows of an A that is formed of J and M are counted to cost less than what velocities still have, and
+        are there in time, with what of SciPy reads them.
+        """
+        problem, left = self.problem, MOST if self.tried else 1.0
+        if over is None or over.general is None or problem.cones.has_round or self.is_late:
             return False
-        left = MOST if self.tried else 1.0
-        return costs.newton_cost(costs.formed(self.problem), self.law) < left * over.cost
-
-    def _forms_late(self) -> bool:
-        """Rows of an A of J and M are not there in time, with what of SciPy reads them."""
-        return self.deadline.is_set and self.deadline.passed(
-            over_rows(self.problem) + 3.0 * forming(self.problem)
+        if costs.newton_cost(costs.formed(problem), self.law) >= left * over.cost:
+            return False
+        return not (
+            self.deadline.is_set and self.deadline.passed(over_rows(problem) + 3.0 * forming(problem))
         )
 
     @cached_property
@@ -196,13 +193,8 @@ class Tree:
                 yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
         if not self.is_short(self.least) and self.is_narrow:
-            n = ROUNDS * costs.factorisations(self.law)
-            yield Stage(
-                "direct",
-                n,
-                self.least,
-                f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations",
-            )
+            why = f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations"
+            yield Stage("direct", ROUNDS * costs.factorisations(self.law), self.least, why)
         yield from self.sweeps_first(self.least)
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
@@ -353,8 +345,8 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             if isinstance(step, Newton | Direct):
                 cost = step.state.cost if isinstance(step, Newton) else stage.cost
                 step.over = not tree.has_time(METHODS[stage.solver][0], cost)
-            elif isinstance(step, Iterations):
-                step.over = step.state is None and not sets_up_in_time(stage.solver, log)
+            elif step.state is None and isinstance(step, Iterations):
+                step.over = log.deadline.passed(SURE * setup_time(stage.solver, log.problem))
         if step.over:
             tree.left += stage.cost
         else:
@@ -366,11 +358,6 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
                 return
     if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
-
-
-def sets_up_in_time(name: str, log: SolveLog) -> bool:
-    """Whether what is set up takes a small part of the time that is left."""
-    return not log.deadline.passed(SURE * setup_time(name, log.problem))
 
 
 def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:

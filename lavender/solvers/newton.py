@@ -42,7 +42,6 @@ from lavender.solvers.newton_systems.systems import System, is_dense, make_syste
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import (
     analysed,
-    entries_of,
     formed_once,
     over_bodies,
     over_rows,
@@ -128,7 +127,7 @@ class Newton(Solver):
         bodies = problem.rows is not None and problem.rows.n_bodies > 0 and self.form != "impulse"
         if bodies:
             return over_bodies(problem)
-        few = not is_dense(entries_of(problem), problem.m, problem.law == "cone")
+        few = not is_dense(problem.most_entries, problem.m, problem.law == "cone")
         return over_rows(problem) + (analysed(problem) if few else 0.0)
 
     def prepare(self, problem: Problem) -> NewtonState:

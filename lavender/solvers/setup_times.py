@@ -18,7 +18,6 @@ __all__ = [
     "analysed",
     "compared",
     "dense_work",
-    "entries_of",
     "factored",
     "first_factor",
     "forming",
@@ -47,11 +46,6 @@ LOADING = 0.3  # s of a part of SciPy
 DENSE, SPARSE = 1.5e-10, 1e-9  # s for each multiply-add of a first factor
 
 
-def entries_of(problem: Problem) -> float:
-    """Entries of A, at most where it is not formed."""
-    return problem.most_entries
-
-
 def forming(problem: Problem) -> float:
     """A, where it is not known yet."""
     if problem.m == 0 or problem.matrix is not None or "_compressed" in problem.__dict__:
@@ -64,7 +58,7 @@ def formed_once(problem: Problem) -> float:
     if problem.rows is None:
         entries = PRODUCT * float(problem.metric.products_of_a)
     else:
-        entries = FORMED * entries_of(problem)
+        entries = FORMED * problem.most_entries
     return START + EACH * problem.m + entries
 
 
@@ -76,12 +70,12 @@ def loading(*modules: str) -> float:
 def compared(problem: Problem) -> float:
     """Whether A is symmetric, where it is not known yet."""
     known = problem.matrix is None or "_scan" in problem.__dict__
-    return 0.0 if known else residuals.READ * entries_of(problem)
+    return 0.0 if known else residuals.READ * problem.most_entries
 
 
 def over_rows(problem: Problem) -> float:
     """A, whether it is symmetric, and a matrix that a solver makes of it."""
-    entries = entries_of(problem)
+    entries = problem.most_entries
     loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
     full = entries == float(problem.m) ** 2
     laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
@@ -90,7 +84,7 @@ def over_rows(problem: Problem) -> float:
 
 def analysed(problem: Problem) -> float:
     """An order of elimination of A, and what it fills; rows of one block are one node."""
-    entries, m = entries_of(problem), float(problem.m)
+    entries, m = problem.most_entries, float(problem.m)
     if entries == m * m:
         return PANEL * entries
     is_known = problem.matrix is not None or "_compressed" in problem.__dict__
@@ -100,12 +94,12 @@ def analysed(problem: Problem) -> float:
 
 def summed(problem: Problem) -> float:
     """A, and sums of its rows by SciPy."""
-    return forming(problem) + SUMMED * entries_of(problem) + START + loading("scipy.sparse")
+    return forming(problem) + SUMMED * problem.most_entries + START + loading("scipy.sparse")
 
 
 def factored(problem: Problem) -> float:
     """The same with its first factor, of all rows."""
-    return over_rows(problem) + first_factor(problem.m, entries_of(problem))
+    return over_rows(problem) + first_factor(problem.m, problem.most_entries)
 
 
 def dense_work(m: int) -> float:
