@@ -21,16 +21,7 @@ from lavender.problem import Problem
 from lavender.solvers._accelerated import sweep_work
 from lavender.solvers.setup_times import dense_work, formed_once
 
-__all__ = [
-    "RATES",
-    "SWEEPS",
-    "Count",
-    "factorisations",
-    "formed",
-    "least",
-    "newton_cost",
-    "sweep_cost",
-]
+__all__ = ["RATES", "SWEEPS", "Count", "factorisations", "formed", "least", "newton_cost", "sweep_cost"]
 
 # By os.path: pathlib would be 4 % of `import lavender`.
 with open(os.path.join(os.path.dirname(__file__), "rates.json"), encoding="utf-8") as _file:
@@ -87,10 +78,5 @@ def formed(problem: Problem) -> Count:
     """What Newton's method over rows of an A that is formed of J and M costs at least."""
     m = float(problem.m)
     entries = min(float(problem.metric.entries_of_a), m * m)
-    return Count(
-        "dense",
-        0.0 if entries < 0.5 * m * m else dense_work(problem.m),
-        entries,
-        m,
-        1e9 * formed_once(problem),
-    )
+    work = 0.0 if entries < 0.5 * m * m else dense_work(problem.m)
+    return Count("dense", work, entries, m, 1e9 * formed_once(problem))
