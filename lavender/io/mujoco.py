@@ -57,6 +57,7 @@ from lavender.base.later import sparse as sp
 from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
+from lavender.problem.operators import USUAL
 from lavender_ext.core.generalized import lower_of_dense
 from lavender_ext.generalized import export
 
@@ -74,9 +75,6 @@ CHANGED = "MjData was changed since its forward pass, or is of another model: ru
 OF_M = ("Euler", "RK4", "implicit", "implicitfast")  # integrators whose constraint problem is of M
 LAYOUT = "(also where opt.jacobian, which says how efc_J is laid out, was changed)"
 OTHER_MODEL = "The model was changed, or MjData is of another one: give a model and data made from it"
-_SEEN: WeakKeyDictionary[Any, Any] = (
-    WeakKeyDictionary()
-)  # a model's operator, whose pattern is compared before use
 NO_TRIANGLE = (np.zeros(1, np.int32), np.zeros(0, np.int32))
 NO_CONTACT = SimpleNamespace(
     dim=np.zeros(0, np.int32), geom=np.zeros((0, 2), np.int32), friction=np.zeros((0, 5))
@@ -91,6 +89,23 @@ _CODES = (
     "mjCNSTR_CONTACT_PYRAMIDAL",
     "mjCNSTR_CONTACT_ELLIPTIC",
 )
+
+
+class _Model:
+    """What a model keeps while it lives: its counts, and where its arrays are; what they hold is read anew."""
+
+    def __init__(self, mj: Any, model: Any) -> None:
+        self.mj, self.n = mj, int(model.nv)
+        self.most = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
+        self.tree = model.body_parentid, model.dof_bodyid
+        has = hasattr(model, "M_rowadr") and hasattr(mj.MjData, "M")
+        self.mass = (
+            (model.M_rowadr, model.M_rownnz, model.M_colind) if has else None
+        )  # None: an earlier MuJoCo
+        self.like: Any = None  # its operator made first, whose pattern is compared before use
+
+
+_SEEN: WeakKeyDictionary[Any, _Model] = WeakKeyDictionary()
 
 
 def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
@@ -122,25 +137,24 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
         or a copy that lacks what the problem needs; after `mj_step`, joints of one body that move it alike. Never
         because MuJoCo's solver stopped early: the problem does not depend on its answer.
     """
-    mj = _mujoco(model, data)
-    opt = model.opt
-    m, n, dt = int(data.nefc), int(model.nv), _timestep(opt)
-    smooth, before = data.qacc_smooth, _SEEN.get(model)
-    mass = _mass(mj, model, data, smooth, NO_TRIANGLE if before is None else before.mass[:2])
-    cones, scale, key = _blocks(mj, model, data, dt)
-    jac = _rows(mj, model, data, m, n, scale)
+    seen, m, contacts, smooth = _mujoco(model, data)
+    opt, like = model.opt, seen.like
+    dt = _timestep(opt)
+    mass = _mass(seen, model, data, smooth, NO_TRIANGLE if like is None else like.mass[:2])
+    cones, scale, key = _blocks(seen, data, contacts, dt)
+    jac = _rows(seen, model, data, m, scale)
     rhs, softness, v_free, sound, gap, gaps = export.numbers(
-        *jac, scale, dt, _before(model, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
-        data.efc_vel, data.efc_b, data.qfrc_constraint, data.qacc,
+        *jac, scale, dt, _before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
+        data.efc_vel, data.efc_b, data.qfrc_constraint, data.qacc, USUAL,
     )  # fmt: skip
     _check_jacobian(*gaps)
     if not gap <= SAME:
         softness, sound = _compliance(data) * scale * scale, False
-    names = Names(cones.n_blocks, lambda: _words(mj, model, cones._blocks.ints[2 * m + 1 :], m))
-    general = Generalized.compressed(jac, mass, v_free, like=before)
-    if before is None or before.n != n:
-        _SEEN[model] = general.operator
-    made = Problem._of_engine if sound else Problem
+    names = Names(cones.n_blocks, lambda: _words(seen.mj, model, cones._blocks.ints[2 * m + 1 :], m))
+    general = Generalized.compressed(jac, mass, v_free, like=like)
+    if like is None:
+        seen.like = general.operator
+    made = Problem._of_engine if sound and not general.operator.is_beyond(USUAL) else Problem
     return made(
         b=rhs,
         cones=cones,
@@ -170,44 +184,45 @@ def scaling(model: Any, data: Any) -> FloatArray:
 
     1, and friction[j] / friction[0] on the tangents of an elliptic cone. Impulses are MuJoCo's over it.
     """
-    mj = _mujoco(model, data)
-    scale: FloatArray = _blocks(mj, model, data, _timestep(model.opt))[1]
+    seen, _, contacts, _ = _mujoco(model, data)
+    scale: FloatArray = _blocks(seen, data, contacts, _timestep(model.opt))[1]
     return scale
 
 
 def acceleration(model: Any, data: Any, impulse: Any) -> FloatArray:
     """MuJoCo's `qacc` (nv,) under impulses (m,) [N s] of the problem's rows: a0 + M^-1 J^T lambda / dt."""
-    mj = _mujoco(model, data)
-    lam = as_array("impulse", impulse, (int(data.nefc),), unit="N s")
+    seen, m, _, smooth = _mujoco(model, data)
+    lam = as_array("impulse", impulse, (m,), unit="N s")
     push = (jacobian(model, data).T @ (scaling(model, data) * lam))[None, :] / _timestep(model.opt)
     change = np.zeros_like(push)
-    mj.mj_solveM(model, data, change, np.ascontiguousarray(push))
-    return np.array(data.qacc_smooth, float) + change[0]
+    seen.mj.mj_solveM(model, data, change, np.ascontiguousarray(push))
+    return np.array(smooth, float) + change[0]
 
 
 def jacobian(model: Any, data: Any) -> sp.csr_array:
     """J (m, nv) of all constraints, from either way in which MuJoCo stores it."""
-    mj = _mujoco(model, data)
-    m, n = int(data.nefc), int(model.nv)
-    indptr, indices, values = _rows(mj, model, data, m, n, np.ones(m))
-    return sp.csr_array((values, indices, indptr), shape=(m, n))
+    seen, m, _, _ = _mujoco(model, data)
+    indptr, indices, values = _rows(seen, model, data, m, np.ones(m))
+    return sp.csr_array((values, indices, indptr), shape=(m, seen.n))
 
 
-def _mujoco(model: Any, data: Any) -> Any:
-    # The module, which whoever holds a model has.
+def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
+    """What is kept of the model, rows, contacts, and the unconstrained acceleration, of a model and data that fit."""
     try:
-        import mujoco as mj
-    except ImportError:
-        raise InputError(
-            "mujoco cannot be imported: pip install mujoco; a model and its data come from it"
-        ) from None
-    if not isinstance(model, mj.MjModel) or not isinstance(data, mj.MjData):
+        seen = _SEEN.get(model)
+    except TypeError:  # of no model: nothing that has weak references
+        seen = None
+    mj = _module() if seen is None else seen.mj
+    if (seen is None and not isinstance(model, mj.MjModel)) or not isinstance(data, mj.MjData):
         raise InputError(
             f"got a {type(model).__name__} and a {type(data).__name__}; a mujoco.MjModel and its mujoco.MjData "
             "are needed"
         )
-    if len(data.qacc_smooth) != model.nv:
-        raise InputError(f"the data has {len(data.qacc_smooth)} degrees of freedom, the model {model.nv}")
+    if seen is None:
+        seen = _SEEN[model] = _Model(mj, model)
+    smooth = data.qacc_smooth
+    if len(smooth) != seen.n:
+        raise InputError(f"the data has {len(smooth)} degrees of freedom, the model {seen.n}")
     m, contacts, entries = data.nefc, data.ncon, getattr(data, "nJ", 0)
     needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
     if min(m, contacts, entries) < 0 or needed > data.parena:  # where its arrays end, for whoever reads them
@@ -215,7 +230,18 @@ def _mujoco(model: Any, data: Any) -> Any:
             f"nefc = {m}, ncon = {contacts}, nJ = {entries}: what this MjData has allocated ({data.parena} bytes) does "
             f"not hold as many. {CHANGED}"
         )
-    return mj
+    return seen, m, contacts, smooth
+
+
+def _module() -> Any:
+    # The module, which whoever holds a model has.
+    try:
+        import mujoco
+    except ImportError:
+        raise InputError(
+            "mujoco cannot be imported: pip install mujoco; a model and its data come from it"
+        ) from None
+    return mujoco
 
 
 @cache
@@ -230,22 +256,19 @@ def _timestep(opt: Any) -> float:
     return dt
 
 
-def _mass(mj: Any, model: Any, data: Any, smooth: Any, like: Any) -> Any:
+def _mass(seen: _Model, model: Any, data: Any, smooth: Any, like: Any) -> Any:
     """(indptr, indices, data) of M's lower triangle, the first two those of `like` where they are the same.
 
     M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
     """
-    try:
-        parts = model.M_rowadr, model.M_rownnz, model.M_colind, data.M
-    except AttributeError:  # an earlier MuJoCo
-        parts = _whole_mass(mj, model, data)
+    parts = _whole_mass(seen.mj, model, data) if seen.mass is None else (*seen.mass, data.M)
     made = export.lower(*parts, smooth, data.qfrc_smooth, ROUNDING, like)
     if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
     mass, gap = made
     if not gap <= ROUNDING:
         number = int(model.opt.integrator)
-        found = [name for name, value in mj.mjtIntegrator.__members__.items() if int(value) == number]
+        found = [name for name, value in seen.mj.mjtIntegrator.__members__.items() if int(value) == number]
         word = found[0].removeprefix("mjINT_").lower() if found else str(number)
         why = f"integrator={word!r} puts damping into it; {', '.join(map(repr, OF_M))} have M itself"
         raise CapabilityError(
@@ -269,11 +292,11 @@ def _whole_mass(mj: Any, model: Any, data: Any) -> Any:
     return indptr[:-1], np.diff(indptr), indices, values
 
 
-def _rows(mj: Any, model: Any, data: Any, m: int, n: int, scale: FloatArray) -> Any:
+def _rows(seen: _Model, model: Any, data: Any, m: int, scale: FloatArray) -> Any:
     """(indptr, indices, data) of J, scaled by row."""
-    values = data.efc_J
+    values, n = data.efc_J, seen.n
     values = values if values.ndim == 1 else np.ravel(values)
-    if not mj.mj_isSparse(model):
+    if not seen.mj.mj_isSparse(model):
         if len(values) < m * n:
             raise InputError(
                 f"efc_J holds {len(values)} numbers; {m} x {n} are needed where opt.jacobian says dense. {CHANGED}"
@@ -313,15 +336,16 @@ def _compliance(data: Any) -> FloatArray:
     return np.where(empty, 1.0 / inverse, r)
 
 
-def _before(model: Any, data: Any) -> FloatArray:
+def _before(seen: _Model, data: Any) -> FloatArray:
     """Velocities (nv,) of the forward pass: qvel, or after a step what those of bodies, made before it, tell."""
-    parent, bodies, axis, spatial = model.body_parentid, model.dof_bodyid, data.cdof, data.cvel
-    gap, size = export.motion_gap(parent, bodies, axis, spatial, data.qvel)
+    parent, bodies = seen.tree
+    axis, spatial, v = data.cdof, data.cvel, data.qvel
+    gap, size = export.motion_gap(parent, bodies, axis, spatial, v)
     if gap < 0.0:
         raise InputError(f"dof_bodyid and body_parentid are no tree of these bodies. {OTHER_MODEL}")
     if gap <= SUMMED * size or (not np.any(spatial) and np.any(data.efc_vel)):  # not filled by a copy
-        return data.qvel
-    v: FloatArray | None = export.motion_before(parent, bodies, axis, spatial, ALIKE)
+        return v
+    v = export.motion_before(parent, bodies, axis, spatial, ALIKE)
     if v is None or not export.motion_gap(parent, bodies, axis, spatial, v)[0] <= SUMMED * size:
         raise CapabilityError(
             "the velocity before the step cannot be told from cvel and cdof: joints of one body move it alike, or "
@@ -348,17 +372,16 @@ def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> 
             )
 
 
-def _blocks(mj: Any, model: Any, data: Any, dt: float) -> tuple[Cones, FloatArray, Any]:
+def _blocks(seen: _Model, data: Any, contacts: int, dt: float) -> tuple[Cones, FloatArray, Any]:
     """Cones, factor of each row, key of each block."""
-    contact = data.contact if data.ncon else NO_CONTACT
-    contacts, tendons = len(contact.dim), model.ntendon
-    most = (model.neq, model.nv, tendons, model.njnt, tendons, contacts, contacts, contacts)
-    types, ids, dims = data.efc_type, data.efc_id, contact.dim
+    contact = data.contact if contacts else NO_CONTACT
+    most = (*seen.most, contacts, contacts, contacts)
+    types, ids, dims, codes = data.efc_type, data.efc_id, contact.dim, _codes(seen.mj)
     found = export.blocks(
-        types, ids, _codes(mj), most, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
+        types, ids, codes, most, dims, contact.friction, contact.geom, data.efc_frictionloss, dt
     )
     if isinstance(found, int):
-        of, which, known = int(types[found]), int(ids[found]), _codes(mj).tolist()
+        of, which, known = int(types[found]), int(ids[found]), codes.tolist()
         if of not in known:
             raise CapabilityError(f"constraint row {found} is of type {of}, which is not known here")
         there = most[known.index(of)]

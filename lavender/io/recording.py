@@ -107,7 +107,7 @@ def record(
         Not a model and its data, `steps` or `every` below 1, another control, precision or threshold, a folder
         that holds a recording.
     """
-    mj = adapter._mujoco(model, data)
+    mj = adapter._mujoco(model, data)[0].mj
     steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
     if precision not in PRECISIONS:
         raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")

@@ -32,11 +32,12 @@ class Operators(ProblemData):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._refuse_extremes()
+        if self.matrix is None and self._is_extreme():
+            self.metric  # noqa: B018 - refused here, and not in a solve
 
     @classmethod
     def _of_engine(cls, **given: Any) -> Any:
-        """From read-only arrays that `export.numbers` has let in, in generalised coordinates: adopted."""
+        """From read-only arrays that `export.numbers` has let in, over J and M; nothing is beyond USUAL: adopted."""
         made, derived = object.__new__(cls), Derived()
         given["derived"], given["precision"], given["copy"] = derived, "float64", True
         derived.view = general_data(
@@ -44,12 +45,7 @@ class Operators(ProblemData):
             FRICTION_NUMBER[given["friction"]],
         )  # fmt: skip
         object.__setattr__(made, "__dict__", given)
-        made._refuse_extremes()
         return made
-
-    def _refuse_extremes(self) -> None:
-        if self.matrix is None and self._is_extreme():
-            self.metric  # noqa: B018 - refused here, and not in a solve
 
     def _is_extreme(self) -> bool:
         """Whether A_ii may be beyond MOST: numbers of J and M^-1 so large that A_ii must be formed to know."""

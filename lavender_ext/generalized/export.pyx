@@ -428,8 +428,8 @@ def motion_before(const int32_t[::1] parent, const int32_t[::1] body, const doub
     return found
 
 
-def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_):
-    """(b, compliance, v*, whether the door takes them, max |efc_R efc_D - 1|, gaps) of J scaled by row.
+def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inverse_, force_, vel_, b_, push_, a_, double usual):
+    """(b, compliance, v*, whether the door takes them as usual numbers, max |efc_R efc_D - 1|, gaps) of J scaled by row.
 
         b = dt (aref - J a0),   v* = v + dt a0,   a0 = qacc_smooth
 
@@ -491,7 +491,7 @@ def numbers(jptr_, jidx_, jval_, scale_, double dt, v_, smooth_, aref_, r_, inve
         rhs[i] = dt * scale[i] * aref[i] - s_free
         compliance[i] = r[i] * scale[i] * scale[i]
         top_b = widest(top_b, rhs[i])
-        sound &= is_size(compliance[i])
+        sound &= is_size(compliance[i]) and compliance[i] <= usual
         gap_0 = widest(gap_0, r[i] * inverse[i] - 1.0)
         c = scale[i] * vel[i]
         gap_1 = widest(gap_1, s_v - c)

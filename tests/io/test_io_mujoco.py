@@ -1,6 +1,8 @@
 """MuJoCo's constraint problem read from memory: its own solution is the judge's solution too."""
 
 import copy
+import gc
+import weakref
 from time import thread_time_ns
 
 import numpy as np
@@ -415,6 +417,21 @@ def test_a_pattern_of_m_that_was_seen_before_is_compared_not_believed(name):
             lv.io.from_mujoco(model, data)
         whole[at] = kept
     assert lv.io.from_mujoco(model, data).generalized == first.generalized
+
+
+def test_of_a_model_only_what_cannot_change_is_kept_and_it_is_let_go():
+    model, data = state()
+    for name in ("body_parentid", "dof_bodyid"):
+        lv.io.from_mujoco(model, data)
+        whole = getattr(model, name)
+        kept, whole[-1] = int(whole[-1]), 1000
+        with pytest.raises(lv.InputError, match="dof_bodyid and body_parentid are no tree"):
+            lv.io.from_mujoco(model, data)
+        whole[-1] = kept
+    alive = weakref.ref(model)
+    del model, data, whole
+    gc.collect()
+    assert alive() is None
 
 
 @pytest.mark.parametrize("name", ["nefc", "ncon", "nJ"])
