@@ -2,7 +2,7 @@
 
 Environment:
 
-    LAVENDER_DEBUG=1        every index of every memoryview is checked, -O1 -g
+    LAVENDER_DEBUG=1        every index of every memoryview is checked, -Og -g1
     LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
     LAVENDER_FILES_URL=U    where the files of this version can be fetched: links and pictures of the long description
@@ -61,7 +61,7 @@ if sys.platform == "win32":
     COMPILE_ARGS = ["/Od", "/fp:precise"] if DEBUG else ["/O2", "/fp:precise"]
 else:
     # -w: .ci/check_kernels.py reads the C for warnings, which cost a twentieth of the time.
-    COMPILE_ARGS = ["-O1", "-g"] if DEBUG else ["-O3", "-g0", "-w"]
+    COMPILE_ARGS = ["-Og", "-g1"] if DEBUG else ["-O3", "-g0", "-w"]
     if not DEBUG:
         INLINE = ["-finline-limit=2000", "--param=inline-unit-growth=70"]
         LIMITS = ["-finline-limit=600", "--param=inline-unit-growth=40"]

@@ -159,8 +159,14 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
 
 
 def translate(path: Path, root: Path, work: Path) -> Path:
-    """Cython's C of a module."""
+    """Cython's C of a module; of one of the kernels that of the build in place, where it is newer than its sources."""
     c_file = work / f"{path.stem}.c"
+    if path.is_relative_to(ROOT / "lavender_ext"):
+        module = ".".join(path.relative_to(ROOT / "lavender_ext").with_suffix("").parts)
+        cut = runpy.run_path(str(ROOT / "lavender" / "sim" / "web" / "cut.py"))
+        [(_, text)] = cut["translate"](ROOT, [module], work, ROOT / "build" / "cython")
+        c_file.write_text(text, encoding="utf-8")
+        return c_file
     directives = [f"-X{name}={value}" for name, value in OPTIONS["directives"]().items()]
     # What Python's side needs stands in a module of its own, as in an ordinary build: half of what would be compiled.
     shared = "--shared=lavender_ext._utility"
