@@ -31,7 +31,10 @@ import sysconfig
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from threading import Lock
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 OPTIONS = runpy.run_path(str(ROOT / "lavender_ext" / "build_options.py"))
@@ -158,13 +161,23 @@ def run(*command: str | Path, cwd: Path = ROOT, **env: str) -> str:
     return done.stdout
 
 
+LOADING = Lock()  # runpy changes sys.modules
+
+
+@cache
+def cut() -> dict[str, Any]:
+    """What takes the C of a build; it stands on a floor above the kernels."""
+    return runpy.run_path(str(ROOT / "lavender" / "sim" / "web" / "cut.py"))
+
+
 def translate(path: Path, root: Path, work: Path) -> Path:
     """Cython's C of a module; of one of the kernels that of the build in place, where it is newer than its sources."""
     c_file = work / f"{path.stem}.c"
     if path.is_relative_to(ROOT / "lavender_ext"):
         module = ".".join(path.relative_to(ROOT / "lavender_ext").with_suffix("").parts)
-        cut = runpy.run_path(str(ROOT / "lavender" / "sim" / "web" / "cut.py"))
-        [(_, text)] = cut["translate"](ROOT, [module], work, ROOT / "build" / "cython")
+        with LOADING:
+            found = cut()
+        [(_, text)] = found["translate"](ROOT, [module], work, ROOT / "build" / "cython")
         c_file.write_text(text, encoding="utf-8")
         return c_file
     directives = [f"-X{name}={value}" for name, value in OPTIONS["directives"]().items()]

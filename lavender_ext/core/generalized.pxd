@@ -9,7 +9,6 @@ Rows that stand together and reach the same columns share a panel: one list of c
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
-from libc.string cimport memcmp
 
 from lavender_ext.core.tree cimport ldl_solve, take_from
 
@@ -122,6 +121,7 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
     cdef const int32_t* parent = g.parent
     cdef uint64_t on = 0, held = 0
     cdef double values = 0.0
+    cdef bint same
     prow[0] = 0
     pcol[0] = 0
     pval[0] = 0
@@ -134,7 +134,12 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
         last = ptr[i + 1]
         end = jptr[last]
         entries = end - jptr[first]
-        if entries != before or memcmp(jidx + jptr[first], jidx + jptr[first] - before, entries * sizeof(int32_t)) != 0:
+        same = entries == before                        # the entries of the block before
+        q = jptr[first]
+        while same and q < end:
+            same = jidx[q] == jidx[q - entries]
+            q += 1
+        if not same:
             on = 0
             top = -1
             for q in range(jptr[first], end):

@@ -38,8 +38,9 @@ cdef extern from *:
     LAVENDER_INLINE void NAME(const int n, int count, const double* rows, const int* at, const double* x,         \
                               double* out) {                                                                      \
         enum { LANES = sizeof(T) / sizeof(double), PARTS = 4 / LANES };                                           \
+        const T zero = {0.0};                                                                                     \
         T sum[PARTS * 6];                                                                                         \
-        for (int i = 0; i < n * PARTS; i++) sum[i] = (T){0.0};                                                    \
+        for (int i = 0; i < n * PARTS; i++) sum[i] = zero;                                                        \
         for (int t = 0; t < count; t++) {                                                                         \
             const double* a = rows + at[t];                                                                       \
             const double f = x[t];                                                                                \
