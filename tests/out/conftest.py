@@ -8,6 +8,7 @@ from clib import Library, run
 
 from lavender import out as export
 from lavender.base.errors import LavenderError
+from lavender.sim.web.compile import why_not
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +21,17 @@ def folder(tmp_path_factory):
             raise
         pytest.skip(str(error))
     return out
+
+
+@pytest.fixture
+def javascript(tmp_path):
+    """A folder with the npm package; skips without Node or what makes it, never because it cannot be made."""
+    if shutil.which("node") is None:
+        pytest.skip("node is not installed")
+    if reason := why_not():
+        pytest.skip(reason)
+    export.write("npm", tmp_path / "js")
+    return tmp_path / "js"
 
 
 @pytest.fixture(scope="session")

@@ -97,16 +97,10 @@ def test_the_tower_in_c_and_cpp_has_one_hash(folder, shared, compiler, tmp_path)
 
 
 @pytest.mark.slow
-def test_javascript_has_the_hash_of_c(folder, shared, compiler, tmp_path):
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-    try:
-        export.write("npm", tmp_path / "js")
-    except LavenderError as reason:
-        pytest.skip(str(reason))
+def test_javascript_has_the_hash_of_c(folder, shared, compiler, tmp_path, javascript):
     link = [shared, f"-Wl,-rpath,{shared.parent}"]
     run(compiler, "-std=c11", folder / "tower.c", *link, "-o", tmp_path / "tower_c")
-    assert tower("node", tmp_path / "js" / "tower.mjs") == tower(tmp_path / "tower_c")
+    assert tower("node", javascript / "tower.mjs") == tower(tmp_path / "tower_c")
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 import ctypes as ct
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -287,13 +286,7 @@ console.log(JSON.stringify(said));
 """
 
 
-def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(tmp_path):
-    if shutil.which("node") is None:
-        pytest.skip("node is not installed")
-    try:
-        export.write("npm", tmp_path / "js")
-    except lv.LavenderError as reason:
-        pytest.skip(str(reason))
+def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript):
     mistakes = [
         ({"b": [1]}, {}, "b has 1 numbers; 3 are needed"),  # the other two stood there from the problem before
         ({"value": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}, {}, "value has 3 numbers; 9"),
@@ -309,17 +302,17 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(tmp_path):
         ({}, 5, "5 is no table of fields"),
     ]  # fmt: skip
     asked = [[{}, {}], *([problem, budget] for problem, budget, _ in mistakes), [{"b": [3, 2, 1, 9]}, {}]]
-    words = ["node", "--input-type=module", "-e", SCRIPT, str(tmp_path / "js"), json.dumps(asked)]
+    words = ["node", "--input-type=module", "-e", SCRIPT, str(javascript), json.dumps(asked)]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     first, *said, last = json.loads(done.stdout)
     assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
     for (_, _, sign), text in zip(mistakes, said, strict=True):
         assert isinstance(text, str) and sign in text
-    module = tmp_path / "js" / "liblavender.wasm"
+    module = javascript / "liblavender.wasm"
     module.write_bytes(b"mine")
     with pytest.raises(lv.InputError, match="is there and is another"):
-        export.write("npm", tmp_path / "js")
+        export.write("npm", javascript)
     assert module.read_bytes() == b"mine"
 
 

@@ -7,9 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from lavender import out as export
-from lavender.base.errors import LavenderError
-
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 sys.path.insert(0, str(HERE))
@@ -40,15 +37,9 @@ def test_x86_and_aarch64_have_the_bits_of_the_extension_and_contraction_is_seen(
     assert "differ, as it must, and lav_self_test says so" in rows[2]
 
 
-def test_webassembly_has_the_bits_of_the_extension(tmp_path):
-    if shutil.which("node") is None:
-        pytest.skip("Node is not installed")
-    try:
-        export.write("npm", tmp_path)
-    except LavenderError as reason:
-        pytest.skip(str(reason))
+def test_webassembly_has_the_bits_of_the_extension(tmp_path, javascript):
     _, count = record(tmp_path, scenes=())
-    check = ["node", str(HERE / "check_vectors.mjs"), str(tmp_path), str(tmp_path / "vectors.bin")]
+    check = ["node", str(HERE / "check_vectors.mjs"), str(javascript), str(tmp_path / "vectors.bin")]
     done = subprocess.run(check, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert f"{count} of {count} vectors the same" in done.stdout and count > 1000

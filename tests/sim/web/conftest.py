@@ -8,6 +8,7 @@ from worked import chromium
 from lavender.base.errors import LavenderError
 from lavender.sim.engine import SOLVER_FIELDS
 from lavender.sim.web import pages
+from lavender.sim.web.compile import why_not
 
 PATIENCE = 600_000  # ms, for what hangs: on a loaded machine a page takes its time
 
@@ -18,6 +19,8 @@ def address(tmp_path_factory):
     try:
         pages.write_page(folder)
     except LavenderError as error:
+        if not why_not():  # what it is made with is there: it must be made
+            raise
         pytest.skip(str(error))
     server = pages.server(folder)
     thread = threading.Thread(target=server.serve_forever)
