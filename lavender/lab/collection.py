@@ -118,7 +118,7 @@ def certified(problem: Problem, name: str, group: str) -> Entry:
 def difficulty(problem: Problem) -> int | None:
     """Sweeps that `pgs` takes to a thousandth of the error of doing nothing, `Entry.sweeps`."""
     try:
-        found = solve(problem, "pgs", tol=1e-3, max_iter=SWEEPS)
+        found = solve(problem, "pgs", impulse=problem.start(), tol=1e-3, max_iter=SWEEPS)
     except CapabilityError:
         return None
     return found.iterations if found.success else None

@@ -9,6 +9,7 @@ import lavender as lv
 from lavender import bench, suite
 from lavender.lab.bench.record import from_json, to_json
 from lavender.lab.bench.running.runner import with_motion
+from lavender.lab.collection import difficulty
 from lavender.lab.motion.reference import as_reference
 from lavender.lab.proof import enclosed
 from lavender.lab.report import tables, write
@@ -126,3 +127,12 @@ def test_a_case_has_its_difficulty_and_who_gave_the_same_answer_without_an_itera
     assert tables.difficulties(shared)[0].same == ("direct", "lemke")
     page = write(shared, tmp_path, figures=False).read_text(encoding="utf-8")
     assert "direct, lemke" in page and "exact solution" not in page
+
+
+def test_a_guess_makes_no_case_easier():
+    problem = suite.case("stack(n=8)").problem
+    near = replace(problem, guess=lv.solve(problem, tol=1e-9).impulse * (1.0 + 1e-4), copy=False)
+    plan = bench.Plan(levels=(1e-3,), **SHORT)
+    cold, warm = (tables.difficulties(bench.run([p], ["pgs", "jacobi"], plan))[0] for p in (problem, near))
+    assert warm.sweeps == cold.sweeps > 10 and warm.same == ()
+    assert difficulty(near) == difficulty(problem)

@@ -158,10 +158,10 @@ def failures(records: Records) -> list[Record]:
 
 
 def difficulties(records: Records) -> list[Difficulty]:
-    """Each case of the records."""
+    """Each case of the records, from doing nothing: what a guess or the step before spares is not the case's."""
     out = []
     for name, info in records.cases.items():
-        mine = [r for r in records if r.case == name]
+        mine = [r for r in records if r.case == name and r.start == "cold"]
         swept = [r.iterations for r in mine if r.solver == "pgs" and r.mode == "tol" and r.relative <= EASY]
         known = [r for r in mine if r.degenerate is not None]
         idle = [r for r in mine if r.bits and r.iterations == 0 and r.claims]
