@@ -462,7 +462,7 @@ def test_what_is_left_out_stands_beside_what_is_left(lavender, tmp_path, monkeyp
     code, out, _ = lavender(
         "report", "--campaign", folder, "--solvers", "pgs", "--workers", 1, "--out", tmp_path / "c"
     )
-    assert code == cli.EXIT_UNMET and "left out (1 of 3)" in out
+    assert code == cli.EXIT_UNMET and "left out, the first of 3: " in out
     assert lavender("check", folder, "--solvers", "pgs")[0] == cli.EXIT_UNMET
     monkeypatch.setattr(recording.adapter, "from_mujoco", true)
     code, out, _ = lavender("report", *model, *more, "--fresh")

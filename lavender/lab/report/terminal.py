@@ -84,7 +84,8 @@ def _notes(report: Report, most: int) -> Iterator[tuple[str, str]]:
     }
     for kind, (style, texts) in kinds.items():
         for i, text in enumerate(texts[:most], 1):
-            yield f"{kind} ({i} of {len(texts)}): {text}" if len(texts) > 1 else f"{kind}: {text}", style
+            place = f" ({i} of {len(texts)})" if most > 1 else f", the first of {len(texts)}"
+            yield f"{kind}{place if len(texts) > 1 else ''}: {text}", style
     pairs = [s.reason.partition(":")[0] for s in records.skips if s.solver]
     stand_ins = Counter(pair for pair in pairs if " → " in pair)
     for pair, n in stand_ins.items():

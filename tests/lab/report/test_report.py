@@ -341,7 +341,7 @@ def test_claims_failures_and_spreads():
         assert sum(bool(f.contradicted) for f in report.failures(more)) == wrong
         console = Console(file=io.StringIO(), width=200)
         print_report(Report(more), console)
-        counted = f" (1 of {wrong})" if wrong > 1 else ""
+        counted = f", the first of {wrong}" if wrong > 1 else ""
         assert f"false claim{counted}: a, x: says CONVERGED" in console.file.getvalue()
     assert [(f.solver, f.status) for f in report.failures(found)] == [
         ("x", "CONVERGED"),

@@ -94,7 +94,7 @@ def test_in_short_the_terminal_shows_25_lines_within_its_width(cases, width):
     assert max(map(len, lines)) <= width
     assert lines[0].startswith("Use solver_0")
     assert sum("more: --tables" in line for line in lines) == 1
-    assert any(line.startswith("false claim (1 of ") for line in lines)
+    assert any(line.startswith("false claim, the ") for line in lines)
 
 
 def test_the_first_screen_is_a_sentence_a_line_and_a_figure(real, tmp_path):
