@@ -121,8 +121,9 @@ GRID = 49  # times of a figure over all cases
 def overall_figure(records: Records) -> Figure:
     """Residual that a solver has reached by a time, over all cases: median, and a band of the middle half.
 
-    A case on which nothing has been reached by then stands at 1, doing nothing. Cases are single problems from a cold
-    start; of sequences alone each step is one, from the impulses of the step before where they are carried.
+    A case on which nothing has been reached by then stands at 1, doing nothing; so does one that a solver does not
+    take, which the title says. Cases are single problems from a cold start; of sequences alone each step is one, from
+    the impulses of the step before where they are carried.
     """
     single = any(r.step < 0 for r in records)
     start = "cold" if single or all(r.start == "cold" for r in records) else "carried"
@@ -153,6 +154,8 @@ def overall_figure(records: Records) -> Figure:
         lower, middle, upper = (tuple(column) for column in zip(*bands[first:], strict=True))
         curves.append(Curve(solver, solver, tuple(grid[first:]), middle, low=lower, high=upper))
     over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
+    if any(len(own) < len(cases) for own in by.values()):
+        over += "; no result: 1"
     return Figure(
         "over all", f"Error against time{over if len(cases) > 1 else ''}",
         "time: set-up and solve [s]", "relative residual [-]", tuple(curves), levels=tables.levels_of(records),

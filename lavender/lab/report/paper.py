@@ -122,9 +122,15 @@ def _own(records: Records, solvers: Iterable[str]) -> str:
     return f" Time of its own interface, on data given before, without conversion: {', '.join(names)}."
 
 
+def _lost(records: Records) -> str:
+    """A sentence on what did not load; empty where all did."""
+    lost = sum(map(len, records.left_out.values()))
+    return f" Left out, for it did not load: {count(lost, 'problem')}." if lost else ""
+
+
 def _included(figure: Figure, records: Records) -> str:
     """A floating figure with its caption."""
-    caption = f"{figure.title}.{_own(records, {c.solver for c in figure.curves})}"
+    caption = f"{figure.title}.{_own(records, {c.solver for c in figure.curves})}{_lost(records)}"
     if any(c.steps for c in figure.curves):
         caption = f"Share of cases solved within a multiple of the fastest solver's time: law {caption}"
     if figure.left_out:
@@ -139,7 +145,7 @@ def _tables(report: Report, own: Records) -> str:
     records, shift = report.records, seconds(tables.SHIFT)
     caption = (
         "Recommended solver, its mean time (of other packages with conversion), and the cases that it brings to the "
-        f"level where that is not all. Within {NOISE:g} times of each other solvers count as equal."
+        f"level where that is not all. Within {NOISE:g} times of each other solvers count as equal.{_lost(records)}"
     )
     advice, last = contents.advice_table(report), 1 + len(report.levels)
     rows: list[list[str | Cell]] = [
@@ -159,8 +165,10 @@ def _tables(report: Report, own: Records) -> str:
             f"Law {law}: geometric mean of times with {shift} added, and cases brought to the level; a miss costs "
             f"{seconds(tables.limit_of(records))}. Solvers that take every case{others}.{_own(own, told)}"
         )
+        caption += _lost(records)
         made.append(latex(contents.mean_table(by_level), caption, f"means-{law}"))
     caption = "Claims of solvers against the judge, who recomputes every residual from the problem's data."
+    caption += _lost(records)
     made.append(latex(contents.claim_table(records), caption, "claims"))
     return "% \\usepackage{booktabs}\n" + "\n".join(made)
 

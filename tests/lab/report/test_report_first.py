@@ -178,6 +178,15 @@ def test_a_paper_has_a_figure_for_each_folder_and_backends_by_their_own_interfac
         assert "Not drawn: solver\\_4, solver\\_5." in line
     assert "without conversion: osqp" in (folder / "method.tex").read_text(encoding="utf-8")
     assert (folder / "tables.tex").read_text(encoding="utf-8").count("without conversion: osqp") == 1
+    assert "Left out" not in "".join(captions) and "no result" not in "".join(captions)
+    found.add(bench.Skip("run", "e", "", "did not load: mine/chains/e.npz is empty"))
+    some = found.having(r for r in found if (r.case, r.solver) != ("a", "osqp"))
+    write_paper(Report(some), tmp_path)
+    for name in ("figures.tex", "tables.tex"):
+        said = [s for s in (folder / name).read_text(encoding="utf-8").splitlines() if "\\caption" in s]
+        assert said and all("Left out, for it did not load: 1 problem." in s for s in said)
+    over = [s for s in (folder / "figures.tex").read_text(encoding="utf-8").splitlines() if "over all" in s]
+    assert ["no result: 1" in s for s in over if "caption" in s] == [True, False, True]
     canvas = kept(
         dataclasses.replace(drawn["over all"], title=""), looks(["osqp"] + [f"solver_{i}" for i in range(6)])
     )
