@@ -123,6 +123,29 @@ def test_masses_for_their_inverses_are_told():
     assert found[0].data["bodies"] == [3]
 
 
+def test_what_bodies_tell_is_told_of_their_j_and_m():
+    bodies = SCENES["stack"]
+    j, mass = bodies.jacobian.toarray(), np.linalg.inv(bodies.rows.inverse_mass_matrix().toarray())
+    v = bodies.rows.v_free.ravel()
+    target = (bodies.b + j @ v).reshape(-1, 3)
+    target[::4, 0] += 0.01  # some depth: what is asked of rows does not tell their order
+
+    def of(mass, order=slice(None)):
+        problem = lv.Problem.from_jacobian(
+            j[order], mass, v, target=target.ravel()[order], cones=bodies.cones
+        )
+        return [s.reason for s in lv.diagnose(problem) if s.kind in ("masses", "all normals first")]
+
+    assert of(mass) == []
+    assert "inverses for mass and inertia" in of(np.linalg.inv(mass))[0]
+    moving = np.arange(len(mass)) % 6 < 3
+    mixed = np.where(moving[:, None] & moving, np.linalg.inv(mass), mass)
+    assert "inverse mass for mass" in of(mixed)[0]
+    rows = np.arange(bodies.m).reshape(-1, 3)
+    for order in (rows.T.ravel(), np.r_[rows[:, 0], rows[:, 1:].ravel()]):
+        assert "all normals stand first" in of(mass, order)[0]
+
+
 def test_a_depth_with_the_wrong_sign_is_told():
     rows, _ = given(SCENES["stack"])
     rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.judge.residuals import residual
+from lavender.lab.suspicions.bodies import are_grouped
 from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.solvers.certify import conflict_of
@@ -40,11 +41,17 @@ def keys(p: Problem) -> Iterator[Suspicion]:
 
 
 def order_of_rows(p: Problem) -> Iterator[Suspicion]:
-    # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
     c = p.cones
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
         return
+    if are_grouped(p):
+        reason = (
+            "rows of J are those of rigid bodies if all normals stand first; rows stand by contact: normal, "
+        )
+        yield suspect(p, "all normals first", reason + "tangent, tangent, then those of the next", full)
+        return
+    # By b alone, which in the direction of a normal is an approach: gravity, a bounce, a depth.
     b = p.b[c.ptr[full][:, None] + np.arange(3)]
     whole, toward = np.abs(b).sum(axis=0), b.sum(axis=0)
     size = whole.sum()

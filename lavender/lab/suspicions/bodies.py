@@ -14,19 +14,28 @@ from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-__all__ = ["CHECKS", "LARGE", "bodies_of", "free_bodies"]
+__all__ = ["CHECKS", "LARGE", "are_grouped", "bodies_of", "free_bodies"]
 
 LARGE = 600  # velocities up to which an inverse of M is looked at
+GIVEN_FOR = (  # of bodies, and of M
+    ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
+    ("inverse mass for mass", "inverse inertia for inertia", "inverses for mass and inertia"),
+)
 FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
 
 
-def bodies_of(p: Problem) -> Rows | None:
-    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
+def bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies.
+
+    rows (c, 3): rows of J of each contact, where they are not those that the cones say.
+    """
     g, c = p.generalized, p.cones
     contact = c.is_contact
     if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
         return p.rows
-    mass, part = g.mass.toarray(), g.jac.toarray()[c.ptr[:-1][contact][:, None] + np.arange(3)]
+    if rows is None:
+        rows = c.ptr[:-1][contact][:, None] + np.arange(3)
+    mass, part = g.mass.toarray(), g.jac.toarray()[rows]
     six: list[npt.NDArray[np.intp]] = []
     for j in free_bodies(mass):  # a ball's spin has one mass, too
         if j + 6 <= g.nv and (not six or j > six[-1][-1]):
@@ -51,10 +60,27 @@ def bodies_of(p: Problem) -> Rows | None:
         return None
     arm = np.stack([moment[..., 1, 2], moment[..., 2, 0], moment[..., 0, 1]], axis=-1)
     return Rows(
-        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.broadcast_to(np.eye(3), (len(six), 3, 3)),
+        inv_mass=1.0 / mass[at[:, 0], at[:, 0]], inv_inertia=np.linalg.inv(mass[at[:, 3:, None], at[:, None, 3:]]),
         v_free=g.v_free[at], normal=axes[:, 0], tangent=axes[:, 1], arm_a=arm[first, k], arm_b=arm[last, k],
         contact_body=np.stack([np.where(count == 2, first, -1), len(six) + last], axis=1),
     )  # fmt: skip
+
+
+def are_grouped(p: Problem) -> bool:
+    """Whether rows of J are those of contacts of rigid bodies if all normals stand first, and not as the cones say."""
+    contact = p.cones.is_contact
+    k = int(np.count_nonzero(contact))
+    if (
+        p.generalized is None
+        or k < 2
+        or bodies_of(p) is not None
+        or 3 * k != np.count_nonzero(p.cones.contact_rows)
+    ):
+        return False
+    first = int(p.cones.ptr[:-1][contact][0])
+    i = np.arange(k)[:, None]
+    each, alike = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
+    return any(bodies_of(p, first + order) is not None for order in (each, alike))
 
 
 def geometry(p: Problem) -> Iterator[Suspicion]:
@@ -152,9 +178,9 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
 
 
 def masses(p: Problem) -> Iterator[Suspicion]:
-    if p.rows is None or not p.rows.n_bodies:
+    r = bodies_of(p)
+    if r is None or not r.n_bodies:
         return
-    r = p.rows
     turning = np.abs(r.inv_inertia).max(axis=(1, 2)) > 0.0
     still = np.flatnonzero((r.inv_mass == 0.0) & turning)
     if len(still):
@@ -166,11 +192,12 @@ def masses(p: Problem) -> Iterator[Suspicion]:
     if not len(known):
         return
     m, e, s2 = r.inv_mass[known], eigen[known], size[known] ** 2
+    given = GIVEN_FOR[p.generalized is not None]
     readings = {  # (2), with each number read as given, or as its inverse
         "": (1.0 / e).sum(axis=1) * m,
-        "mass for inverse mass": (1.0 / e).sum(axis=1) / m,
-        "inertia for inverse inertia": e.sum(axis=1) * m,
-        "mass and inertia for their inverses": e.sum(axis=1) / m,
+        given[0]: (1.0 / e).sum(axis=1) / m,
+        given[1]: e.sum(axis=1) * m,
+        given[2]: e.sum(axis=1) / m,
     }
     share = {name: float(np.median(np.log10(0.5 * k2 / s2))) for name, k2 in readings.items()}
     own = share.pop("")
@@ -188,7 +215,7 @@ def masses(p: Problem) -> Iterator[Suspicion]:
         return
     density = np.median(1.0 / m / s2**1.5)
     if density < 0.05 and 10.0 < np.median(m / s2**1.5) < 3e4:
-        reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with mass for inverse mass"
+        reason = f"bodies are lighter than air ({density:.2g} kg/m^3 by the arms), ordinary with {given[0]}"
         yield suspect(p, "masses", reason, density=float(density))
 
 
