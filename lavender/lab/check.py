@@ -109,7 +109,11 @@ class CrossCheck:
 
     @property
     def ok(self) -> bool:
-        """Every solver that takes the problem solves it, and agrees; False where none takes it."""
+        """Every solver that takes the problem solves it, and agrees with the reference; False where none takes it.
+
+        Where there is no reference, nothing is compared: `reference` is None, as always under Coulomb's law, and
+        solvers may have found different motions (see `motions`).
+        """
         asked = {row.verdict for row in self.rows} - {REFUSED}
         return bool(asked) and asked <= {AGREES, AGREES_UNCOMPARED, NOTHING}
 
