@@ -6,8 +6,8 @@
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it
-    Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile of bodies
-                                that do not roll, or few entries of A, the first under the cone law
+    Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile that does
+                                not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
     all in turn                 with doubled work, until nobody gains: sweeps, `newton`, under friction `admm` or, of J
@@ -51,6 +51,7 @@ LAST = 100.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
+PILE = 200  # blocks of J and M, below which sweeps under Coulomb's law alone end sooner
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
 SHORT = 3.0 * SURE  # times the counted cost, below which a limit may be short
@@ -175,14 +176,16 @@ class Tree:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Blocks under Coulomb's law that do not roll, nearly each between another pair of bodies, or of few entries of
-        A: sweeps then decide what sticks.
+        """Blocks under Coulomb's law that do not roll, nearly each between another pair of bodies or of trees of M, or
+        of few entries of A: sweeps then decide what sticks.
         """
         p = self.problem
-        if self.law != "coulomb" or p.cones.has_more_parts or p.generalized is not None:
+        if self.law != "coulomb" or p.cones.has_more_parts:
             return False
-        if p.rows is None:
+        if p.matrix is not None:
             return len(p._compressed[1]) < SPARSE * p.m**2
+        if p.rows is None:
+            return p.n_blocks >= PILE and 4 * graph.tree_pairs(p.derived.view) > 3 * p.n_blocks
         pairs = graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) if p.rows.n_bodies else 0
         return 4 * pairs > 3 * p.n_blocks
 
@@ -195,7 +198,9 @@ class Tree:
         if not self.is_short(self.least) and self.is_narrow:
             why = f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations"
             yield Stage("direct", ROUNDS * costs.factorisations(self.law), self.least, why)
-        yield from self.sweeps_first(self.least)
+        # Fill is most of what J and M cost, and only an analysis tells it: they are swept as long as is usual before.
+        usual = self.problem.generalized is not None and self.law == "coulomb"
+        yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep if usual else 0.0))
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep

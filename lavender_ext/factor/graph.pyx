@@ -187,3 +187,23 @@ def body_pairs(const int32_t[:, ::1] body, int n_bodies, bint still):
             count = lav_body_pairs(k, &body[0, 0], n_bodies, still, &scratch[0], &scratch[n_bodies + 1],
                                    &scratch[2 * n_bodies + 2])
     return count
+
+
+def tree_pairs(Data p):
+    """The same of a problem in generalised coordinates: pairs of the first and the last tree that rows of a block touch."""
+    cdef const generalized_t* g = &p.general
+    cdef int32_t i, j, q, t, k = p.blocks.n_blocks
+    cdef int32_t[::1] tree = np.empty(g.n + 1, np.int32)
+    cdef int32_t[:, ::1] body = np.full((k, 2), -1, np.int32)
+    with nogil:
+        for i in range(g.n):
+            tree[i] = i if g.parent[i] < 0 else tree[g.parent[i]]
+        for i in range(k):
+            for j in range(p.blocks.ptr[i], p.blocks.ptr[i + 1]):
+                for q in range(g.jptr[j], g.jptr[j + 1]):
+                    t = tree[g.jidx[q]]
+                    if body[i, 0] < 0 or t < body[i, 0]:
+                        body[i, 0] = t
+                    if t > body[i, 1]:
+                        body[i, 1] = t
+    return body_pairs(body, g.n, True)

@@ -5,7 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, random_lcp
+from random_problems import as_matrix, general, random_lcp
 from random_trees import random_general
 
 import lavender as lv
@@ -48,7 +48,7 @@ FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
     "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
     "linear, J and M": (lambda: over_velocities(None), ["newton"]),
-    "J and M": (lambda: over_velocities("coulomb"), COULOMB),
+    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "nncg", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
     "the cone law": (
@@ -57,6 +57,7 @@ FIRST = {
     ),
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, COULOMB),
     "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), COULOMB),
+    "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), COULOMB),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, COULOMB),
 }  # fmt: skip
 
