@@ -31,6 +31,7 @@ LEVELS = (1e-3, 1e-6, 1e-9)
 GROWTH = 0.25  # of the iterations so far, between two points of a curve
 SHORT = 0.03  # s of CPU time below which a run is made three times
 FAR, LEAST = 12.0, 0.05  # times the least time to the middle level, and s, after which a solver is given up
+LONG = 30.0  # times the limit of one curve, that `auto` has: a limit that may be short changes its tree
 SOLVERS: dict[str, tuple[str, dict[str, Any]]] = METHODS | {"auto": ("auto", {})}
 Points = list[tuple[int, float, float]]
 
@@ -67,7 +68,7 @@ def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> It
             least = math.inf
             for name in filter(lambda name: takes(problem, name), SOLVERS):
                 run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
-                limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else 3.0 * time_limit
+                limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else LONG * time_limit
                 found = [run(problem, name, limit)]
                 if found[0][1] and found[0][1][-1][1] < SHORT:
                     found += [run(problem, name, limit) for _ in range(2)]

@@ -5,13 +5,14 @@
                                 sweeps: one compiled call (`small.py`); if that does not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
-    sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it
+    sweeps (`anderson`)         where 100 cost less than Newton's method, or a compiled call of it has failed: for its
+                                cost, or until they predict that they will cost more than it
     Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile that does
                                 not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first
-    all in turn                 with doubled work, until nobody gains: sweeps, `newton`, under friction `admm` or, of J
-                                and M, `nncg`; all together LAST times Newton's cost
+    all in turn                 with doubled work, until nobody gains: sweeps, `newton`, and `admm` or, of J and M,
+                                `nncg`; all together LAST times Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -228,7 +229,7 @@ class Tree:
         cost = (self.half if short else newton) - self.begun
         if short and self.law == "coulomb":
             cost *= 0.5  # nncg has the other half
-        pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
+        pays = short or self.tried or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             why = f"{words(cost)} of what newton costs"
@@ -241,8 +242,8 @@ class Tree:
         return Stage("anderson", cost / self.sweep, cost, why, most / self.sweep)
 
     def iterations(self, name: str, cost: float, why: str) -> Stage:
-        """Of two sweeps, or of `admm`, which cost as much as four."""
-        return Stage(name, (0.25 if name == "admm" else 0.5) * cost / self.sweep, cost, why)
+        """Of a solver of which each costs as much as two sweeps."""
+        return Stage(name, 0.5 * cost / self.sweep, cost, why)
 
     def in_turn(self, times: float) -> Iterator[Stage]:
         """All, with so many times the work of Newton's method before."""
@@ -251,8 +252,7 @@ class Tree:
         if not self.problem.cones.has_round:
             yield self.sweeps(cost, why)
         yield from self.factorisations(times * MOST)
-        if self.law in ("coulomb", "cone"):
-            yield self.iterations("admm" if self.problem.generalized is None else "nncg", cost, why)
+        yield self.iterations("admm" if self.problem.generalized is None else "nncg", cost, why)
 
 
 def words(ns: float) -> str:

@@ -88,8 +88,9 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
         raise CapabilityError(f"solver 'auto' {reason}")
     problem = problem.disk  # where it has ellipses
     reference(problem)
-    tree = Tree(problem)
+    tree, small = Tree(problem), who(problem)
+    tree.tried = problem.generalized is not None and bool(small)
     return Plan(
-        rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=who(problem), newton=tree.newton,
+        rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
         sweep=tree.sweep, stages=tuple(islice(tree, LINES)),
     )  # fmt: skip
