@@ -55,11 +55,12 @@ CYTHONS_OWN = "ISO C forbids conversion of function pointer to object pointer ty
 #: `call` the kernels themselves, and allocate what these need; `checks` and `blocks` read arrays of Python, `method`
 #: and `solve` lead the driver's newton for Python. The arithmetic of all is that of other modules, which this
 #: check sees, but for the logarithms by which `checked_sweeps` guesses about sweeps; that of `pgs`, `serial`,
-#: `accelerated`, `direct`, `lemke`, `principal`, `measure` and `watch` is cut out for the C library, which refuses what
-#: needs Python.
+#: `gauss_seidel`, `accelerated`, `direct`, `lemke`, `principal`, `measure` and `watch` is cut out for the C library,
+#: which refuses what needs Python.
 EXEMPT = {
     "threaded": "threads",
     "pgs": "called by serial; the C library has it whole",
+    "gauss_seidel": "called by serial; the C library has it whole",
     "serial": "calls loops over blocks by pointer; the C library has it whole",
     "accelerated": "calls sweeps by pointer; the C library has it whole",
     "checked_sweeps": "calls kernels, guesses how long they will take",

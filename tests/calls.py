@@ -14,9 +14,7 @@ from lavender import registry
 from lavender.judge.certificates import check_certificate
 from lavender.solvers.newton_systems import systems
 from lavender.solvers.newton_systems.systems import make_system
-from lavender_ext.accelerate import accelerated
 from lavender_ext.driver.driver import Driver
-from lavender_ext.sweep import serial
 
 SHORT = ("auto", "direct", "newton")
 
@@ -82,10 +80,10 @@ def over_velocities(m, nv, seed=0):
 
 def impulses(problem, packs=True, **options):
     """Sequential impulses of a problem, prepared, perhaps never in pairs."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(serial, "may_pack", lambda data: False)
-        return lv.prepare(problem, "sequential_impulses", **options)
+    prepared = lv.prepare(problem, "sequential_impulses", **options)
+    if not packs:
+        prepared.state.sweeps.alone()
+    return prepared
 
 
 def in_chunks(problem, order, counts, start, *, packs=True):
@@ -111,11 +109,10 @@ def packed(problem, order, counts, start):
 
 def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
     """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    with pytest.MonkeyPatch.context() as patch:
-        if not packs:
-            patch.setattr(accelerated, "may_pack", lambda data: False)
-        prepared = lv.prepare(problem, name, **options)
+    prepared = lv.prepare(problem, name, **options)
     solver, state = prepared.solver, prepared.state
+    if not packs:
+        state.sweeps.alone()
     rng = np.random.default_rng(problem.m)
     lam = 0.05 * np.abs(rng.normal(size=problem.m))
     for n in counts:

@@ -13,6 +13,7 @@ from lavender.problem.ordering import Order
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated
+from lavender_ext.core.order import SYMMETRIC
 
 SWEEPS = ("pgs", "blocks")
 LARGEST_MEMORY = 16
@@ -31,13 +32,11 @@ class AcceleratedState(SweepState):
     """A sweep state with the memory of the acceleration."""
 
     def __init__(
-        self, problem: Problem, data: Any, order: Order, exact: bool, convex: int, memory: int
+        self, problem: Problem, data: Any, order: Order, exact: bool, memory: int, convex: int, keeps: bool
     ) -> None:
-        sweeps = accelerated.sweeps_of(data, *plan_of(order), exact, convex > 0)
+        sweeps = accelerated.AcceleratedSweeps(data, *plan_of(order), exact, memory, convex, keeps)
         super().__init__(problem, data, order, sweeps, PATIENCE)
-        self.exact, self.convex, self.memory = exact, convex, memory
-        self.space = accelerated.allocate(sweeps, memory)
-        self.restarts = 0
+        self.exact = exact
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ class Accelerated(Sweeping):
     def _state(self, problem: Problem, order: Order, before: AcceleratedState | None) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = self.convex if problem.law == "coulomb" else 0
-        return AcceleratedState(problem, operator(problem), order, exact, convex, self._memory)
+        return AcceleratedState(problem, operator(problem), order, exact, self._memory, convex, self._keeps)
 
     def run(
         self,
@@ -87,11 +86,8 @@ class Accelerated(Sweeping):
         time_limit: float | None = None,
     ) -> Claim:
         """`max_iter` iterations, or fewer where a check ends them."""
-        status, done, sweeps, restarts = accelerated.run(
-            state.sweeps, state.watch, impulse, max_iter, tol, state.memory, state.convex, state.space, self._keeps
-        )  # fmt: skip
-        work = {"sweeps": sweeps, "restarts": restarts - state.restarts}
-        state.restarts = restarts
+        status, done, restarts = state.sweeps.run(state.watch, impulse, max_iter, tol)
+        work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": restarts}
         sweep = "blocks" if state.exact else "pgs"
         form = f"{sweep} on {over(state.data)}"
         return replace(claim(status, done), work=work, form=form)

@@ -20,7 +20,6 @@ from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
-from lavender_ext.local import gauss_seidel
 from lavender_ext.sweep import serial
 
 
@@ -33,8 +32,7 @@ class BlockGaussSeidel(Sweeping):
 
     def _state(self, problem: Problem, order: Order, before: SweepState | None) -> SweepState:
         data = swept(problem)
-        sweeps = serial.Sweeps(data, *plan_of(order), gauss_seidel.prepare(data), exact=True)
-        return SweepState(problem, data, order, sweeps)
+        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), exact=True))
 
     def run(
         self,
@@ -44,8 +42,7 @@ class BlockGaussSeidel(Sweeping):
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        ended = serial.run(serial.SWEEPS, state.sweeps, state.watch, impulse, max_iter, tol)
-        status, done, fallbacks = ended
+        status, done, fallbacks = state.sweeps.run(state.watch, impulse, max_iter, tol)
         work = {"sweeps": done, "fallbacks": fallbacks}
         return replace(claim(status, done), work=work, form=over(state.data))
 

@@ -11,28 +11,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from lavender.base.arrays import FloatArray, number
-from lavender.judge.solution import Claim
+from lavender.base.arrays import number
 from lavender.problem import Problem
 from lavender.problem.ordering import block_order
-from lavender.solvers.registry import Solver, SolverSpec
+from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import summed
-from lavender.solvers.sweeping import SweepState, run_kernel
+from lavender.solvers.sweeping import SweepState, Swept, plan_of
 from lavender_ext.sweep import serial
 
 
-class JacobiState(SweepState):
-    """A sweep state with its damping."""
-
-    def __init__(self, problem: Problem, omega: float) -> None:
-        super().__init__(problem, problem.csr_data, block_order(problem))
-        self.omega = omega
-
-
 @dataclass(frozen=True)
-class Jacobi(Solver):
+class Jacobi(Swept):
     """Damped (projected) Jacobi.
 
     Parameters
@@ -51,28 +40,10 @@ class Jacobi(Solver):
         """What `prepare` takes [s], as counted."""
         return summed(problem)
 
-    def prepare(self, problem: Problem) -> JacobiState:
-        return JacobiState(problem, safe_damping(problem) if self.omega is None else self.omega)
-
-    def run(
-        self,
-        state: JacobiState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        return run_kernel(state, impulse, max_iter, tol, serial.JACOBI, state.omega)
-
-
-@np.errstate(all="ignore")  # what overflows is judged
-def safe_damping(problem: Problem) -> float:
-    """min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)), s the steps [kg] (1/d, on tangents 1/lambda_max)."""
-    if problem.m == 0:
-        return 1.0
-    root = np.sqrt(problem.csr_data.step)
-    bound = float((abs(problem.csr) @ root * root).max())
-    return min(1.0, 1.6 / bound) if bound > 0.0 else 1.0
+    def prepare(self, problem: Problem) -> SweepState:
+        data, order = problem.csr_data, block_order(problem)
+        omega = serial.damping(data) if self.omega is None else self.omega
+        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), serial.JACOBI, omega))
 
 
 SPEC = SolverSpec(

@@ -25,11 +25,8 @@ from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import (
     SweepState,
     Threaded,
-    gains_from_threads,
     plan_of,
     reads_whitened,
-    run_kernel,
-    run_threads,
 )
 from lavender_ext.sweep import serial
 
@@ -48,11 +45,8 @@ class PGS(Threaded):
         tol: float,
         time_limit: float | None = None,
     ) -> Claim:
-        if state.data.is_general:
-            return replace(run_kernel(state, impulse, max_iter, tol), form="whitened J")
-        if self.threads > 1 and gains_from_threads(state):
-            return run_threads(state, impulse, max_iter, tol, self.threads)
-        return run_kernel(state, impulse, max_iter, tol)
+        claim = super().run(state, impulse, max_iter, tol)
+        return replace(claim, form="whitened J") if state.data.is_general else claim
 
     def _forming(self, problem: Problem) -> float:
         return 0.0 if reads_whitened(problem) else forming(problem)

@@ -21,14 +21,7 @@ from lavender.problem.ordering import Order
 from lavender.solvers.layout import Layout, lay_out
 from lavender.solvers.layout import pays as layout_pays
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import (
-    SweepState,
-    Threaded,
-    gains_from_threads,
-    plan_of,
-    run_kernel,
-    run_threads,
-)
+from lavender.solvers.sweeping import SweepState, Threaded, plan_of
 from lavender_ext.sweep import serial
 
 
@@ -48,8 +41,7 @@ class ImpulseState(SweepState):
         if self.layout is not None:
             data = self.layout.data
             swept = replace(order, blocks=np.arange(problem.n_blocks, dtype=np.int32))
-        packs = order.is_fixed and serial.may_pack(data)
-        sweeps = serial.Sweeps(data, *plan_of(swept), packs=packs, before=sweeps)
+        sweeps = serial.Sweeps(data, *plan_of(swept), before=sweeps)
         super().__init__(problem, data, swept, sweeps)
         self.plan = order
 
@@ -88,10 +80,7 @@ class SequentialImpulses(Threaded):
             if state.laid is None:
                 state.laid = state.layout.take(impulse)
             lam = state.laid
-        if self.threads > 1 and gains_from_threads(state):
-            claim = run_threads(state, lam, max_iter, tol, self.threads)
-        else:
-            claim = run_kernel(state, lam, max_iter, tol)
+        claim = super().run(state, lam, max_iter, tol)
         if state.layout is not None:
             state.layout.put(lam, impulse)
         return claim

@@ -6,12 +6,14 @@ Converges for symmetric positive definite A and 0 < omega < 2 (Ostrowski, Reich)
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-from lavender.base.arrays import FloatArray, number
+from lavender.base.arrays import number
 from lavender.base.errors import InputError
-from lavender.judge.solution import Claim
+from lavender.problem import Problem
+from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
-from lavender.solvers.sweeping import Sweeping, SweepState, run_kernel
+from lavender.solvers.sweeping import Sweeping, SweepState, plan_of
 from lavender_ext.sweep import serial
 
 
@@ -31,15 +33,9 @@ class SOR(Sweeping):
         if not 0.0 < number("omega", self.omega) < 2.0:
             raise InputError(f"omega is {self.omega}; 0 < omega < 2 is needed, outside it SOR diverges")
 
-    def run(
-        self,
-        state: SweepState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        return run_kernel(state, impulse, max_iter, tol, serial.SOR, self.omega)
+    def _state(self, problem: Problem, order: Order, before: Any) -> SweepState:
+        data = problem.csr_data
+        return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), serial.SOR, self.omega))
 
 
 SPEC = SolverSpec(

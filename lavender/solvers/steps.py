@@ -147,7 +147,7 @@ class Sweeps(Step):
 
     relative = 1.0  # residual of the last check
     rest = np.inf  # s, of the sweeps that are predicted to be left under a time limit
-    told = 0, 0  # sweeps and restarts of the turns before
+    told = 0  # restarts of the turns before
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         """Everything that depends on no impulse; A is formed only if that is a small part of the time."""
@@ -219,8 +219,8 @@ class Sweeps(Step):
         self.relative = log.best if state.now is None else state.now.relative
         if state.watch.best_relative < log.best:
             log.offer(state.watch.best[1])
-        told, self.told = self.told, (state.sweeps, state.restarts)
-        work = {"sweeps": state.sweeps - told[0], "restarts": state.restarts - told[1]}
+        told, self.told = self.told, state.restarts
+        work = {"sweeps": state.done - before, "restarts": state.restarts - told}
         return Claim(STATUS[state.status], state.done - before, work)
 
     def finish(self) -> None:

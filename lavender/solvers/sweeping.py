@@ -83,22 +83,11 @@ def plan_of(order: Order) -> tuple[Any, ...]:
     return order.blocks, order.split, order.mode, order.rng
 
 
-def run_kernel(
-    state: SweepState,
-    impulse: FloatArray,
-    max_iter: int,
-    tol: float,
-    kind: int = serial.SWEEPS,
-    omega: float = 1.0,
-) -> Claim:
-    """`max_iter` sweeps in one call of `serial.run`, or fewer where a check ends them; tol = 0 checks nothing."""
-    status, done, _ = serial.run(kind, state.sweeps, state.watch, impulse, max_iter, tol, omega)
-    return claim(status, done)
-
-
 def gains_from_threads(state: SweepState) -> bool:
     """Colours are large enough for more than one thread."""
     ptr, work = state.order.color_ptr, state.data.work
+    if state.data.is_general:
+        return False
     return ptr is not None and len(ptr) > 1 and work >= LEAST and work >= GRAIN * (len(ptr) - 1)
 
 
@@ -139,8 +128,23 @@ def over(data: Any) -> str:
     return "whitened J" if data.is_general else "body velocities" if data.factored else "rows of A"
 
 
+class Swept(Solver):
+    """A solver whose state is a `SweepState`."""
+
+    def run(
+        self,
+        state: Any,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
+    ) -> Claim:
+        """`max_iter` sweeps in one call of the kernel, or fewer where a check ends them; tol = 0 checks nothing."""
+        return claim(*state.sweeps.run(state.watch, impulse, max_iter, tol)[:2])
+
+
 @dataclass(frozen=True)
-class Sweeping(Solver):
+class Sweeping(Swept):
     """Options and life cycle of a sweep solver over A in compressed rows."""
 
     order: Any = "given"
@@ -183,3 +187,15 @@ class Threaded(Sweeping):
             raise InputError(
                 f"threads={self.threads} needs order='colored': only blocks of one colour share nothing"
             )
+
+    def run(
+        self,
+        state: Any,
+        impulse: FloatArray,
+        max_iter: int,
+        tol: float,
+        time_limit: float | None = None,
+    ) -> Claim:
+        if self.threads > 1 and gains_from_threads(state):
+            return run_threads(state, impulse, max_iter, tol, self.threads)
+        return super().run(state, impulse, max_iter, tol)

@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY
 from lavender_ext.core.parts cimport CONE, blocks_t
-from lavender_ext.sweep.serial cimport context_t
+from lavender_ext.sweep.serial cimport Sweeps, context_t, sweeping_t
 
 
 cdef struct sweep_data_t:
@@ -18,14 +18,22 @@ cdef struct sweep_data_t:
     double* work                # nncg 3 (m + n_v); anderson (4 + 2 memory) m
 
 
+cdef public void lav_nncg(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+cdef void forget_all(void* context, const double* lam) noexcept nogil
+cdef double undone_of(const sweep_data_t* c) noexcept nogil
+
+
 cdef inline int64_t accelerated_room(int64_t m, int64_t n_v, int64_t memory) noexcept nogil:
     """Numbers of a run."""
     return 3 * (m + n_v) + (1 + 2 * memory) * m + CONTROL + MAX_MEMORY * MAX_MEMORY
 
 
-cdef inline void lay_accelerated(sweep_data_t* c, context_t* sweeps, int32_t memory, int32_t convex, int32_t keeps,
-                                 double* room) noexcept nogil:
-    """A run before its first iteration, in room (`accelerated_room`, zeroed)."""
+cdef inline void accelerate(sweeping_t* x, sweep_data_t* c, int32_t memory, int32_t convex, int32_t keeps,
+                            double* room) noexcept nogil:
+    """A run of sweeps, started, before its first iteration, in room (`accelerated_room`, zeroed); memory 0 is nncg."""
+    cdef context_t* sweeps = &x.c
+    x.step, x.of, x.forget = lav_nncg if memory == 0 else lav_anderson, c, forget_all
     c.sweeps, c.cone = sweeps, sweeps.blocks[0]
     c.cone.law = CONE
     c.memory, c.convex, c.keeps, c.turn = memory, convex, keeps, 0
@@ -34,4 +42,5 @@ cdef inline void lay_accelerated(sweep_data_t* c, context_t* sweeps, int32_t mem
     c.control = c.gram + MAX_MEMORY * MAX_MEMORY
 
 
-cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, int32_t n) noexcept nogil
+cdef class AcceleratedSweeps(Sweeps):
+    cdef sweep_data_t fast

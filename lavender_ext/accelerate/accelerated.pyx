@@ -15,26 +15,19 @@ order.
 where contacts stick, its answer is Coulomb's.
 """
 from libc.math cimport sqrt
-from libc.stdint cimport int32_t, int64_t
+from libc.stdint cimport int32_t, int64_t, uint64_t
 
-import numpy as np
-
-from lavender_ext.accelerate.accelerated cimport accelerated_room, lay_accelerated, sweep_data_t
-from lavender_ext.accelerate.mixing cimport CONTROL, MAX_MEMORY, UNDONE, forget, mix, mixing_t, take
+from lavender_ext.accelerate.accelerated cimport accelerate, accelerated_room, sweep_data_t
+from lavender_ext.accelerate.mixing cimport CONTROL, UNDONE, forget, mix, mixing_t, take
 from lavender_ext.core.block cimport clip, length
-from lavender_ext.core.order cimport RANDOM, SYMMETRIC
+from lavender_ext.core.order cimport SYMMETRIC
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, STALLED, Watch, begins_again, sweep_t
-from lavender_ext.local.gauss_seidel import prepare
-from lavender_ext.sweep.serial cimport Sweeps, form_velocity, is_packed, sweep
-from lavender_ext.sweep.serial import may_pack
+from lavender_ext.core.view cimport view_t
+from lavender_ext.sweep.serial cimport Sweeps, form_velocity, sweep, velocities_of
 
 cdef enum:
     REFRESH = 64                # iterations of nncg after which v is formed anew: rounding adds up in it
-
-cdef enum:
-    AGAIN = 64                  # sweeps that a stalled run has from its best, begun anew
 
 cdef enum:                      # places in control of nncg
     NORM = 0                    # g.Dg of the last sweep
@@ -205,8 +198,9 @@ cdef public void lav_anderson(void* context, double* lam, int32_t first_sweep, i
             forget(&mixing)                             # another map
 
 
-cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
+cdef void forget_all(void* context, const double* lam) noexcept nogil:
     """As before the first iteration, from lam (m), but for the counts."""
+    cdef sweep_data_t* c = <sweep_data_t*>context
     cdef int32_t i, n = c.sweeps.blocks.n_rows + c.sweeps.n_v
     if c.memory == 0:
         c.control[NORM] = 0.0
@@ -219,42 +213,31 @@ cdef inline void forget_all(sweep_data_t* c, const double* lam) noexcept nogil:
     form_velocity(c.sweeps, lam)
 
 
-def sweeps_of(Data p, int32_t[::1] order, int split, int mode, rng, bint exact=False, bint convex=False):
-    """`Sweeps` to be accelerated; `convex`: some of them under the cone law first."""
-    cdef bint packs = may_pack(p) and not exact and mode != RANDOM and split == p.rows.n_joints
-    return Sweeps(p, order, split, mode, rng, prepare(p) if exact or convex else None, exact, packs, True)
+cdef double undone_of(const sweep_data_t* c) noexcept nogil:
+    """Directions or mixtures so far that were dropped."""
+    return c.control[RESTARTS if c.memory == 0 else UNDONE]
 
 
-def allocate(Sweeps x, int memory):
-    """Zeroed numbers for a run; memory 0 is nncg."""
-    if not 0 <= memory <= MAX_MEMORY:
-        raise ValueError(f"memory is {memory}; 0 to {MAX_MEMORY} is needed")
-    return np.zeros(accelerated_room(x.c.blocks.n_rows, x.c.n_v, memory))
+cdef class AcceleratedSweeps(Sweeps):
+    """Accelerated sweeps, `undone`: restarts.
 
-
-def run(Sweeps x, Watch watch, double[::1] lam, int n, double tol, int memory, int convex,
-        double[::1] space, bint keeps=False):
-    """`n` iterations in place under `watch`, GIL released: (status, iterations, sweeps, restarts so far).
-
-    Blocks of x are prepared where they are exact or `convex` is not 0. space comes from `allocate`.
+    p, order, split, mode, rng, exact
+        As in `Sweeps`.
+    memory : int
+        Sweeps that are combined, up to 16; 0 is nncg.
+    convex : int
+        Iterations under the cone law first, whose blocks are solved exactly.
+    keeps : bool
+        nncg drops a direction only where it points against the sweep.
     """
-    cdef sweep_data_t c
-    cdef int32_t status, done = 0, more = 0
-    cdef sweep_t step = lav_nncg if memory == 0 else lav_anderson
-    if lam.shape[0] == 0:
-        if tol > 0.0:
-            return CONVERGED, 0, 0, 0
-        return RUNNING, n, n, 0
-    lay_accelerated(&c, &x.c, memory, convex, keeps, &space[0])
-    c.turn = watch.state.total
-    x.make_room(c.turn + <int64_t>n)
-    with nogil:
-        if c.turn == 0:
-            form_velocity(&x.c, &lam[0])
-        is_packed(&x.c, &lam[0], c.turn + <int64_t>n)
-        status = watch.run(step, &c, &lam[0], n, tol, &done)
-        while status == STALLED and begins_again(&watch.state, AGAIN):
-            forget_all(&c, &lam[0])
-            status = watch.run(step, &c, &lam[0], n - done, tol, &more)
-            done += more
-    return status, done, done * (2 if x.c.mode == SYMMETRIC else 1), int(c.control[RESTARTS if memory == 0 else UNDONE])
+
+    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact=False, int memory=0,
+                 int convex=0, bint keeps=False):
+        cdef view_t v = p.view()
+        cdef int64_t n = accelerated_room(v.p.n_rows, velocities_of(&v), memory)
+        self.x.packing.single = True
+        accelerate(&self.x, &self.fast, memory, convex, keeps,
+                   self.lay(p, order, split, mode, rng, exact, exact or convex > 0, n))
+
+    cdef double undone(self) noexcept:
+        return undone_of(&self.fast)

@@ -201,4 +201,3 @@ cdef class Watch:
     cdef view_t other
     cdef const view_t* confirm  # the other, or NULL
     cdef watch_t state
-    cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil

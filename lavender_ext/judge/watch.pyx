@@ -7,7 +7,7 @@ import numpy as np
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport scratch_of
 from lavender_ext.judge.progress cimport envelope
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due, sweep_t, watched
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, begin_watch, due
 
 
 cdef class Watch:
@@ -54,11 +54,8 @@ cdef class Watch:
         cdef int32_t k = envelope(&self.state.progress, &fall, &low)
         return -k / log10(fall) if k > 0 and 0.0 < fall < 1.0 else NAN
 
-    cdef int32_t run(self, sweep_t sweep, void* context, double* lam, int32_t n, double tol, int32_t* done) noexcept nogil:
-        return watched(&self.state, &self.view, self.confirm, sweep, context, lam, n, tol, done)
-
     def run_python(self, sweep, double[::1] lam, int n, double tol):
-        """`run` with a Python callable sweep(count, first); returns (status, sweeps done)."""
+        """`watched` with a Python callable sweep(count, first); returns (status, sweeps done)."""
         cdef int32_t done = 0, step, status
         if lam.shape[0] == 0:
             if tol > 0.0:

@@ -18,6 +18,7 @@ from lavender_ext.core.parts cimport (CONE, blocks_t, is_box, is_disk, is_round,
                                       parts_of, parts_t)
 from lavender_ext.core.rows cimport (cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity,
                                      relax_joint, rows_t, swing_body)
+from lavender_ext.core.view cimport view_t
 from lavender_ext.local.box cimport box3_from
 from lavender_ext.local.cone cimport cone3
 from lavender_ext.local.coulomb cimport PREPARED, coulomb3_from, prepare3
@@ -320,5 +321,7 @@ cdef inline int32_t solve_rows_block(const blocks_t* p, const rows_t* r, int32_t
     return found
 
 
+cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil
+cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil
 cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil

@@ -13,13 +13,14 @@ from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.local.exact cimport boxed_rows
 from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
                                               solve_rows_block)
 
 
-cdef public double lav_prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
+cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
     """First place of each block's prepared numbers, start (k); returns their number."""
     cdef int32_t i
     cdef double n = 0
@@ -29,7 +30,7 @@ cdef public double lav_prepared_sizes(const blocks_t* p, int32_t* start) noexcep
     return n
 
 
-cdef public void lav_prepare_csr(const blocks_t* p, const csr_t* a, const int32_t* start, double* g) noexcept nogil:
+cdef inline void prepare_csr(const blocks_t* p, const csr_t* a, const int32_t* start, double* g) noexcept nogil:
     cdef int32_t i, j, n, k, q, one
     cdef double W[MAX_ROWS * MAX_ROWS]
     for i in range(p.n_blocks):
@@ -51,7 +52,7 @@ cdef public void lav_prepare_csr(const blocks_t* p, const csr_t* a, const int32_
         prepare_block(p, i, W, one, g + start[i])
 
 
-cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int32_t* start, double* g) noexcept nogil:
+cdef inline void prepare_rows(const blocks_t* p, const rows_t* r, const int32_t* start, double* g) noexcept nogil:
     """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
     cdef int32_t i, j, n, k, q, c
     cdef double W[MAX_ROWS * MAX_ROWS]
@@ -85,8 +86,7 @@ cdef public void lav_prepare_rows(const blocks_t* p, const rows_t* r, const int3
         prepare_block(p, i, W, 0, g + start[i])
 
 
-cdef public void lav_prepare_general(const blocks_t* p, const generalized_t* o, const int32_t* start,
-                                     double* g) noexcept nogil:
+cdef inline void prepare_general(const blocks_t* p, const generalized_t* o, const int32_t* start, double* g) noexcept nogil:
     """The same from the rows of Y."""
     cdef int32_t i, j, n, k, q, b, nc
     cdef double W[MAX_ROWS * MAX_ROWS]
@@ -107,21 +107,24 @@ cdef public void lav_prepare_general(const blocks_t* p, const generalized_t* o, 
         prepare_block(p, i, W, 0, g + start[i])
 
 
+cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil:
+    """Each block's own part of A into g (`prepared_sizes`, zeroed)."""
+    if v.g != NULL:
+        prepare_general(&v.p, v.g, start, g)
+    elif v.r != NULL:
+        prepare_rows(&v.p, v.r, start, g)
+    else:
+        prepare_csr(&v.p, v.a, start, g)
+
+
 def prepare(Data p):
     """(start (k,) int32, numbers) of every block, for the sweeps."""
-    cdef int32_t[::1] start = np.zeros(p.blocks.n_blocks + 1, np.int32)
-    cdef double size = lav_prepared_sizes(&p.blocks, &start[0])
-    if size > 2147483647:
-        raise MemoryError(f"{size:.0f} prepared numbers do not fit 32-bit places")
-    cdef double[::1] g = np.zeros(<Py_ssize_t>size + 1)
+    cdef view_t v = p.view()
+    cdef int32_t[::1] start = np.zeros(v.p.n_blocks + 1, np.int32)
+    cdef double[::1] g = np.zeros(<Py_ssize_t>prepared_sizes(&v.p, &start[0]) + 1)
     with nogil:
-        if p.is_general:
-            lav_prepare_general(&p.blocks, &p.general, &start[0], &g[0])
-        elif p.factored:
-            lav_prepare_rows(&p.blocks, &p.rows, &start[0], &g[0])
-        else:
-            lav_prepare_csr(&p.blocks, &p.csr, &start[0], &g[0])
-    return np.asarray(start), np.asarray(g)
+        prepare_blocks(&v, &start[0], &g[0])
+    return start.base, g.base
 
 
 cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,

@@ -11,10 +11,12 @@ from libc.stdint cimport int32_t
 
 import numpy as np
 
-from lavender_ext.accelerate.accelerated import allocate, run, sweeps_of
+from lavender_ext.accelerate.accelerated cimport AcceleratedSweeps
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport Judged
 from lavender_ext.judge.watch cimport RUNNING, Watch
+
+run = AcceleratedSweeps.run
 
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
@@ -46,12 +48,12 @@ cdef class CheckedSweeps:
     cdef readonly bint exact
     cdef readonly int split, memory
     cdef readonly Watch watch
-    cdef readonly object over, space    # as `accelerated.run` takes them
+    cdef readonly AcceleratedSweeps over
     cdef readonly Judged now, best      # of the last check, and of all
     cdef readonly double before         # relative residual before the last sweeps,
     cdef readonly int last, done        # how many these were, and all of them
     cdef readonly int status            # of the watch
-    cdef readonly int sweeps, restarts
+    cdef readonly int restarts
 
     def __init__(self, Data metric, Data data, bint exact, int split):
         cdef bint formed = (metric.factored or metric.is_general) and not (data.factored or data.is_general)
@@ -60,17 +62,17 @@ cdef class CheckedSweeps:
         self.metric, self.data, self.exact, self.split, self.memory = metric, data, exact, split, MEMORY
         # Rows of A that were formed: the form that was given has the last word.
         self.watch = Watch(data, PATIENCE, metric if formed else None)
-        self.over = sweeps_of(data, np.arange(data.blocks.n_blocks, dtype=np.int32), split, 0, np.zeros(1, np.uint64), exact)
-        self.space = allocate(self.over, MEMORY)
+        order = np.arange(data.blocks.n_blocks, dtype=np.int32)
+        self.over = AcceleratedSweeps(data, order, split, 0, np.zeros(1, np.uint64), exact, MEMORY)
 
     cdef int sweep(self, lam, int n, double tol) except -1:
         """n of them, fewer where their watch ends them, whose checks cost as much as the first sweeps; none for tol = 0."""
-        cdef int32_t last, swept
-        self.status, last, swept, self.restarts = run(self.over, self.watch, lam, n, tol, MEMORY, 0, self.space)
+        cdef int32_t last, undone
+        self.status, last, undone = run(self.over, self.watch, lam, n, tol)
+        self.restarts += undone
         if tol == 0.0:
             self.watch.state.check_at = self.watch.state.total
         self.done += last
-        self.sweeps += swept
         return last
 
     cdef double check(self, lam, double before, int last, double tol) except *:

@@ -17,31 +17,26 @@ from lavender_ext.core.block cimport relax_normal, relax_row, relax_tangents
 from lavender_ext.core.csr cimport csr_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, sweep_t
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
 from lavender_ext.local.gauss_seidel cimport solve_blocks
 from lavender_ext.sweep.levels cimport sweep_levels
-from lavender_ext.sweep.packed cimport MOST, move_impulses, room_of, sweep_records
+from lavender_ext.sweep.packed cimport move_impulses, room_of, sweep_records
 from lavender_ext.sweep.pgs cimport relax_bodies, relax_general, relax_matrix
-from lavender_ext.sweep.serial cimport NOT_YET, READY, USELESS, context_t, form_velocity, is_packed, next_order
-
-
-cdef enum:
-    FEWEST = 24                 # blocks: below, calls cost more than sweeps
-    FIRST = 8                   # sweeps of the run that packs: packing costs two to four
-    FIRST_FAR = 16              # from FAR blocks, whose records leave the second-level cache; of sweeps one at a time
-    FAR = 4000
+from lavender_ext.sweep.serial cimport (NOT_YET, READY, USELESS, WHOLE, context_t, form_velocity, is_packed, may_pack,
+                                        next_order, packing_t, sweeps_room, sweeps_start, sweeps_step)
+from lavender_ext.sweep.serial cimport damping as safe_damping
 
 
 cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:
     """One sweep over blocks p, those of `c` or with another law."""
     next_order(c, first)
-    if exact:
+    if WHOLE and exact:
         c.fallbacks += solve_blocks(p, c.csr, c.rows, c.general, c.start, c.g, c.order, lam, c.v)
-    elif c.general != NULL:
+    elif WHOLE and c.general != NULL:
         relax_general(p, c.general, c.order, 0, p.n_blocks, lam, c.v)
     elif c.csr != NULL:
         relax_matrix(p, c.csr, c.order, 0, p.n_blocks, lam)
-    elif c.packing != NULL and c.packing.single and c.packing.status == READY:
+    elif WHOLE and c.packing != NULL and c.packing.single and c.packing.status == READY:
         sweep_levels(p, c.rows, &c.packing.packed, c.packing.backwards, lam, c.v)
     else:
         relax_bodies(p, c.rows, c.order, 0, p.n_blocks, lam, c.v)
@@ -99,13 +94,14 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
 SWEEPS, SOR, JACOBI = range(3)
 
 
-def may_pack(Data p):
-    """Whether there are as many blocks over bodies as gain by standing in pairs."""
-    return bool(p.factored and FEWEST <= p.blocks.n_blocks <= MOST)
+def damping(Data p):
+    """Of jacobi over the rows of A."""
+    cdef double[::1] root = np.empty(p.blocks.n_rows + 1)
+    return safe_damping(&p.blocks, &p.csr, &root[0])
 
 
 cdef class Sweeps:
-    """What sweeps of a problem run over: its blocks in an order, and the velocities that they keep.
+    """Sweeps of a problem: its blocks in an order, and the velocities that they keep.
 
     Parameters
     ----------
@@ -114,103 +110,85 @@ cdef class Sweeps:
         Turned round or shuffled in place, as `mode` says; empty: row by row, over single rows of A.
     split, mode, rng
         As in `lavender.ordering.Order`.
-    prepared : tuple, optional
-        (start, numbers) of `gauss_seidel.prepare`, for blocks that are solved exactly.
+    kind, omega
+        SWEEPS, or SOR or JACOBI with their relaxation.
     exact : bool
-        They all are; else in the first sweeps of `accelerated.run` alone.
-    packs : bool
-        In pairs, from a run on that is long enough; the order is the same in each sweep, or turned round.
-    single : bool
-        Something is done between two sweeps: pairs are of one.
+        Blocks are solved exactly.
     before : Sweeps, optional
         Of another problem: hands over the room of its pairs, and packs no more.
     """
 
-    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, prepared=None,
-                 bint exact=False, bint packs=False, bint single=False, Sweeps before=None):
-        cdef int32_t[::1] start
-        cdef double[::1] g
-        cdef double[:, ::1] v
-        cdef context_t* c = &self.c
-        self.keep = p, order, rng, prepared
-        c.blocks = &p.blocks
-        if p.is_general:
-            c.general = &p.general
-            c.n_v = p.general.n
-        elif p.factored:
-            c.rows = &p.rows
-            c.n_v = 6 * p.rows.n_bodies
-        else:
-            c.csr = &p.csr
-        if c.n_v > 0:
-            self.velocity = v = np.zeros((c.n_v // 6 + 2, 6))
-            c.v = &v[0, 0]
-        c.split = split
-        c.mode = mode
-        c.order = &order[0] if order.shape[0] else NULL
-        c.rng = &rng[0]
-        c.exact = exact
-        if prepared is not None:
-            start, g = prepared
-            c.start = &start[0]
-            c.g = &g[0]
-        self.packing.single = single
-        self.packing.first = FIRST_FAR if single or p.blocks.n_blocks >= FAR else FIRST
-        if packs:
-            c.packing = &self.packing
+    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int kind=0, double omega=1.0,
+                 bint exact=False, Sweeps before=None):
+        self.x.step = sor_step if kind == 1 else jacobi_step if kind == 2 else sweep_step
+        self.x.c.omega = omega
+        self.lay(p, order, split, mode, rng, exact, exact, 0)
         if before is not None:
-            self.room, before.room = before.room, None
-            before.packing.status = USELESS
+            self.for_pairs, before.for_pairs = before.for_pairs, None
+            before.x.packing.status = USELESS
 
-    cdef int make_room(self, int64_t sweeps) except -1:
-        """Room of pairs, where so many sweeps in a run make them."""
-        cdef int64_t size
+    cdef double* lay(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, bint exact, bint prepares,
+                     int64_t more) except NULL:
+        """Before the first sweep; room for so many numbers more. `prepares`: blocks, as some sweeps solve them exactly."""
+        cdef context_t* c = &self.x.c
+        cdef int32_t[::1] place = np.empty(p.blocks.n_blocks + 1, np.int32) if prepares else None
+        cdef int32_t* at = &place[0] if prepares else NULL
         cdef double[::1] room
-        cdef packing_t* x = self.c.packing
-        if x != NULL and x.status == NOT_YET and x.room == NULL and sweeps >= x.first:
-            size = room_of(self.c.blocks, self.c.rows)
-            if self.room is None or len(self.room) < size:
-                self.room = np.empty(size)
-            room = self.room
+        cdef int64_t n
+        self.view = p.view()
+        c.order = &order[0] if order.shape[0] else NULL
+        c.split, c.mode, c.rng, c.exact = split, mode, &rng[0], exact
+        n = sweeps_room(&self.x, &self.view, at)
+        if n < 0:
+            raise MemoryError("the prepared numbers of blocks do not fit 32-bit places")
+        self.room = room = np.zeros(n + more)
+        self.keep = p, order, rng, place
+        sweeps_start(&self.x, &self.view, at, &room[0])
+        if may_pack(&self.x, &self.view):
+            c.packing = &self.x.packing
+        return &room[0] + n
+
+    cdef double undone(self) noexcept:
+        """Blocks so far that fell back."""
+        return self.x.c.fallbacks
+
+    def run(self, Watch watch, double[::1] lam, int n, double tol):
+        """`n` sweeps in place, or fewer where `watch` ends them, GIL released: (status, sweeps done, `undone`)."""
+        cdef int32_t status, done = 0
+        cdef double before = self.undone()
+        cdef double[::1] room
+        cdef packing_t* x = self.x.c.packing
+        if lam.shape[0] == 0:
+            if tol > 0.0:
+                return CONVERGED, 0, 0
+            return RUNNING, n, 0
+        if x != NULL and x.status == NOT_YET and x.room == NULL and n + (watch.state.total if x.single else 0) >= x.first:
+            if self.for_pairs is None or len(self.for_pairs) < room_of(&self.view.p, self.view.r):
+                self.for_pairs = np.empty(room_of(&self.view.p, self.view.r))
+            room = self.for_pairs
             x.room = &room[0]
-        return 0
+        with nogil:
+            status = sweeps_step(&self.x, &watch.state, &watch.view, watch.confirm, &lam[0], n, tol, &done)
+        return status, done, int(self.undone() - before)
 
     def start(self, const double[::1] lam):
         """The velocities of an impulse (m,), where it is another than the last sweep left."""
         if lam.shape[0]:
-            form_velocity(&self.c, &lam[0])
+            form_velocity(&self.x.c, &lam[0])
+
+    def alone(self):
+        """One block after the other from here on, with the same bits."""
+        self.x.c.packing = NULL
+
+    @property
+    def velocity(self):
+        """(n + 2, 6) of bodies, then zeros."""
+        return self.room[:self.x.c.n_v + 12].reshape(-1, 6)
 
     @property
     def pairs(self):
         """(records, stages); (0, 0) where one block is swept after the other."""
-        if self.packing.status != READY:
+        cdef packing_t* x = &self.x.packing
+        if x.status != READY:
             return 0, 0
-        return self.packing.packed.pairs, self.packing.packed.stages
-
-
-def run(int kind, Sweeps x, Watch watch, double[::1] lam, int n, double tol, double omega=1.0):
-    """`n` sweeps in place under `watch`, GIL released: (status, sweeps done, blocks that fell back).
-
-    kind is SWEEPS, SOR or JACOBI. Before the first sweep the velocities of lam are formed; later ones keep them.
-    """
-    cdef int32_t status, done = 0
-    cdef double[::1] w
-    cdef sweep_t step = sweep_step
-    if lam.shape[0] == 0:
-        if tol > 0.0:
-            return CONVERGED, 0, 0
-        return RUNNING, n, 0
-    if kind == 1:
-        step = sor_step
-    elif kind == 2:
-        step = jacobi_step
-        w = np.empty(lam.shape[0])
-        x.c.w = &w[0]
-    x.c.omega = omega
-    x.c.fallbacks = 0.0
-    x.make_room(n)
-    with nogil:
-        if watch.state.total == 0:
-            form_velocity(&x.c, &lam[0])
-        status = watch.run(step, &x.c, &lam[0], n, tol, &done)
-    return status, done, int(x.c.fallbacks)
+        return x.packed.pairs, x.packed.stages

@@ -15,7 +15,7 @@ OpenMP would make the end of every run wait for all of them.
 """
 from libc.stdint cimport int32_t, int64_t
 
-from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch
+from lavender_ext.judge.watch cimport CONVERGED, RUNNING, Watch, watched
 from lavender_ext.sweep.pgs cimport relax_bodies, relax_matrix
 from lavender_ext.sweep.serial cimport Sweeps, context_t, form_velocity
 
@@ -176,7 +176,7 @@ cdef class Team:
         self.x.alone, self.x.penalty = alone
         self.watch = watch
         self.keep = (sweeps, lam, color_ptr)
-        self.x.c = &sweeps.c
+        self.x.c = &sweeps.x.c
         self.x.n_colors = <int32_t>color_ptr.shape[0] - 1
         self.x.color_ptr = &color_ptr[0]
         self.x.lam = &lam[0] if lam.shape[0] > 0 else NULL
@@ -196,7 +196,7 @@ cdef class Team:
         with nogil:
             if self.watch.state.total == 0:
                 form_velocity(self.x.c, self.x.lam)
-            status = self.watch.run(lead, &self.x, self.x.lam, n, tol, &done)
+            status = watched(&self.watch.state, &self.watch.view, self.watch.confirm, lead, &self.x, self.x.lam, n, tol, &done)
             lav_store(&self.x.stop[0], 1)
         return status, done
 

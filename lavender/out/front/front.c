@@ -12,11 +12,9 @@ typedef struct where_t { /* what is refused: an array or a count, and the place 
   int32_t index;
 } where_t;
 
-enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000, AGAIN = 64 };
-enum { PACK_FROM = 24, FAR_FROM = 4000 }; /* blocks from which sweeps run in pairs, and from which they leave the cache */
+enum { MAGIC = 0x4C415631, PATIENCE = 64, LONG_PATIENCE = 500, SPLIT_PATIENCE = 5000 };
 /* Above rounding of what was normalised in float64; above what float32 leaves of unit vectors and tensors after some turns. */
 static const double EXACT = 1e-9, ROUNDED = 1e-5;
-enum { PACK_AT = 8, PACK_FAR_AT = 16 };   /* sweeps of a run that makes them; the latter where sweeps are accelerated too */
 
 typedef struct kept_t { /* impulses of the problem before, by key */
   int32_t n_blocks, n_rows, most_blocks, most_rows;
@@ -42,19 +40,16 @@ struct lav_solver {
   rows_t r;
   general_t g;
   uint64_t *key;
-  double *impulse, *v_free, *v, *score_room, *compare;
+  double *impulse, *v_free, *score_room, *compare;
   double start[3]; /* E0 [sqrt J], V0 [m/s], relative residual of doing nothing */
   int32_t *order, *empty, *marks;
   int32_t split, mode;
   uint64_t rng;
   struct core_view_view_t read; /* as the judge reads it */
   struct judge_watch_watch_t watch;
-  sweep_t step;
-  void *context;
-  struct sweep_serial_context_t swept;
+  struct sweep_serial_sweeping_t swept;
   double deadline;  /* by the clock of the budget */
 #ifndef LAV_SWEEPS_ONLY
-  struct sweep_serial_packing_t packing;
   struct accelerate_accelerated_sweep_data_t fast;
   struct core_view_view_t view; /* as newton does: over rows of A where these were formed */
   struct core_method_options_t newton_options;
@@ -82,6 +77,8 @@ typedef struct method_t {
 } method_t;
 
 static const method_t *row_of(int32_t method);
+
+static int32_t is_accelerated(const lav_options *o) { return o->method == LAV_ANDERSON || o->method == LAV_NNCG; }
 
 #define GIVE_BACK(call)                                             \
   do {                                                              \
@@ -210,7 +207,7 @@ static int32_t takes(const lav_problem *q, const lav_options *o) {
   if ((row->blocks == FREE_ROWS && !free_rows) || (row->blocks == ROWS_ALONE && !rows_alone)) return LAV_ERROR_UNSUPPORTED;
   if (q->law == LAV_CONE && !rows_alone) {
     if (row->blocks != EVERY_LAW) return LAV_ERROR_UNSUPPORTED;
-    if ((o->method == LAV_ANDERSON || o->method == LAV_NNCG) && o->sweep == LAV_PGS_SWEEP) return LAV_ERROR_UNSUPPORTED;
+    if (is_accelerated(o) && o->sweep == LAV_PGS_SWEEP) return LAV_ERROR_UNSUPPORTED;
   }
   return LAV_OK;
 }

@@ -1,110 +1,7 @@
 
-/* -- sweeps ----------------------------------------------------------------------------------------------------------- */
-
-#ifdef LAV_SWEEPS_ONLY
-/* Block after block, over A or bodies. */
-static void sweep_step(void *context, double *lam, int32_t first, int32_t n) {
-  struct sweep_serial_context_t *c = (struct sweep_serial_context_t *)context;
-  int32_t i;
-  for (i = 0; i < n; i++) {
-    sweep_serial_next_order(c, first && i == 0);
-    if (c->csr) sweep_pgs_relax_matrix(c->blocks, c->csr, c->order, 0, c->blocks->n_blocks, lam);
-    else sweep_pgs_relax_bodies(c->blocks, c->rows, c->order, 0, c->blocks->n_blocks, lam, c->v);
-  }
-}
-#else
-#define sweep_step sweep_serial_sweep_step
-
-/* Room for pairs of blocks, with the same bits; `single`: something is done between two sweeps. */
-static void take_packing(lav_solver *s, int32_t single) {
-  if (s->form != LAV_BODIES || s->p.n_blocks < PACK_FROM || s->p.n_blocks > sweep_packed_MOST) return;
-  memset(&s->packing, 0, sizeof s->packing);
-  s->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
-  s->packing.first = single || s->p.n_blocks >= FAR_FROM ? PACK_FAR_AT : PACK_AT;
-  s->packing.single = single;
-  s->swept.packing = &s->packing;
-}
-
-/* Each block's own part of A, for those that are solved exactly. */
-static int32_t prepare_blocks(lav_solver *s) {
-  int32_t *start = TAKE(s, int32_t, s->p.n_blocks);
-  double numbers, *g;
-  if (s->is_short) return LAV_ERROR_ROOM;
-  numbers = k_prepared_sizes(&s->p, start);
-  if (numbers >= 2147483647.0) return LAV_ERROR_COUNT;
-  g = TAKE(s, double, (int64_t)numbers);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  memset(g, 0, ((size_t)numbers + 1) * sizeof(double));
-  if (s->form == LAV_VELOCITIES) k_prepare_general(&s->p, &s->g, start, g);
-  else if (s->form == LAV_BODIES) k_prepare_rows(&s->p, &s->r, start, g);
-  else k_prepare_csr(&s->p, &s->a, start, g);
-  s->swept.start = start;
-  s->swept.g = g;
-  return LAV_OK;
-}
-#endif
-
-/* max_i sum_j |A_ij| sqrt(s_i s_j), s the steps, of which a damping that is safe follows. */
-static double largest_row(const lav_solver *s) {
-  double most = 0.0, sum;
-  int32_t i, q;
-  for (i = 0; i < s->p.n_rows; i++) {
-    for (sum = 0.0, q = s->a.indptr[i]; q < s->a.indptr[i + 1]; q++)
-      sum += fabs(s->a.data[q]) * sqrt(s->p.step[s->a.indices[q]]);
-    sum *= sqrt(s->p.step[i]);
-    if (sum > most) most = sum;
-  }
-  return most;
-}
-
-static int32_t start_sweeps(lav_solver *s) {
-  memset(s->v, 0, ((size_t)s->n_v + 12) * sizeof(double));
-  s->swept.packing = NULL;
-  s->swept.blocks = &s->p;
-  s->swept.csr = s->form == LAV_MATRIX ? &s->a : NULL;
-  s->swept.rows = s->form == LAV_BODIES ? &s->r : NULL;
-  s->swept.general = general_of(s);
-  s->swept.v = s->v;
-  s->swept.n_v = s->n_v;
-  s->swept.order = s->options.method == LAV_PGS && s->in_rows ? NULL : s->order;
-  s->swept.split = s->split;
-  s->swept.mode = s->mode;
-  s->swept.rng = &s->rng;
-  s->swept.omega = s->options.omega;
-  s->swept.w = s->watch.e; /* which the watch does not need between sweeps */
-  s->context = &s->swept;
-  s->step = row_of(s->options.method)->sweep;
-  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
-}
-
-static int32_t start_impulses(lav_solver *s) {
-  GIVE_BACK(start_sweeps(s));
-#ifndef LAV_SWEEPS_ONLY
-  if (s->mode == core_order_GIVEN) take_packing(s, 0);
-#endif
-  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
-}
-
-static int32_t start_jacobi(lav_solver *s) {
-  GIVE_BACK(start_sweeps(s));
-  if (s->options.omega == 0.0) {
-    const double most = largest_row(s);
-    s->swept.omega = most > 0.0 && 1.6 / most < 1.0 ? 1.6 / most : 1.0;
-  }
-  return LAV_OK;
-}
+/* -- sweeps, accelerated or not --------------------------------------------------------------------------------------- */
 
 #ifndef LAV_SWEEPS_ONLY
-static int32_t start_block_sweeps(lav_solver *s) {
-  GIVE_BACK(start_sweeps(s));
-  s->swept.exact = 1;
-  return prepare_blocks(s);
-}
-#endif
-
-#ifndef LAV_SWEEPS_ONLY
-/* -- accelerated sweeps ----------------------------------------------------------------------------------------------- */
-
 /* Some contact has more than its normal: the law counts, and which sweeps know it, however rough the contacts are. */
 static int32_t has_tangents(const blocks_t *p) {
   int32_t i;
@@ -113,42 +10,53 @@ static int32_t has_tangents(const blocks_t *p) {
   return 0;
 }
 
-static int32_t start_accelerated(lav_solver *s) {
-  const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
-  const int32_t memory = s->options.method == LAV_NNCG ? 0 : s->options.memory;
-  const int32_t convex = rubs && !is_cone ? s->options.convex : 0;
-  const int64_t n = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
-  double *x;
-  GIVE_BACK(start_sweeps(s));
-  s->swept.exact = s->options.sweep == LAV_BLOCK_SWEEP || (s->options.sweep == LAV_DEFAULT_SWEEP && is_cone);
-  if (s->swept.exact || convex > 0) GIVE_BACK(prepare_blocks(s));
-  x = TAKE(s, double, n);
-  if (!s->swept.exact && s->mode != core_order_RANDOM && s->form == LAV_BODIES && s->split == s->r.n_joints) take_packing(s, 1);
-  if (s->is_short) return LAV_ERROR_ROOM;
-  memset(x, 0, (size_t)n * sizeof(double));
-  accelerate_accelerated_lay_accelerated(&s->fast, &s->swept, memory, convex, s->options.keeps, x);
-  s->context = &s->fast;
-  s->step = memory == 0 ? k_nncg : k_anderson;
-  return LAV_OK;
-}
-
-static int32_t is_accelerated(const lav_solver *s) {
-  return s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG;
-}
-
 static int32_t restarts_of(const lav_solver *s) {
-  if (s->options.method == LAV_BLOCK_GAUSS_SEIDEL) return (int32_t)s->swept.fallbacks;
   if (s->options.method == LAV_ADMM) return s->factors;
-  return is_accelerated(s) ? (int32_t)s->fast.control[s->fast.memory == 0 ? 1 : accelerate_mixing_UNDONE] : 0;
+  return (int32_t)(is_accelerated(&s->options) ? accelerate_accelerated_undone_of(&s->fast) : s->swept.c.fallbacks);
 }
-
-static int32_t begins_again(lav_solver *s) {
-  if (!is_accelerated(s) || !judge_watch_begins_again(&s->watch, AGAIN)) return 0;
-  accelerate_accelerated_forget_all(&s->fast, s->impulse);
-  return 1;
-}
-
 #endif
+
+static int32_t start_sweeps(lav_solver *s) {
+  const lav_options *o = &s->options;
+  struct sweep_serial_sweeping_t *x = &s->swept;
+  int32_t *place = NULL;
+  int64_t numbers, more = 0;
+  double *room;
+#ifndef LAV_SWEEPS_ONLY
+  const int32_t rubs = has_tangents(&s->p), is_cone = s->p.law == LAV_CONE && rubs;
+  const int32_t memory = o->method == LAV_NNCG ? 0 : o->memory, convex = rubs && !is_cone ? o->convex : 0;
+  x->packing.single = is_accelerated(o);
+  x->c.exact = o->method == LAV_BLOCK_GAUSS_SEIDEL;
+  if (x->packing.single) {
+    x->c.exact = o->sweep == LAV_BLOCK_SWEEP || (o->sweep == LAV_DEFAULT_SWEEP && is_cone);
+    more = accelerate_accelerated_accelerated_room(s->p.n_rows, s->n_v, memory);
+  }
+  if (x->c.exact || (x->packing.single && convex > 0)) {
+    place = TAKE(s, int32_t, s->p.n_blocks);
+    if (s->is_short) return LAV_ERROR_ROOM;
+  }
+#endif
+  x->c.order = o->method == LAV_PGS && s->in_rows ? NULL : s->order;
+  x->c.split = s->split;
+  x->c.mode = s->mode;
+  x->c.rng = &s->rng;
+  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_damping(&s->p, &s->a, s->watch.e) : o->omega;
+  x->step = row_of(o->method)->sweep;
+  numbers = sweep_serial_sweeps_room(x, &s->read, place);
+  if (numbers < 0) return LAV_ERROR_COUNT;
+  room = TAKE(s, double, numbers + more);
+  if (s->is_short) return LAV_ERROR_ROOM;
+  memset(room, 0, (size_t)(numbers + more) * sizeof(double));
+  sweep_serial_sweeps_start(x, &s->read, place, room);
+#ifndef LAV_SWEEPS_ONLY
+  if (x->packing.single) accelerate_accelerated_accelerate(x, &s->fast, memory, convex, o->keeps, room + numbers);
+  if (sweep_serial_may_pack(x, &s->read)) {
+    x->c.packing = &x->packing;
+    x->packing.room = TAKE(s, double, sweep_packed_room_of(&s->p, &s->r));
+  }
+#endif
+  return s->is_short ? LAV_ERROR_ROOM : LAV_OK;
+}
 
 static int32_t is_timed(const lav_budget *budget) { return budget->seconds > 0.0; }
 
@@ -167,13 +75,9 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
 #endif
   while (out->iterations < budget->iterations && status == judge_watch_RUNNING) {
     if (n > budget->iterations - out->iterations) n = budget->iterations - out->iterations;
-#ifndef LAV_SWEEPS_ONLY
-    if (s->context == &s->fast) sweep_serial_is_packed(&s->swept, s->impulse, (int64_t)s->fast.turn + n);
-#endif
-    status = judge_watch_watched(&s->watch, &s->read, NULL, s->step, s->context, s->impulse, n, budget->tol, &done);
+    status = sweep_serial_sweeps_step(&s->swept, &s->watch, &s->read, NULL, s->impulse, n, budget->tol, &done);
     out->iterations += done;
 #ifndef LAV_SWEEPS_ONLY
-    if (status == judge_watch_STALLED && begins_again(s)) status = judge_watch_RUNNING;
     if (s->is_broken) {
       out->outcome = LAV_FAILED;
       break;
@@ -194,13 +98,13 @@ static void run_sweeps(lav_solver *s, const lav_budget *budget, lav_result *out)
   out->sweeps = out->iterations;
 #ifndef LAV_SWEEPS_ONLY
   out->restarts = restarts_of(s) - before;
-  if (s->mode == core_order_SYMMETRIC && (s->options.method == LAV_ANDERSON || s->options.method == LAV_NNCG)) out->sweeps *= 2;
+  if (s->mode == core_order_SYMMETRIC && is_accelerated(&s->options)) out->sweeps *= 2;
 #endif
   if (budget->tol > 0.0 && s->watch.best_at >= 0 && out->outcome != LAV_CONVERGED) {
     judge(s, s->impulse, 0, &best); /* a residual may rise: the best check counts */
     if (!(best.relative <= s->watch.best_relative)) {
       COPY(s->impulse, s->watch.best, s->p.n_rows);
-      sweep_serial_form_velocity(&s->swept, s->impulse);
+      sweep_serial_form_velocity(&s->swept.c, s->impulse);
     }
   }
 }
@@ -381,8 +285,8 @@ static int32_t start_admm(lav_solver *s) {
   s->factor.dense = s->table + m * m;
   s->factors = 0;
   s->is_broken = !factor_shifted(s);
-  s->context = s;
-  s->step = admm_step;
+  s->swept.of = s;
+  s->swept.step = admm_step;
   return LAV_OK;
 }
 #endif

@@ -49,7 +49,6 @@ static void take_blocks(lav_solver *s, const lav_problem *q) {
   s->form = q->form;
   s->n_v = q->form == LAV_BODIES ? 6 * q->n_bodies : q->form == LAV_VELOCITIES ? q->n_velocities : 0;
   s->v_free = TAKE(s, double, s->n_v);
-  s->v = TAKE(s, double, s->n_v + 12);
   s->compare = TAKE(s, double, 2 * m + s->n_v);
   s->watch.v = TAKE(s, double, q->form == LAV_BODIES ? 12 * n : q->form == LAV_VELOCITIES ? nv + m : 0);
 }

@@ -69,28 +69,21 @@ static void carry(lav_solver *s) {
 /* -- room: numbers that a method has beside the problem; what depends on arrays is guessed ----------------------------- */
 
 static int64_t sweeps_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
-  int64_t numbers = 64;
-  (void)q, (void)o, (void)n_v;
+  int64_t numbers = n_v + 76;
 #ifndef LAV_SWEEPS_ONLY
-  if (q->form == LAV_BODIES && q->n_blocks >= PACK_FROM)
+  const int32_t fast = is_accelerated(o), packs = q->form == LAV_BODIES && q->n_blocks >= sweep_serial_FEWEST;
+  const int32_t exact = o->method == LAV_BLOCK_GAUSS_SEIDEL || (fast && (o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE));
+  if (!exact && packs)
     numbers += sweep_packed_room_for(q->n_joints, joint_rows(q), q->n_blocks - q->n_joints, contact_rows(q), q->n_bodies);
+  if (exact || (fast && o->convex > 0)) numbers += 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
+  if (fast) numbers += accelerate_accelerated_accelerated_room(q->n_rows, n_v, o->method == LAV_NNCG ? 0 : o->memory);
+#else
+  (void)q, (void)o;
 #endif
   return numbers;
 }
 
 #ifndef LAV_SWEEPS_ONLY
-static int64_t blocks_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
-  (void)o, (void)n_v;
-  return 9 * (int64_t)q->n_rows + 26 * (int64_t)q->n_blocks;
-}
-
-static int64_t accelerated_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
-  const int32_t exact = o->sweep == LAV_BLOCK_SWEEP || q->law == LAV_CONE;
-  const int64_t memory = o->method == LAV_NNCG ? 0 : o->memory;
-  return accelerate_accelerated_accelerated_room(q->n_rows, n_v, memory) + (exact ? 64 : sweeps_room(q, o, n_v)) +
-         (exact || o->convex > 0 ? blocks_room(q, o, n_v) : 0);
-}
-
 static int64_t newton_room(const lav_problem *q, const lav_options *o, int32_t n_v) {
   const int64_t m = q->n_rows, k = q->n_blocks, nv = q->n_velocities;
   const int32_t one = LAV_CONTACT, ends[2] = {0, q->n_rows};
@@ -135,15 +128,15 @@ static const method_t *row_of(int32_t method) {
   static const method_t table[LAV_ADMM + 1] = {
     {0, 0, 0, 0, 0, NULL, NULL, NULL, NULL},
     /* forms, where parts roll, with round cones; blocks, patience; a sweep; room, start, step */
-    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_step, sweeps_room, start_impulses, run_sweeps},
-    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_step, sweeps_room, start_sweeps, run_sweeps},
+    {B, B, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
+    {A | V, A | V, 0, COULOMB_ALONE, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
     {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
     {A, 0, 0, FREE_ROWS, PATIENCE, sweep_serial_sor_step, sweeps_room, start_sweeps, run_sweeps},
-    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_room, start_jacobi, run_sweeps},
+    {A, A, 0, COULOMB_ALONE, PATIENCE, sweep_serial_jacobi_step, sweeps_room, start_sweeps, run_sweeps},
 #ifndef LAV_SWEEPS_ONLY
-    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_step, blocks_room, start_block_sweeps, run_sweeps},
-    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_step, accelerated_room, start_accelerated, run_sweeps},
-    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_step, accelerated_room, start_accelerated, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
+    {ALL, ALL, 0, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
+    {ALL, ALL, A | V, EVERY_LAW, LONG_PATIENCE, sweep_serial_sweep_step, sweeps_room, start_sweeps, run_sweeps},
     {ALL, V, V, EVERY_LAW, PATIENCE, NULL, newton_room, start_newton, run_newton},
     {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
     {A | B, 0, 0, ROWS_ALONE, PATIENCE, NULL, pivots_room, start_pivots, run_pivots},
@@ -303,10 +296,7 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   out->outcome = LAV_MAX_ITERATIONS;
   out->iterations = out->sweeps = out->restarts = 0;
   s->deadline = is_timed(budget) ? budget->clock(budget->clock_data) + budget->seconds : 0.0;
-  if (!s->begun) {
-    judge_watch_begin_watch(&s->watch, s->start[0], s->start[1], row->patience, s->score_room, s->p.n_rows);
-    sweep_serial_form_velocity(&s->swept, s->impulse);
-  }
+  if (!s->begun) judge_watch_begin_watch(&s->watch, s->start[0], s->start[1], row->patience, s->score_room, s->p.n_rows);
   s->begun = 1;
   if (s->p.n_rows == 0) {
     if (budget->tol > 0.0) out->outcome = LAV_CONVERGED;

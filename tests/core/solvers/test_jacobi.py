@@ -6,7 +6,7 @@ from hypothesis import given
 from random_problems import random_lcp, seeds, sweeps
 
 import lavender as lv
-from lavender.solvers.jacobi import safe_damping
+from lavender_ext.sweep import serial
 
 
 @pytest.mark.parametrize("k", [2, 3, 5])
@@ -28,7 +28,7 @@ def test_safe_damping_is_below_the_limit_of_convergence(seed):
     # omega < 2 / L, L the largest eigenvalue of D^-1 A, for symmetric positive semidefinite A.
     problem = random_lcp(seed, m=12)
     scaled = problem.dense() / np.sqrt(np.outer(problem.d, problem.d))
-    assert 0.0 < safe_damping(problem) * np.linalg.eigvalsh(scaled).max() < 2.0
+    assert 0.0 < serial.damping(problem.csr_data) * np.linalg.eigvalsh(scaled).max() < 2.0
 
 
 @given(seed=seeds)
@@ -36,7 +36,7 @@ def test_the_damping_is_the_same_in_every_unit(seed):
     problem, rng = random_lcp(seed, m=12), np.random.default_rng(seed)
     size = 2.0 ** rng.integers(-8, 9, 12)  # each row in a unit of its own; rounds by the square roots alone
     other = lv.Problem.lcp(size[:, None] * problem.dense() * size, size * problem.b)
-    assert safe_damping(other) == pytest.approx(safe_damping(problem), rel=1e-12)
+    assert serial.damping(other.csr_data) == pytest.approx(serial.damping(problem.csr_data), rel=1e-12)
 
 
 @given(seed=seeds)
