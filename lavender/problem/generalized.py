@@ -226,9 +226,8 @@ class Generalized:
 
     def velocity_of(self, v: FloatArray) -> FloatArray:
         """J v (m,) [m/s, rad/s] of velocities v (nv,)."""
-        out = np.empty(self.m)
         own = np.ascontiguousarray(v, np.float64)
-        self.operator.times(own if self.order is None else own[self.order], out)
+        out: FloatArray = self.operator.times(own if self.order is None else own[self.order])
         return out
 
     def bias(self, target: FloatArray) -> FloatArray:
@@ -239,15 +238,11 @@ class Generalized:
 
     def momentum_of(self, v: FloatArray) -> FloatArray:
         """M v (nv,) [kg m/s] of velocities v (nv,)."""
-        out = np.empty(self.nv)
-        self.operator.momentum(v if self.order is None else v[self.order], out)
-        return self._given(out)
+        return self._given(self.operator.momentum(v if self.order is None else v[self.order]))
 
     def force(self, impulse: FloatArray) -> FloatArray:
         """J^T impulse (nv,) [N s] of impulses (m,)."""
-        out = np.empty(self.nv)
-        self.operator.force(impulse, out)
-        return self._given(out)
+        return self._given(self.operator.force(impulse))
 
     def solve(self, x: Any) -> FloatArray:
         """M^-1 x (nv,)."""
@@ -258,9 +253,7 @@ class Generalized:
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """M^-1 J^T impulse (nv,) [m/s, rad/s] of impulses (m,)."""
-        out = np.empty(self.nv)
-        self.operator.change(impulse, out)
-        return self._given(out)
+        return self._given(self.operator.change(impulse))
 
     def _given(self, x: FloatArray) -> FloatArray:
         # from the factor's order to the order given

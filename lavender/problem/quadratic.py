@@ -106,7 +106,7 @@ class QPSolution:
 
     @cached_property
     def _residuals(self) -> tuple[float, ...]:
-        """r_p, r_d, gap, and what each is the sum of."""
+        """r_p, r_d, gap and error."""
         qp, of = self.qp, self.qp.generalized
         least = 0.0
         if largest(qp.target) == 0.0:  # x = 0 may be the solution
@@ -137,7 +137,7 @@ class QPSolution:
         """|x.P x + q.x + b.y + h.z + bounds.z_box|."""
         return self._residuals[2]
 
-    @cached_property
+    @property
     def error(self) -> float:
         """The largest of the three, each relative to what it is the sum of; 0 is a solution.
 
@@ -145,8 +145,7 @@ class QPSolution:
         one over the largest of |q|, |P x|, |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the
         sums of |lambda| and |x|.
         """
-        of = self._residuals
-        return max(of[i] / of[i + 3] if of[i + 3] > 0.0 else of[i] for i in range(3))
+        return self._residuals[3]
 
     @property
     def found(self) -> bool:

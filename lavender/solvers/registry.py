@@ -42,8 +42,10 @@ class SmallCall(Protocol):
     def limits(self) -> Any:
         """What it may cost over generalised velocities."""
 
-    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...) -> Any:
-        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None where it is left."""
+    def attempt(
+        self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...
+    ) -> tuple[Any, Any]:
+        """(what the judge finds, None where it is left, and counts) from an impulse (m,) or from doing nothing."""
 
     def claim(
         self, problem: Problem, counts: Any, start: FloatArray | None, after: float, status: Status
@@ -349,7 +351,7 @@ def get(name: str) -> SolverSpec:
         spec = _found(name)
     if spec is None:
         raise UnknownName("solver", name, specs())
-    reason = spec.missing()
+    reason = spec.requires and spec.missing()
     if reason:
         raise SolverUnavailable(f"solver {name!r} {reason}")
     return spec

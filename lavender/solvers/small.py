@@ -128,20 +128,16 @@ class SmallCall:
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
 
-    def solve(self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf) -> Any:
-        """(what the judge finds, counts) from an impulse (m,) or from doing nothing; None if it does not converge.
-
-        most: counted cost [ns] at which it ends with what was found by then, above tol.
-        """
-        made = self.attempt(problem, impulse, tol, most)
-        return None if made[0] is None else made
-
     def attempt(
         self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf
     ) -> tuple[Any, Any]:
-        """The same, and what was done in vain where the judge finds nothing (None): () where no call was made."""
+        """(what the judge finds, counts) from an impulse (m,) or from doing nothing.
+
+        Where it does not converge the judge finds nothing, None, and counts are of what was done in vain: () where no
+        call was made. most: counted cost [ns] at which it ends with what was found by then, above tol.
+        """
         kept = problem.derived
-        if not tol > 0.0 or problem.m == 0:
+        if not tol > 0.0 or not len(problem.b):
             return None, ()
         if kept.vain is not None and kept.vain[0] == self._call(problem, impulse, tol):
             return None, kept.vain[1]

@@ -456,8 +456,8 @@ def solve_small(
         return None
     if not 0.0 < tol < math.inf:
         return None
-    if problem.cones.has_ellipse or (
-        problem.m > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
+    if problem.cones._blocks.has_ellipse or (
+        len(problem.b) > SMALL_ROWS and (problem.generalized is None or limit < math.inf)
     ):
         return None  # islands may take long: they are solved where Ctrl-C and the clock are heard
     start = perf_counter()
@@ -470,13 +470,9 @@ def solve_small(
         given = impulse
     else:
         given = problem.impulse_array(impulse)
-    if limit == math.inf:
-        found = small.solve(problem, given, tol)
-    else:
-        found = small.solve(problem, given, tol, COUNTED * limit)
-    if found is None:
+    judged, counts = small.attempt(problem, given, tol, COUNTED * limit)
+    if judged is None:
         return None
-    judged, counts = found
     status = CONVERGED
     if judged.relative > tol:
         status, judged = TIME_LIMIT, best_of(problem, judged, given)

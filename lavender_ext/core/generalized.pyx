@@ -1,7 +1,7 @@
 """J and M of generalised coordinates for Python: M's factor, kept, and what the judge and the solvers read of it."""
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
-from libc.string cimport memcmp
+from libc.string cimport memcmp, memset
 
 import numpy as np
 
@@ -151,51 +151,66 @@ cdef class Operator:
             out[i] = self.g.parent[i]
         return out.base
 
-    def solve(self, double[::1] x):
+    def solve(self, x):
         """x <- M^-1 x (n,)."""
         if self.g.n:
-            tree_solve(&self.g, &x[0])
+            tree_solve(&self.g, doubles(x, self.g.n))
 
-    def change(self, const double[::1] lam, double[::1] x):
-        """x = M^-1 J^T lam (n,)."""
+    def change(self, lam):
+        """M^-1 J^T lam (n,), a new array."""
+        made = self.force(lam)
         if self.g.n:
-            if self.g.m == 0:
-                x[:] = 0.0
-                return
-            jac_push(&self.g, &lam[0], &x[0])
-            tree_solve(&self.g, &x[0])
+            tree_solve(&self.g, doubles(made, self.g.n))
+        return made
 
-    def force(self, const double[::1] lam, double[::1] x):
-        """x = J^T lam (n,)."""
-        x[:] = 0.0
+    def force(self, lam):
+        """J^T lam (n,), a new array."""
+        cdef const double* at = doubles(lam, self.g.m)
+        cdef double* x
+        made = new(self.g.n)
+        x = doubles(made, self.g.n)
+        memset(x, 0, self.g.n * sizeof(double))
         if self.g.n and self.g.m:
-            jac_push(&self.g, &lam[0], &x[0])
+            jac_push(&self.g, at, x)
+        return made
 
-    def momentum(self, const double[::1] v, double[::1] x):
-        """x = M v (n,)."""
-        cdef const int32_t[::1] mptr = self.mass[0], midx = self.mass[1]
-        cdef const double[::1] mval = self.mass[2]
+    def momentum(self, given):
+        """M v (n,), a new array."""
+        cdef const double* mval = doubles(self.mass[2], self.mptr[self.g.n])
+        cdef const double* v = doubles(given, self.g.n)
         cdef int32_t i, p
+        cdef double* x
+        made = new(self.g.n)
+        x = doubles(made, self.g.n)
         for i in range(self.g.n):
-            p = mptr[i + 1] - 1
+            p = self.mptr[i + 1] - 1
             x[i] = mval[p] * v[i]
-            for p in range(mptr[i], p):
-                x[i] += mval[p] * v[midx[p]]
-                x[midx[p]] += mval[p] * v[i]
+            for p in range(self.mptr[i], p):
+                x[i] += mval[p] * v[self.midx[p]]
+                x[self.midx[p]] += mval[p] * v[i]
+        return made
 
-    def times(self, const double[::1] x, double[::1] out):
-        """out = J x (m,)."""
+    def times(self, given):
+        """J x (m,), a new array."""
+        cdef const double* x = doubles(given, self.g.n)
         cdef int32_t i
-        for i in range(self.g.m):
-            out[i] = jac_row(&self.g, i, &x[0]) if self.g.n else 0.0
-
-    def bias(self, const double[::1] v, const double[::1] target):
-        """b = target - J v (m,), a new array; what leaves the door's range is left to whoever reads it."""
-        cdef int32_t i
+        cdef double* out
         made = new(self.g.m)
-        cdef double[::1] out = made
+        out = doubles(made, self.g.m)
         for i in range(self.g.m):
-            out[i] = target[i] - (jac_row(&self.g, i, &v[0]) if self.g.n else 0.0)
+            out[i] = jac_row(&self.g, i, x) if self.g.n else 0.0
+        return made
+
+    def bias(self, given, target):
+        """b = target - J v (m,), a new array; what leaves the door's range is left to whoever reads it."""
+        cdef const double* v = doubles(given, self.g.n)
+        cdef const double* t = doubles(target, self.g.m)
+        cdef int32_t i
+        cdef double* out
+        made = new(self.g.m)
+        out = doubles(made, self.g.m)
+        for i in range(self.g.m):
+            out[i] = t[i] - (jac_row(&self.g, i, v) if self.g.n else 0.0)
         return made
 
 

@@ -5,6 +5,7 @@ from libc.string cimport memcmp
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.generalized cimport whitened_gather
 from lavender_ext.core.problem cimport Data, Room, room_for
 from lavender_ext.core.velocity cimport rows_velocity
@@ -216,19 +217,27 @@ cdef inline double larger(double s, double x) noexcept nogil:
     return s if x <= s or s != s else x
 
 
-def program_residuals(const double[::1] x, const double[::1] q, const double[::1] px, const double[::1] force,
-                      const double[::1] jx, const double[::1] target, const double[::1] lam, int32_t free,
-                      double rows, double curved):
-    """(r_p, r_d, gap, rows, forces, energy) of a quadratic program: three residuals, and what each is the sum of.
+cdef inline double share(double x, double of) noexcept nogil:
+    return x / of if of > 0.0 else x
 
-    r_p    max |J x - target| on the first `free` rows, max of target - J x on the others
-    r_d    max |P x + q - J^T lambda|, and the largest of -lambda on the others
-    gap    |x.(P x + q) - target.lambda|
-    energy sum |x| forces + sum |lambda| rows
+
+def program_residuals(x_, q_, px_, force_, jx_, target_, lam_, int32_t free, double rows, double curved):
+    """(r_p, r_d, gap, error) of a quadratic program; the error is the largest of three over what each is the sum of.
+
+    r_p    max |J x - target| on the first `free` rows, max of target - J x on the others;  over rows
+    r_d    max |P x + q - J^T lambda|, and the largest of -lambda on the others;            over forces
+    gap    |x.(P x + q) - target.lambda|;                      over energy = sum |x| forces + sum |lambda| rows
 
     rows is at least what is given, forces at least `curved` max |x|; px (n,) = P x, force (n,) = J^T lambda, jx (m,).
     """
-    cdef Py_ssize_t i, n = x.shape[0], m = lam.shape[0]
+    cdef Py_ssize_t i, n = len(x_), m = len(lam_)
+    cdef const double* x = doubles(x_, n)
+    cdef const double* q = doubles(q_, n)
+    cdef const double* px = doubles(px_, n)
+    cdef const double* force = doubles(force_, n)
+    cdef const double* jx = doubles(jx_, m)
+    cdef const double* target = doubles(target_, m)
+    cdef const double* lam = doubles(lam_, m)
     cdef double primal = 0.0, dual = 0.0, gap = 0.0, forces = 0.0, size = 0.0, far = 0.0, impulse = 0.0, short
     for i in range(n):
         dual = larger(dual, fabs(px[i] + q[i] - force[i]))
@@ -245,4 +254,5 @@ def program_residuals(const double[::1] x, const double[::1] q, const double[::1
         gap -= target[i] * lam[i]
         rows = larger(larger(rows, fabs(target[i])), fabs(jx[i]))
         impulse += fabs(lam[i])
-    return primal, dual, fabs(gap), rows, forces, size * forces + impulse * rows
+    gap, size = fabs(gap), size * forces + impulse * rows
+    return primal, dual, gap, larger(larger(share(primal, rows), share(dual, forces)), share(gap, size))

@@ -12,6 +12,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport doubles
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
@@ -28,6 +29,8 @@ from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, 
 from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
 from lavender_ext.judge.rounding cimport relative_size, squares32
 from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
+
+cdef object new = np.empty
 
 cdef extern from *:
     """
@@ -235,11 +238,9 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     cdef job_t j
     cdef room_t room = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     cdef Py_ssize_t m = p.blocks.n_rows
-    cdef double[::1] lam, both
     cdef bint known = p.ready
-    impulse, results = np.empty(m), np.empty(2 * m + 1)
-    lam, both = impulse, results
-    take(&j, p, start, &lam[0], &both[0])
+    impulse, results = new(m), new(2 * m + 1)
+    take(&j, p, start, doubles(impulse, m), doubles(results, 2 * m + 1))
     j.most = most
     with nogil:
         solve_job(&j, &room, &limits.at, tol)

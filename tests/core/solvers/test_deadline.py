@@ -147,12 +147,12 @@ def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeyp
             assert within.message == without.message and within.work == without.work
         for most in (0.0, 3e3, 1e4, 1e5, 1e6):
             small = fresh(problem)
-            found = AUTO.solve(small, None, 1e-9, most)
+            found, counts = AUTO.attempt(small, None, 1e-9, most)
             assert small.derived.vain is None  # it may be tried again without a limit
             if found is not None:
-                claim = AUTO.claim(small, found[1], None, found[0].relative, lv.Status.TIME_LIMIT)
-                assert claim.message and np.isfinite(found[0].impulse).all()
-                ended.append(found[0].relative <= 1e-9)
+                claim = AUTO.claim(small, counts, None, found.relative, lv.Status.TIME_LIMIT)
+                assert claim.message and np.isfinite(found.impulse).all()
+                ended.append(found.relative <= 1e-9)
     assert any(ended) and not all(ended)
 
 
@@ -164,19 +164,19 @@ def test_steps_that_factor_nothing_are_cheap():
         cones = lv.Cones.bounded(low, low + rng.uniform(0.0, 3.0, 48))
         jac, free = rng.normal(size=(48, 30)), rng.normal(size=30)
         problem = lv.Problem.from_jacobian(jac, np.diag(rng.uniform(0.1, 10.0, 30)), free, cones=cones)
-        steps, factored, _, _ = AUTO.solve(problem, None, 1e-6)[1]
+        steps, factored, _, _ = AUTO.attempt(problem, None, 1e-6)[1]
         of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work)[1]
         most = 1.25 * factored * of_step
         assert most < 0.8 * steps * of_step
-        assert AUTO.solve(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
+        assert AUTO.attempt(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
 
 
 @pytest.mark.parametrize("small", [AUTO, DIRECT, NEWTON], ids=lambda small: small.name)
 def test_more_counted_cost_of_a_small_call_ends_more_problems(small):
     ends = []
     for most in (1e2, 1e4, 1e6, 1e9):
-        found = [small.solve(dense(48, "lcp", seed), None, 1e-9, most) for seed in range(10)]
-        ends.append(sum(x is not None and x[0].relative <= 1e-9 for x in found))
+        found = [small.attempt(dense(48, "lcp", seed), None, 1e-9, most)[0] for seed in range(10)]
+        ends.append(sum(x is not None and x.relative <= 1e-9 for x in found))
     assert ends == sorted(ends)
     assert ends[-1] == 10 or (small.limits is not None and not small.pivots)
 

@@ -110,8 +110,8 @@ def test_rows_of_zeros_leave_a_small_problem_to_the_one_call():
             jac, np.eye(6), rng.normal(size=6), target=np.r_[-0.1, -np.ones(9)],
             cones=lv.Cones.bounded(np.zeros(10), np.full(10, np.inf)),
         )  # fmt: skip
-        found = AUTO.solve(problem, None, 1e-6)
-        solved += found is not None
+        found = AUTO.attempt(problem, None, 1e-6)
+        solved += found[0] is not None
         assert lv.solve(problem).success
     assert solved == 20
 
@@ -120,7 +120,7 @@ def test_most_of_them_do_take_the_short_way():
     took = 0
     for kind in KINDS:
         for seed in range(6):
-            took += registry.get("auto").small.solve(draw(kind, seed), None, 1e-6) is not None
+            took += registry.get("auto").small.attempt(draw(kind, seed), None, 1e-6)[0] is not None
     assert took >= 0.6 * 6 * len(KINDS)  # a chain that gives everything up would pass the tests above
 
 
@@ -129,7 +129,7 @@ def test_small_joints_that_depend_on_each_other_are_one_shifted_factor_more(solv
     g = np.random.default_rng(4).normal(size=(12, 7))
     a = g @ g.T
     problem = lv.Problem.linear(0.5 * (a + a.T), a @ np.ones(12))
-    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
+    assert registry.get(solver).small.attempt(problem, None, 1e-9)[0] is not None
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["rank"] == 7
@@ -275,18 +275,18 @@ def test_an_island_that_does_not_end_leaves_the_whole_to_the_long_way():
     stack = forms(stacks(40, 2, 0.4, False, corners=1))["matrix"].relaxed("cone")
     no_answer = lv.Problem(np.array([1.0, -1.0]), lv.Cones.free(2), np.ones((2, 2)), friction="cone")
     problem = side_by_side([stack, no_answer])
-    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is None
+    assert registry.get("auto").small.attempt(fresh(problem), None, 1e-6)[0] is None
     found = lv.solve(problem)
     assert found.status.name == "INFEASIBLE" and found.certificate is not None
 
 
 def test_islands_are_no_one_call_where_that_may_take_too_long():
     problem = forms(stacks(40, 2, 0.4, False))["matrix"]
-    assert registry.get("auto").small.solve(fresh(problem), None, 1e-6) is not None
+    assert registry.get("auto").small.attempt(fresh(problem), None, 1e-6)[0] is not None
     assert not call_ends_within(problem, 1e-6) and call_ends_within(problem, 10.0)
     pile = stacks(3, 1 + ISLAND // 12, 0.4, False)  # 12 rows for each cube
-    assert registry.get("auto").small.solve(pile, None, 1e-6) is None
-    assert registry.get("newton").small.solve(fresh(problem), None, 1e-6) is None
+    assert registry.get("auto").small.attempt(pile, None, 1e-6)[0] is None
+    assert registry.get("newton").small.attempt(fresh(problem), None, 1e-6)[0] is None
 
 
 def test_islands_where_doing_nothing_is_right_from_a_warm_start():

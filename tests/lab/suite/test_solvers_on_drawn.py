@@ -207,7 +207,7 @@ def test_small_bounded_rows_that_depend_on_each_other_are_one_shift(solver, seed
     found = check(problem, solver, tol=1e-9)
     assert found.success
     assert found.work["shifts"] == 1 and found.work["factorisations"] <= 6
-    assert registry.get(solver).small.solve(problem, None, 1e-9) is not None
+    assert registry.get(solver).small.attempt(problem, None, 1e-9)[0] is not None
 
 
 @pytest.mark.parametrize("tol", [1e-3, 1e-9])
@@ -222,7 +222,7 @@ def test_where_exchanges_of_few_rows_are_stuck_auto_follows_lemkes_path(seed, to
     assert said, found.message
     assert found.work["pivots"] == int(said[1]) + int(said[2])
     assert found.iterations > int(said[2])
-    assert registry.get("direct").small.solve(problem, None, tol) is None  # which is exchanges alone
+    assert registry.get("direct").small.attempt(problem, None, tol)[0] is None  # which is exchanges alone
 
 
 def test_small_bounded_rows_that_are_nearly_singular_end_where_that_meets_the_tolerance():
@@ -253,7 +253,7 @@ def test_steps_over_few_velocities_that_were_in_vain_are_not_taken_twice_in_one_
     found, counts = solve_first(replace(problem, copy=False).metric, None, 1e-6, AUTO.limits)
     assert found is None and counts[0] > 0
     fresh = replace(problem, copy=False)
-    assert registry.get("auto").small.solve(fresh, None, 1e-6) is None
+    assert registry.get("auto").small.attempt(fresh, None, 1e-6)[0] is None
     assert fresh.derived.vain is not None
     solution = check(problem, "auto", tol=1e-6)
     first = solution.turns[0]
