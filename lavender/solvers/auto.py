@@ -5,14 +5,14 @@
                                 sweeps: one compiled call (`small.py`); if that does not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
-    sweeps (`anderson`)         where 100 cost less than Newton's method, or a compiled call of it has failed: for its
-                                cost, or until they predict that they will cost more than it
+    sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
+                                where 100 cost less than it
     Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile that does
                                 not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
-                                rows of A, the cheaper first
-    all in turn                 with doubled work, until nobody gains: sweeps, `newton`, and `admm` or, of J and M,
-                                `nncg`; all together LAST times Newton's cost
+                                rows of A, the cheaper first; what stalls from another's impulse begins from nothing
+    all in turn                 with doubled work, until nobody gains in two turns: `newton`, `admm` or, of J and M,
+                                `nncg`, and sweeps as long as these gain; all together LAST times Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -42,13 +42,13 @@ from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
-from lavender.solvers.steps import METHODS, Direct, Iterations, Newton, Step, Sweeps, setup_time
+from lavender.solvers.steps import METHODS, PROBE, Direct, Iterations, Newton, Step, Sweeps, setup_time
 from lavender_ext.factor import graph
 
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
-LAST = 100.0  # times Newton's counted cost, that all have together
+LAST = 200.0  # times Newton's counted cost, that all have together
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
@@ -81,6 +81,7 @@ class Tree:
     begun = 0.0  # ns, of sweeps before Newton's method
     left = 0.0  # ns, for turns; who takes the lines gives back what did not run
     tried = False  # velocities of J and M, in the compiled call
+    swept = False  # in vain, in turn
     best = nan  # relative residual, as who takes the lines tells
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -214,7 +215,7 @@ class Tree:
                 share = min(1.0, self.left / stage.cost)
                 self.left -= share * stage.cost
                 yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
-            if self.best > GAIN * before:
+            if k > 0 and self.best > GAIN * before:
                 return
 
     def factorisations(self, times: float) -> Iterator[Stage]:
@@ -229,7 +230,7 @@ class Tree:
         cost = (self.half if short else newton) - self.begun
         if short and self.law == "coulomb":
             cost *= 0.5  # nncg has the other half
-        pays = short or self.tried or costs.SWEEPS * self.sweep <= newton
+        pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             why = f"{words(cost)} of what newton costs"
@@ -249,10 +250,12 @@ class Tree:
         """All, with so many times the work of Newton's method before."""
         cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         why = f"in turn, {times * MOST:g} times newton's cost"
-        if not self.problem.cones.has_round:
-            yield self.sweeps(cost, why)
         yield from self.factorisations(times * MOST)
         yield self.iterations("admm" if self.problem.generalized is None else "nncg", cost, why)
+        if not self.swept and not self.problem.cones.has_round:
+            before = self.best
+            yield self.sweeps(cost, why)
+            self.swept = self.best > GAIN * before
 
 
 def words(ns: float) -> str:
@@ -344,7 +347,8 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         if step is None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
-            if isinstance(step, Sweeps) and not tree_goes_on(tree, steps, stage.cost):
+            most = PROBE * log.deadline.nanoseconds()
+            if isinstance(step, Sweeps) and not tree_goes_on(tree, steps, min(stage.cost, most)):
                 step.finish()
                 return
             if isinstance(step, Newton | Direct):

@@ -82,13 +82,24 @@ class Step:
 
 
 class Newton(Step):
-    """From the state whose factor was counted."""
+    """From the state whose factor was counted; if it ends in vain, once more from doing nothing."""
+
+    anew = lost = False
+
+    def run(self, n: float) -> None:
+        log, done = self.log, self.log.iterations
+        super().run(n)
+        if self.lost and not self.anew and not log.done():
+            self.anew, self.over, self.state.begun = True, False, False
+            super().run(n - (log.iterations - done))
 
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.state.begun:
-            self.impulse = log.impulse.copy()
+            self.impulse = log.problem.start() if self.anew else log.impulse.copy()
+            self.anew = not (self.impulse - log.problem.start()).any()
         claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
+        self.lost = claim.status is Status.STALLED
         self.offer()
         return claim
 
@@ -167,7 +178,7 @@ class Sweeps(Step):
         try:
             left = self.log.deadline.left()
             if left is not None and 1e-9 * self.cost > PROBE * left:
-                self.until(Deadline(min(left, 1e-9 * self.cost)), n, True)
+                self.until(Deadline(PROBE * left), n, True)
             else:
                 self.predicted(n)
         finally:
@@ -178,7 +189,9 @@ class Sweeps(Step):
         """As many as end in time; `checked`: and are judged in it."""
         log = self.log
         room = PROBE, CHUNK_TIME, checked
-        pace = self.state.within(self.impulse, self.relative, n, log.tol, FIRST, deadline.left, *room)
+        pace = self.state.within(
+            self.impulse, self.relative, n, log.tol, FIRST, deadline.left, log.deadline.left, *room
+        )
         last = self.state.now
         if last is not None:
             self.rest = pace * sweeps_left(self.state.last, self.state.before, last.relative, log.tol)

@@ -21,6 +21,7 @@ run = AcceleratedSweeps.run
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
     PATIENCE = 500              # of their watch
+    HOPELESS = 10               # times the time that is left, which sweeps may promise to take: they gain pace
 
 
 cpdef double sweeps_left(double done, double before, double now, double tol) noexcept nogil:
@@ -103,11 +104,12 @@ cdef class CheckedSweeps:
             before = now
             sweeps = min(max(self.done // 2, first), end - self.done)
 
-    def within(self, lam, double before, int n, double tol, int first, left, double share, double chunk, bint checked):
+    def within(self, lam, double before, int n, double tol, int first, left, most, double share, double chunk, bint checked):
         """The same for as long as `left()` [s] says; returns what a sweep has taken [s].
 
         One, as sweeps that solve blocks exactly are no steady work, then as many as fit into `share` of what is left, at
-        most `chunk` [s], at the pace of the last. `checked`: the last sweeps end with a check.
+        most `chunk` [s], at the pace of the last. `checked`: the last sweeps end with a check, and all end where one
+        promises far more than `most()` [s].
         """
         cdef double time = left(), was, pace
         cdef int32_t at = self.done, end = at + n, due = at + first, step
@@ -128,6 +130,8 @@ cdef class CheckedSweeps:
             was, time = time, left()
             pace = max(was - time, 1e-9) / (step + is_due)
             if self.done >= end or 2.0 * time <= pace:
+                break
+            if is_due and checked and pace * sweeps_left(self.last, self.before, before, tol) > HOPELESS * most():
                 break
             fit = min(share * time, chunk) / pace
         if checked and self.done > at:
