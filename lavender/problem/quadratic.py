@@ -51,8 +51,9 @@ PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
 FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
-# Entries of J, whitened, over those of J and of M's factor, from which (4) costs less, and variables up to which not.
-FILLED, FEW = 3.0, 100
+# Entries of J, whitened, over those of J and of M's factor, from which (4) costs less than more than one compiled call
+# over velocities; and of more than MANY variables than that call; variables up to which it does not.
+FILLED, WHOLLY, MANY, FEW = 1.0, 3.0, 300, 100
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
@@ -202,11 +203,17 @@ class QuadraticProgram:
         general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
         return replace(self, generalized=general, proximal=d)
 
-    @property
-    def fills_in(self) -> bool:
-        """Whether J, whitened, has so many more entries than J that rows of (4) are solved sooner."""
+    @cached_property
+    def filled(self) -> float:
+        """Entries of J, whitened, over those of J and of M's factor; 0 where rows of (4) are not solved sooner."""
         of = self.generalized.operator
-        return bool(of.n > FEW and of.reach > FILLED * (len(of.jac[1]) + len(of.mass[1]) + of.fill))
+        share = of.reach / max(1.0, len(of.jac[1]) + len(of.mass[1]) + of.fill) if of.n > FEW else 0.0
+        return share if share > FILLED else 0.0
+
+    @property
+    def fills_wholly(self) -> bool:
+        """Whether whitening J alone may cost more than rows of (4)."""
+        return self.filled > WHOLLY and len(self.q) > MANY
 
     @property
     def _rows_of_box(self) -> tuple[tuple[IntpArray, slice], ...]:

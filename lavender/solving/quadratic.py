@@ -2,7 +2,8 @@
 
     x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
 
-Where `auto` has a P that fills J in, it solves the rows (4) of `problem/quadratic.py` in its place, which stay sparse.
+Where `auto` has a P that fills J in, and its compiled call does not solve the program, it solves the rows (4) of
+`problem/quadratic.py` in its place, which stay sparse.
 Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
 program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 """
@@ -21,7 +22,7 @@ from lavender.base.errors import InputError
 from lavender.judge.solution import Claim, Solution, Status
 from lavender.problem import Problem, QPSolution
 from lavender.solvers.registry import SMALL_ROWS, get
-from lavender.solving.solve import judged_later, seconds_of, solve
+from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
 __all__ = ["solve_qp"]
 
@@ -90,7 +91,7 @@ def solve_qp(
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
-    sparse = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS and qp.fills_in
+    sparse = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS and qp.filled > 0.0
     step = _over_rows if sparse else _over_velocities
     solution, x = step(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)
@@ -140,8 +141,12 @@ def _over_velocities(
 def _over_rows(
     problem: Problem, solver: str, tol: float, time_limit: float | None, impulse: Any, options: dict[str, Any]
 ) -> Step:
-    """The sparse rows of `problem.qp`; where these are not solved, velocities."""
+    """The compiled call over velocities, then sparse rows of `problem.qp`; where these are not solved, velocities."""
     qp, watch = problem.qp, Stopwatch()
+    if not qp.fills_wholly:
+        made = solve_small(problem, get(solver), impulse, tol, seconds_of(time_limit))
+        if made is not None:
+            return made, None
     b, cones, matrix = qp.over_rows()
     over = Problem(b, cones, matrix, copy=False)
     start = None if impulse is None else qp.start_over_rows(problem.impulse_array(impulse))

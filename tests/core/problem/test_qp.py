@@ -416,6 +416,35 @@ def test_a_singular_hessian_that_fills_j_in_is_solved_over_sparse_rows(seed):
     assert max(kkt(qp, answer)) <= 1e-5
 
 
+def test_a_hessian_that_fills_j_in_is_left_to_velocities_where_their_one_call_solves_it():
+    n, rng = 200, np.random.default_rng(3)
+    P = sp.diags_array([-1.0, 2.05, -1.0], offsets=[-1, 0, 1], shape=(n, n))
+    problem = lv.Problem.from_qp(sp.csr_array(P), rng.normal(size=n), sp.eye_array(n), np.full(n, 2.0))
+    assert problem.qp.filled > 3.0
+    answer = lv.solve_qp(problem, tol=1e-9)
+    assert answer.found and "over the rows" not in answer.solution.message
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_controls_that_are_coupled_from_stage_to_stage_are_solved_over_sparse_rows(seed):
+    """States follow controls, whose changes cost: J fills in by less than three times, and one call solves none."""
+    n, nx, nu, rng = 30, 6, 3, np.random.default_rng(seed)
+    step = sp.csr_array(sp.eye_array(n) - sp.eye_array(n, k=-1))
+    change = sp.kron(0.1 * sp.eye_array(n) + 0.5 * step.T @ step, sp.eye_array(nu))
+    turn = np.linalg.qr(rng.normal(size=(nx, nx)))[0]  # states neither grow nor fade
+    states = sp.eye_array(n * nx) - sp.kron(sp.eye_array(n, k=-1), turn)
+    A = sp.hstack([states, -sp.kron(sp.eye_array(n), 0.3 * rng.normal(size=(nx, nu)))])
+    b = np.r_[turn @ rng.normal(size=nx), np.zeros((n - 1) * nx)]
+    q = np.r_[-np.tile(rng.normal(size=nx), n), np.zeros(n * nu)]
+    wide = np.r_[np.full(n * nx, np.inf), np.full(n * nu, 0.3)]
+    P = sp.csr_array(sp.block_diag([sp.eye_array(n * nx), change]))
+    problem = lv.Problem.from_qp(P, q, A=sp.csr_array(A), b=b, lb=-wide, ub=wide)
+    assert 1.0 < problem.qp.filled < 3.0
+    answer = lv.solve_qp(problem, tol=1e-6)
+    assert answer.found and "over the rows" in answer.solution.message
+    np.testing.assert_allclose(answer.x, lv.solve_qp(problem, "newton", tol=1e-6).x, atol=1e-4)
+
+
 def test_a_wide_program_without_a_feasible_point_is_proven_infeasible():
     qp = chained(0)
     qp["A"], qp["b"] = sp.csr_array(np.ones((2, 150))), np.array([0.0, 1.0])
