@@ -58,7 +58,7 @@ cdef struct flow_t:
     const int32_t* icols        # (<= n) ascending in each
     const int32_t* local        # (n) number of a column in its island
     int32_t plain               # bounded rows alone
-    const int32_t* few          # (n_islands) A of its bounded rows is less work than N
+    const int32_t* few          # (n_islands) A is less work than N
     int32_t sparse              # one at least is not few: L is known
     const int32_t* lptr         # (n + 1) rows of the islands' L, one after the other
     const int32_t* lidx         # columns in their island, ascending

@@ -151,11 +151,12 @@ cdef struct need_t:             # what the islands of a problem ask for
 
 
 cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexcept nogil:
-    """Has A of bounded rows less work than N? Then what it asks for is counted, else the work of N without its factor.
+    """Has A less work than N? Then what it asks for is counted, else the work of N without its factor.
 
     By multiply-adds of one step of three, half of the rows pushing; constants fitted to dense rows and to trees.
     """
     cdef int32_t a, b
+    cdef bint few
     cdef double rows = 0.0, values = 0.0, normal = 0.0, added = 0.0, formed, size = f.cptr[island + 1] - f.cptr[island], v, nc
     for a in range(f.iptr[island], f.iptr[island + 1]):
         rows += row_end(f, a) - row_from(f, a)
@@ -165,14 +166,15 @@ cdef inline bint count_few(const flow_t* f, int32_t island, need_t* need) noexce
             values += v
             added += ADDED * 0.5 * v * nc
             normal += nc * (28.0 + 2.0 * nc + 0.5 * v)
-    formed = rows * (values / 6.0 + rows + rows * rows / 24.0)
-    if not f.plain or formed > normal or rows * (rows + size) > 1e9:
+    formed = rows * (values / 6.0 + (rows + rows * rows / 24.0 if f.plain else 3.0 * rows + rows * rows / 6.0))
+    few = f.plain or (f.law != COULOMB and rows <= size)    # `swap` has room for these
+    if not few or formed > normal or rows * (rows + size) > 1e9:
         need.work += added
         return False
     need.work += formed
     rows += 3.0
-    if 0.5 * rows * rows > need.values:
-        need.values = 0.5 * rows * rows
+    if rows * rows > need.values:
+        need.values = rows * rows
     if rows * (rows + size) > need.formed:
         need.formed = rows * (rows + size)
     if rows > need.rows:

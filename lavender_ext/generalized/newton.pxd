@@ -1,4 +1,4 @@
-"""Newton's method over the velocities of generalised coordinates, island by island; A is never formed.
+"""Newton's method over the velocities of generalised coordinates, island by island, of which few rows form A (`normal.pxd`).
 
 With y = D^1/2 L (v - v*), whitened, s = Y y - b, and the answer lambda(s) of softened blocks (`flow.pxd`):
 

@@ -1,10 +1,14 @@
 """N = I + Y^T V Y of one island and its factor: in the pattern of L, or whole under Coulomb's law (`newton.pxd`).
 
-Where an island has few rows, all bounded, A = Y Y^T serves every step, its columns formed when their rows first push.
-y is kept as Y^T mu and p as Y^T pi; by the matrix inversion lemma, a the rows that answer:
+Where an island has few rows, A = Y Y^T serves every step, its columns formed when their rows first push.
+y is kept as Y^T mu and p as Y^T pi; by the matrix inversion lemma, a the rows that answer, all of them bounded:
 
     h = A (mu - lambda) = s + b - A lambda,    S = Theta_a + A_aa,    z = S^-1 h_a                        (1)
     pi = lambda - mu + E_a z,    q = A pi = A E_a z - h,    q_a = -Theta_a z                              (2)
+
+and where blocks of V may be full, as those of contacts, a the rows of those that are not 0:
+
+    (I + A_aa V_aa) t = h_a,    x = V_aa t,    pi = lambda - mu + E_a x,    q = A E_a x - h,    q_a = -t      (3)
 """
 from libc.stdint cimport int32_t
 from libc.string cimport memcpy
@@ -221,11 +225,47 @@ cdef inline void solve_rows(const flow_t* f, double* z) noexcept nogil:
         l += a + 1
 
 
+cdef inline int32_t pass_blocks(const flow_t* f, const double* t, double* x) noexcept nogil:
+    """x = V t of (3), or where t is NULL: which rows answer, and V A of them, row by row, in x; how many they are."""
+    cdef int32_t a, i, r, k, size, end, place = 0, n = 0
+    cdef const double* v
+    cdef bint answers
+    for a in range(f.iptr[f.island], f.iptr[f.island + 1]):
+        for i in range(block_from(f, a), block_end(f, a)):
+            v, end = f.held + f.vptr[i], place + f.p.ptr[i + 1] - f.p.ptr[i]
+            size = 1 if is_rows(&f.p, i) else end - place
+            while place < end:
+                answers = False
+                for k in range(size * size):
+                    answers |= v[k] != 0.0
+                if answers and t == NULL:
+                    for r in range(size):
+                        find_column(f, place + r)
+                        f.places[n + r], f.columns[n + r] = place + r, (place + r) * f.rows
+                    for r in range(size):
+                        combine(f.wide, f.rows, size, f.a, f.columns + n, v + r * size, x + <ssize_t>(n + r) * f.rows)
+                elif answers:
+                    for r in range(size):
+                        x[n + r] = dot(v + r * size, t + n, size)
+                n += size if answers else 0
+                place += size
+                v += size * size
+    return n
+
+
 cdef inline void form_rows(flow_t* f) noexcept nogil:
-    """The lower triangle of S, row by row, in `factor`."""
+    """The lower triangle of S, row by row, in `factor`; of (3) I + A V, in `factor` whole."""
     cdef int32_t a, b, n = 0
     cdef const double* column
     cdef double* to = f.factor
+    if not f.plain:
+        f.n_answering = n = pass_blocks(f, NULL, f.normal)
+        for a in range(n):
+            for b in range(n):
+                to[b] = f.normal[<ssize_t>b * f.rows + f.places[a]]     # V and A are symmetric
+            to[a] += 1.0
+            to += n
+        return
     for a in range(f.n_own):
         if f.v[f.own[a]] != 0.0:
             find_column(f, a)
@@ -241,21 +281,27 @@ cdef inline void form_rows(flow_t* f) noexcept nogil:
 
 
 cdef inline void step_by_rows(const flow_t* f) noexcept nogil:
-    """pi and q of (2)."""
+    """pi and q of (2) or (3)."""
     cdef int32_t a, k
     cdef double* z = f.local_rhs
+    cdef double* x = z
     for a in range(f.n_answering):
         z[a] = f.grad[f.own[f.places[a]]]
-    solve_rows(f, z)
-    combine(f.wide, f.rows, f.n_answering, f.a, f.columns, z, f.sum)
+    if f.plain:
+        solve_rows(f, z)
+    else:
+        x = f.sum + f.rows
+        lu_solve(f.n_answering, f.factor, f.swap, z)
+        pass_blocks(f, z, x)
+    combine(f.wide, f.rows, f.n_answering, f.a, f.columns, x, f.sum)
     for a in range(f.n_own):
         k = f.own[a]
         f.step[k] = f.lam[k] - f.y[k]
         f.q[k] = f.sum[a] - f.grad[k]
     for a in range(f.n_answering):
         k = f.own[f.places[a]]
-        f.step[k] += z[a]
-        f.q[k] = -f.theta[k] * z[a]                     # without what (2) cancels
+        f.step[k] += x[a]
+        f.q[k] = -f.theta[k] * z[a] if f.plain else -z[a]   # without what (2) and (3) cancel
 
 
 # -- N -----------------------------------------------------------------------------------------------------------
@@ -302,7 +348,7 @@ cdef inline int32_t factor(flow_t* f, int32_t island, bint square) noexcept nogi
     cdef const int32_t* lptr = f.lptr + f.cptr[island]
     f.factorisations += 1
     if f.formed:
-        return factor_rows(f)
+        return factor_rows(f) if f.plain else lu_factor(f.n_answering, f.factor, f.swap)
     if square:
         memcpy(f.factor, f.normal, <ssize_t>size * size * sizeof(double))
         return lu_factor(size, f.factor, f.swap)
