@@ -19,7 +19,6 @@ cdef class Blocks:
                     const double[::1] upper, const double[::1] mu, const double[::1] radius,
                     const double[::1] rolling)
     cdef bint check(self) noexcept
-    cdef void spell(self) noexcept
 
 
 cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=*, Py_ssize_t numbers=*)

@@ -9,7 +9,8 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport frozen, ndarray
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, lay_frictions
+from lavender_ext.core.parts cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, fits, lay_frictions,
+                                      spell_bounds)
 
 cdef enum:
     CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
@@ -76,26 +77,17 @@ cdef class Blocks:
         for i in range(p.n_blocks):
             size = p.ptr[i + 1] - p.ptr[i]
             kind = p.kind[i]
-            if size <= 0 or not is_size(p.mu[i]) or not is_size(p.patch_radius[i]) or not is_size(p.rolling[i]):
+            if not is_size(p.mu[i]) or not is_size(p.patch_radius[i]) or not is_size(p.rolling[i]):
                 return False
             if kind != ROW and not is_size(p.mu[i] * p.patch_radius[i]):
                 return False
-            if kind == ROUND:
-                self.has_round = True
-                if not 3 < size <= 6:
+            self.has_round |= kind == ROUND
+            self.has_rolling |= kind == CONTACT_ROLLING
+            if kind == CONTACT_ELLIPSE:
+                self.has_ellipse, kind = True, CONTACT_BOX
+                if not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
                     return False
-            elif kind == CONTACT_BOX or kind == CONTACT_ELLIPSE:
-                if kind == CONTACT_ELLIPSE:
-                    self.has_ellipse = True
-                if size != 3:
-                    return False
-                if kind == CONTACT_ELLIPSE and not 1.0 / WIDEST <= p.patch_radius[i] <= WIDEST:
-                    return False
-            elif kind == CONTACT_ROLLING:
-                self.has_rolling = True
-                if not 5 <= size <= 6:
-                    return False
-            elif kind != ROW and (not 0 < kind < ROUND or size < kind or size > kind + 2):
+            if not fits(kind, size):
                 return False
             if kind != ROW or size > 1:
                 self.single_rows = False
@@ -114,17 +106,6 @@ cdef class Blocks:
                 elif p.lower[j] != -INF or p.upper[j] != INF:
                     self.is_free = False
         return True
-
-    cdef void spell(self) noexcept:
-        # One spelling for bounds of contacts, which nobody reads, so that equal problems compare equal.
-        cdef int32_t i, j
-        cdef double* lower = <double*>self.at.lower
-        cdef double* upper = <double*>self.at.upper
-        for i in range(self.at.n_blocks):
-            if self.at.kind[i] != ROW:
-                for j in range(self.at.ptr[i], self.at.ptr[i + 1]):
-                    lower[j] = 0.0 if j == self.at.ptr[i] else -INF
-                    upper[j] = INF
 
 
 cdef Blocks room_of(Py_ssize_t k, Py_ssize_t m, Py_ssize_t ints=0, Py_ssize_t numbers=0):
@@ -203,7 +184,7 @@ def private(ptr, kind, lower, upper, mu, patch_radius, rolling):
     put(made, 0, 0, &given.at)
     if not made.check():
         return None
-    made.spell()
+    spell_bounds(&made.at)
     return made
 
 

@@ -6,7 +6,8 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.arrays cimport DOUBLE, TOGETHER, doubles, is_of, ndarray
-from lavender_ext.core.door cimport first_unsized, least, most
+from lavender_ext.core.door cimport first_unsized, is_definite, is_frame, is_size, least, most
+from lavender_ext.core.door cimport largest as greatest
 
 #: The largest and the least size that a number of a problem may have.
 MOST, LEAST = most(), least()
@@ -102,47 +103,17 @@ def are_pairs(const int32_t[:, ::1] pair, int32_t n, bint moves):
 
 def are_frames(const double[:, ::1] normal, const double[:, ::1] tangent):
     """Whether normals and tangents (c, 3) are orthogonal unit vectors, to half of what is allowed."""
-    cdef Py_ssize_t i, k
-    cdef double nn, tt, nt
+    cdef Py_ssize_t i
     for i in range(normal.shape[0]):
-        nn = tt = -1.0
-        nt = 0.0
-        for k in range(3):
-            nn += normal[i, k] * normal[i, k]
-            tt += tangent[i, k] * tangent[i, k]
-            nt += normal[i, k] * tangent[i, k]
-        if not (fabs(nn) <= 5e-10 and fabs(tt) <= 5e-10 and fabs(nt) <= 5e-10):
+        if not is_frame(&normal[i, 0], &tangent[i, 0], 5e-10):
             return False
     return True
 
 
 def are_definite(const double[:, :, ::1] tensor):
     """Whether every tensor (n, 3, 3) is zero, or symmetric to half of what is allowed with pivots well above 0."""
-    cdef Py_ssize_t i, j, k
-    cdef double size, skew, p, q, r, s, t, a
+    cdef Py_ssize_t i
     for i in range(tensor.shape[0]):
-        size = 0.0
-        skew = 0.0
-        for j in range(3):
-            for k in range(3):
-                if fabs(tensor[i, j, k]) > size:
-                    size = fabs(tensor[i, j, k])
-                if fabs(tensor[i, j, k] - tensor[i, k, j]) > skew:
-                    skew = fabs(tensor[i, j, k] - tensor[i, k, j])
-        if size == 0.0:
-            continue
-        a = 1.0 / size
-        if not (size >= LEAST and skew <= 5e-10 * size):
-            return False
-        p = tensor[i, 0, 0] * a
-        if not p > 1e-6:
-            return False
-        q = tensor[i, 1, 0] * a
-        r = tensor[i, 2, 0] * a
-        s = tensor[i, 1, 1] * a - q * (q / p)
-        if not s > 1e-6:
-            return False
-        t = tensor[i, 2, 1] * a - q * (r / p)
-        if not tensor[i, 2, 2] * a - r * (r / p) - t * (t / s) > 1e-6:
+        if not (is_size(greatest(&tensor[i, 0, 0], 9)) and is_definite(&tensor[i, 0, 0], 5e-10, 0.0, 1e-6)):
             return False
     return True

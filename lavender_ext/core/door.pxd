@@ -60,3 +60,24 @@ cdef inline double largest(const double* x, int64_t n) noexcept nogil:
     for i in range(n):
         s = fabs(x[i]) if fabs(x[i]) > s else s
     return s
+
+
+cdef inline bint is_frame(const double* n, const double* t, double off) noexcept nogil:
+    """Whether two vectors are orthogonal and their squares 1, all to `off`."""
+    cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]
+    return (fabs(nn - 1.0) <= off and fabs(tt - 1.0) <= off
+            and fabs(n[0] * t[0] + n[1] * t[1] + n[2] * t[2]) <= off)
+
+
+cdef inline bint is_definite(const double* x, double skew, double shift, double pivot) noexcept nogil:
+    """Whether (3, 3) is 0, or divided by its largest entry s symmetric to `skew`, the pivots of x / s + shift above `pivot`."""
+    cdef double s = largest(x, 9), p, q, r, a, b, c
+    if s == 0.0:
+        return True
+    if not (fabs(x[3] - x[1]) <= skew * s and fabs(x[6] - x[2]) <= skew * s and fabs(x[7] - x[5]) <= skew * s):
+        return False
+    q, r, p = x[3] / s, x[6] / s, x[0] / s + shift
+    if not p > pivot:
+        return False
+    a, b, c = x[4] / s + shift - q * (q / p), x[7] / s - r * (q / p), x[8] / s + shift - r * (r / p)
+    return a > pivot and c - b * (b / a) > pivot

@@ -71,6 +71,27 @@ cdef inline void from_block(blocks_t* p, const blocks_t* all, int32_t i) noexcep
     p.kind, p.mu, p.patch_radius, p.rolling = all.kind + i, all.mu + i, all.patch_radius + i, all.rolling + i
 
 
+cdef inline bint fits(int32_t kind, int32_t n) noexcept nogil:
+    """Whether a block of that kind may have n rows."""
+    if kind == ROW:
+        return n > 0
+    if kind == CONTACT or kind == CONTACT_SPIN:
+        return kind <= n <= kind + 2
+    if kind == ROUND:
+        return 3 < n <= 6
+    return n == 3 if kind == CONTACT_BOX else kind == CONTACT_ROLLING and 5 <= n <= 6
+
+
+cdef inline void spell_bounds(const blocks_t* p) noexcept nogil:
+    """One spelling for bounds of contacts, which nobody reads, so that equal problems compare equal."""
+    cdef int32_t i, j
+    for i in range(p.n_blocks):
+        if p.kind[i] != ROW:
+            for j in range(p.ptr[i], p.ptr[i + 1]):
+                (<double*>p.lower)[j] = 0.0 if j == p.ptr[i] else -1.0 / 0.0
+                (<double*>p.upper)[j] = 1.0 / 0.0
+
+
 cdef inline bint is_rows(const blocks_t* p, int32_t i) noexcept nogil:
     """Bounded rows, without a normal."""
     return p.kind[i] == ROW

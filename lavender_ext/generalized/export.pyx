@@ -14,7 +14,7 @@ import numpy as np
 from lavender_ext.core.arrays cimport DOUBLE, INT, doubles, frozen, ints, ndarray, spread
 from lavender_ext.core.blocks cimport Blocks, room_of
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind
+from lavender_ext.core.parts cimport ROW, blocks_t, contact_kind, spell_bounds
 from lavender_ext.core.problem cimport Room, room_for
 
 
@@ -152,7 +152,7 @@ def blocks(type_, id_, codes, tuple most, dim, friction, geom, loss, double dt):
         return -1 - k
     p.n_blocks = k
     fits = made.check()
-    made.spell()
+    spell_bounds(&made.at)
     return made if fits else None, made.numbers[5 * m:6 * m], frozen(keys if k == m else keys[:k])
 
 

@@ -113,7 +113,7 @@ cdef inline void next_order(context_t* c, bint first) noexcept nogil:
         c.packing.backwards = 1 - c.packing.backwards
 
 
-cdef inline double damping(const blocks_t* p, const csr_t* a, double* root) noexcept nogil:
+cdef inline double safe_damping(const blocks_t* p, const csr_t* a, double* root) noexcept nogil:
     """min(1, 1.6 / max_i sum_j |A_ij| sqrt(s_i s_j)) of jacobi, s the steps; root (m) is scratch."""
     cdef double most = 0.0, sum
     cdef int32_t i, q

@@ -23,8 +23,7 @@ from lavender_ext.sweep.levels cimport sweep_levels
 from lavender_ext.sweep.packed cimport move_impulses, room_of, sweep_records
 from lavender_ext.sweep.pgs cimport relax_bodies, relax_general, relax_matrix
 from lavender_ext.sweep.serial cimport (NOT_YET, READY, USELESS, WHOLE, context_t, form_velocity, is_packed, may_pack,
-                                        next_order, packing_t, sweeps_room, sweeps_start, sweeps_step)
-from lavender_ext.sweep.serial cimport damping as safe_damping
+                                        next_order, packing_t, safe_damping, sweeps_room, sweeps_start, sweeps_step)
 
 
 cdef void sweep(context_t* c, const blocks_t* p, bint exact, double* lam, bint first) noexcept nogil:

@@ -219,7 +219,6 @@ static int32_t refuse(where_t *at, int32_t code, const char *array, int64_t inde
 }
 
 static int32_t check_blocks(const lav_problem *q, where_t *at) {
-  static const int32_t least_rows[6] = {1, 1, 2, 4, 3, 5}, most_rows[6] = {1, 3, 4, 6, 3, 6}; /* by kind */
   int32_t i, j;
   if (q->n_rows > 0 && !q->block_ptr && q->n_blocks != q->n_rows) return refuse(at, LAV_ERROR_BLOCKS, "n_blocks", 0);
   if (q->block_ptr) {
@@ -235,8 +234,7 @@ static int32_t check_blocks(const lav_problem *q, where_t *at) {
     const double mu = q->mu ? q->mu[i] : 0.0, radius = q->patch_radius ? q->patch_radius[i] : 0.0;
     const double rolling = q->rolling ? q->rolling[i] : 0.0;
     if (kind < LAV_ROW || kind > LAV_CONTACT_ROLLING) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
-    if (end - first < least_rows[kind] || (kind != LAV_ROW && end - first > most_rows[kind]))
-      return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
+    if (!core_parts_fits(kind, end - first)) return refuse(at, LAV_ERROR_BLOCKS, "block_ptr", i + 1);
     if (q->form == LAV_BODIES && (kind == LAV_ROW) != (i < q->n_joints)) return refuse(at, LAV_ERROR_BLOCKS, "kind", i);
     if (!core_door_is_size(mu)) return refuse(at, LAV_ERROR_FRICTION, "mu", i);
     if (!core_door_is_size(radius) || (kind != LAV_ROW && !core_door_is_size(mu * radius))) return refuse(at, LAV_ERROR_FRICTION, "patch_radius", i);
@@ -293,30 +291,10 @@ static int32_t check_numbers(const double *x, int64_t n, int32_t is_needed, cons
 static double off_frame(const double *n, const double *t) {
   double nn = core_rows_dot3(n, n), tt = core_rows_dot3(t, t), most;
   const double nt = fabs(core_rows_dot3(n, t));
-  if (fabs(nn - 1.0) <= EXACT && fabs(tt - 1.0) <= EXACT && nt <= EXACT) return 0.0; /* most are, without a root */
+  if (core_door_is_frame(n, t, EXACT)) return 0.0; /* most are, without a root */
   nn = fabs(sqrt(nn) - 1.0), tt = fabs(sqrt(tt) - 1.0);
   most = nn > tt ? nn : tt;
   return most > nt ? most : nt;
-}
-
-/* Symmetric, and with the shift positive definite: no eigenvalue is below -ROUNDED times the largest entry. */
-static int32_t is_inertia(const double *x) {
-  double size = 0.0, a[6], p, q, r;
-  int32_t i, k;
-  for (i = 0; i < 9; i++)
-    if (fabs(x[i]) > size) size = fabs(x[i]);
-  if (size == 0.0) return 1;
-  for (i = 0; i < 3; i++)
-    for (k = 0; k < i; k++)
-      if (fabs(x[3 * i + k] - x[3 * k + i]) > ROUNDED * size) return 0;
-  a[0] = x[0] / size + ROUNDED, a[1] = x[3] / size, a[2] = x[4] / size + ROUNDED;
-  a[3] = x[6] / size, a[4] = x[7] / size, a[5] = x[8] / size + ROUNDED;
-  if (!(a[0] > 0.0)) return 0;
-  p = a[2] - a[1] * (a[1] / a[0]);
-  if (!(p > 0.0)) return 0;
-  q = a[4] - a[3] * (a[1] / a[0]);
-  r = a[5] - a[3] * (a[3] / a[0]) - q * (q / p);
-  return r > 0.0;
 }
 
 static int32_t check_bodies(const lav_problem *q, where_t *at) {
@@ -334,7 +312,7 @@ static int32_t check_bodies(const lav_problem *q, where_t *at) {
     if (q->inv_mass[i] < 0.0) return refuse(at, LAV_ERROR_MASS, "inv_mass", i);
     if (!core_door_is_size(q->inv_mass[i])) return refuse(at, LAV_ERROR_NUMBER, "inv_mass", i);
     if (!core_door_is_size(core_door_largest(q->inv_inertia + 9 * i, 9))) return refuse(at, LAV_ERROR_NUMBER, "inv_inertia", 9 * i);
-    if (!is_inertia(q->inv_inertia + 9 * i)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
+    if (!core_door_is_definite(q->inv_inertia + 9 * i, ROUNDED, ROUNDED, 0.0)) return refuse(at, LAV_ERROR_MASS, "inv_inertia", 9 * i);
   }
   GIVE_BACK(check_pairs(q->joint_body, q->n_joints, q->n_bodies, 0, "joint_body", at));
   GIVE_BACK(check_pairs(q->contact_body, (int32_t)c, q->n_bodies, 1, "contact_body", at));

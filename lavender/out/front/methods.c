@@ -40,7 +40,7 @@ static int32_t start_sweeps(lav_solver *s) {
   x->c.split = s->split;
   x->c.mode = s->mode;
   x->c.rng = &s->rng;
-  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_damping(&s->p, &s->a, s->watch.e) : o->omega;
+  x->c.omega = o->method == LAV_JACOBI && o->omega == 0.0 ? sweep_serial_safe_damping(&s->p, &s->a, s->watch.e) : o->omega;
   x->step = row_of(o->method)->sweep;
   numbers = sweep_serial_sweeps_room(x, &s->read, place);
   if (numbers < 0) return LAV_ERROR_COUNT;

@@ -125,21 +125,16 @@ static void copy_or(const double *to, const double *from, int64_t n, double othe
 }
 
 static int32_t fill_blocks(lav_solver *s, const lav_problem *q) {
-  int32_t *ptr = (int32_t *)(uintptr_t)s->p.ptr, *kind = (int32_t *)(uintptr_t)s->p.kind, i, j, single = 1;
-  double *lower = (double *)(uintptr_t)s->p.lower, *upper = (double *)(uintptr_t)s->p.upper;
+  int32_t *ptr = (int32_t *)(uintptr_t)s->p.ptr, *kind = (int32_t *)(uintptr_t)s->p.kind, i, single = 1;
   const int32_t k = q->n_blocks, m = q->n_rows;
   for (i = 0; i <= k; i++) ptr[i] = q->block_ptr ? q->block_ptr[i] : i;
   for (i = 0; i < k; i++) {
     kind[i] = q->kind ? q->kind[i] : LAV_ROW;
     if (kind[i] != LAV_ROW || ptr[i + 1] - ptr[i] > 1) single = 0;
   }
-  copy_or(lower, q->lower, m, -INFINITY);
-  copy_or(upper, q->upper, m, INFINITY);
-  for (i = 0; i < k; i++) /* bounds of contacts, which nobody reads, in one spelling */
-    for (j = ptr[i]; kind[i] != LAV_ROW && j < ptr[i + 1]; j++) {
-      lower[j] = j == ptr[i] ? 0.0 : -INFINITY;
-      upper[j] = INFINITY;
-    }
+  copy_or(s->p.lower, q->lower, m, -INFINITY);
+  copy_or(s->p.upper, q->upper, m, INFINITY);
+  core_parts_spell_bounds(&s->p);
   copy_or(s->p.mu, q->mu, k, 0.0);
   copy_or(s->p.patch_radius, q->patch_radius, k, 0.0);
   copy_or(s->p.rolling, q->rolling, k, 0.0);
