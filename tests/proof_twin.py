@@ -12,16 +12,15 @@ tries that many, and says how many of each kind were proven and what was wrong.
 import sys
 import time
 from collections import Counter
-from decimal import Decimal, getcontext
 from fractions import Fraction
 
 import numpy as np
+from kkt_truth import Exact, matrix_in
 
 import lavender as lv
 from lavender.lab.proof import prove
 from lavender.lab.proof.search import Search
 
-getcontext().prec = 60
 SLACK = Fraction(
     1, 10**25
 )  # of the largest number of the problem: the centre is 1e-30 from the exact solution
@@ -128,27 +127,7 @@ def planted(seed, border=False):
 
 def exact_slack(problem, x):
     """w = A lambda - b of Fractions, from the data."""
-    if problem.operator == "matrix":
-        a = problem.dense().tolist()
-        return [
-            sum((Fraction(p) * q for p, q in zip(row, x, strict=True) if p), Fraction(0)) - Fraction(b)
-            for row, b in zip(a, problem.b.tolist(), strict=True)
-        ]
-    j = [[Fraction(p) for p in row] for row in problem.jacobian.toarray().tolist()]
-    pulled = [sum((j[i][k] * x[i] for i in range(len(x)) if j[i][k]), Fraction(0)) for k in range(len(j[0]))]
-    mass = np.diag(problem.generalized.mass.toarray()).tolist()  # planted ones are diagonal
-    moved = [p / Fraction(q) for p, q in zip(pulled, mass, strict=True)]
-    return [
-        sum((p * q for p, q in zip(row, moved, strict=True) if p), Fraction(0))
-        + Fraction(t) * y
-        - Fraction(b)
-        for row, t, y, b in zip(j, problem.compliance.tolist(), x, problem.b.tolist(), strict=True)
-    ]
-
-
-def root(x):
-    value = Decimal(x.numerator) / Decimal(x.denominator)
-    return Fraction(value.sqrt())
+    return (matrix_in(problem, Exact)[0] @ np.array(x, object) - Exact.array(problem.b)).tolist()
 
 
 def violation(problem, x):
@@ -169,9 +148,9 @@ def violation(problem, x):
             c2 = [Fraction(r) for r in reach]
             z = [q * w[r] for q, r in zip(c2, rows, strict=True)]
             y = [x[r] / q for q, r in zip(c2, rows, strict=True)]
-            size = root(sum((q * q for q in z), Fraction(0)))
+            size = Exact.sqrt(sum((q * q for q in z), Fraction(0)))
             speed += size
-            out.append((f"cone {i}", root(sum((q * q for q in y), Fraction(0))) - x[first]))
+            out.append((f"cone {i}", Exact.sqrt(sum((q * q for q in y), Fraction(0))) - x[first]))
             out += [(f"slides {i}", abs(p * size + q * x[first])) for p, q in zip(y, z, strict=True)]
         own = w[first] - (speed if problem.law == "cone" else 0)
         out.append((f"normal {i}", abs(min(x[first], own))))
