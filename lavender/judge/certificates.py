@@ -88,10 +88,21 @@ def check_certificate(problem: Problem, y: Any, tol: float = 0.0) -> str | None:
 def prove(problem: Problem, y: Any, tol: float = 0.0) -> Proof:
     """What y (m,) proves: no solution, or a least impulse of every solution.
 
-    Where y is off by rounding of a solver, the nearest direction on the same rows with A^T y = 0 takes its place.
+    Where y is off by rounding of a solver, the nearest direction on the same rows with A^T y = 0 takes its place. The
+    last answer is kept with the problem: a solver, and whoever checks its claim, ask the same.
     """
+    y = np.array(y, float)
+    y.setflags(write=False)
+    asked = tol, y.shape, y.tobytes()
+    last: tuple[Any, Proof] | None = problem.derived.proof
+    if last is None or last[0] != asked:
+        last = problem.derived.proof = asked, _prove(problem, y, tol)
+    return last[1]
+
+
+def _prove(problem: Problem, y: FloatArray, tol: float) -> Proof:
     with np.errstate(all="ignore"):  # what overflows proves nothing
-        y, inner = np.asarray(y, float), problem.disk
+        inner = problem.disk
         if y.shape != (problem.m,) or not np.isfinite(y).all() or not np.any(y):
             reason = f"certificate of shape {y.shape} must be {problem.m} finite numbers, not all zero"
             return Proof(y, 0.0, reason)

@@ -11,8 +11,9 @@
                                 not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
-    all in turn                 with doubled work, until nobody gains in two turns: `newton`, `admm` or, of J and M,
-                                `nncg`, and sweeps as long as these gain; all together LAST times Newton's cost
+    all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
+                                at up to MOST times the cost), `admm` or, of J and M, `nncg`, and sweeps as long as
+                                these gain; all together LAST times Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -102,26 +103,27 @@ class Tree:
     def states(self) -> dict[str, NewtonState]:
         """Newton's method after its analysis, the cheaper form first; none where it takes no form or has no time."""
         found: dict[str, NewtonState] = {}
-        problem = self.problem
-        if get("newton").refuses(problem) is not None or self.is_late:
-            return found
-        for name in ("newton", "newton over rows"):
-            if name == "newton over rows" and not self._rows_may_pay(found.get("newton")):
-                continue
-            try:
-                found[name] = get("newton").load()(**METHODS[name][1]).prepare(problem)
-            except BREAKDOWN:
-                continue
+        if get("newton").refuses(self.problem) is None and not self.is_late:
+            found |= self.prepared("newton")
+            if self._rows_may_pay(found.get("newton"), MOST if self.tried else 1.0):
+                found |= self.prepared("newton over rows")
         # Last what has failed.
         return dict(
             sorted(found.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
         )
 
-    def _rows_may_pay(self, over: NewtonState | None) -> bool:
-        """Whether rows of an A that is formed of J and M are counted to cost less than what velocities still have, and
-        are there in time, with what of SciPy reads them.
+    def prepared(self, name: str) -> dict[str, NewtonState]:
+        """Newton's method in this form after its analysis, by name; nothing where that breaks down."""
+        try:
+            return {name: get("newton").load()(**METHODS[name][1]).prepare(self.problem)}
+        except BREAKDOWN:
+            return {}
+
+    def _rows_may_pay(self, over: NewtonState | None, left: float) -> bool:
+        """Whether rows of an A that is formed of J and M are counted to cost less than `left` times what velocities do,
+        and are there in time, with what of SciPy reads them.
         """
-        problem, left = self.problem, MOST if self.tried else 1.0
+        problem = self.problem
         if over is None or over.general is None or problem.cones.has_round or self.is_late:
             return False
         if costs.newton_cost(costs.formed(problem), self.law) >= left * over.cost:
@@ -207,6 +209,8 @@ class Tree:
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
         self.left = (LAST - MOST) * unit - self.begun
+        if "newton over rows" not in self.states and self._rows_may_pay(self.states.get("newton"), MOST):
+            self.states |= self.prepared("newton over rows")
         for k in range(TURNS):
             before = self.best
             for stage in self.in_turn(2.0**k):

@@ -48,6 +48,15 @@ def test_what_is_proved_is_said(name):
     assert lv.solve(opposed(1.0), name).impulse_bound is None
 
 
+def test_what_a_direction_proved_does_not_change_with_its_array():
+    """The last proof is kept with the problem: for the same numbers, not for the same array."""
+    problem, y = opposed(0.0), np.ones(2)
+    proof = prove(problem, y)
+    y[1] = -1.0
+    assert prove(problem, y).reason and not proof.reason
+    assert proof.y.tolist() == [1.0, 1.0] and not prove(problem, np.ones(2)).reason
+
+
 def held(law, soft, form):
     """One body between floor and ceiling that come nearer, by rows of each law."""
     rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))

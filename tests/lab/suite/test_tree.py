@@ -325,6 +325,20 @@ def test_what_only_late_turns_solve_is_solved(name):
     assert solution.success, solution.turns
 
 
+def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
+    rng = np.random.default_rng(0)
+    half, jac, moved = (
+        rng.standard_normal((150, 150)),
+        rng.standard_normal((400, 150)),
+        rng.standard_normal(150),
+    )
+    target = jac @ moved - rng.exponential(0.5, 400) * (rng.random(400) < 0.7)
+    cones = lv.Cones.bounded(np.zeros(400), np.full(400, np.inf))
+    problem = lv.Problem.from_jacobian(jac, half @ half.T, np.zeros(150), target=target, cones=cones)
+    solution = lv.solve(problem, tol=1e-6)
+    assert solution.success and solution.turns[-1].solver == "newton over rows", solution.turns
+
+
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
