@@ -5,17 +5,18 @@ import os
 import re
 import signal
 import subprocess
-import sys
 
 import numpy as np
 import pytest
 from calls import robot
 from stacks import stack
+from worked import python
 
 import lavender as lv
 from lavender import bench, cli, io, registry
 from lavender.lab.bench.record import Skip, to_json
 
+TOLD = {"capture_output": False, "stderr": subprocess.PIPE}  # where the output goes to a place of its own
 QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
@@ -32,17 +33,10 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")
 def test_a_full_disk_behind_stdout_is_one_line():
-    words = [sys.executable, "-m", "lavender", "solvers"]
     with open("/dev/full", "w") as full:
-        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
-    assert done.returncode == cli.EXIT_BAD_INPUT
+        done = python("-m", "lavender", "solvers", status=cli.EXIT_BAD_INPUT, stdout=full, **TOLD)
     assert done.stderr.startswith("lavender: ")
     assert "Traceback" not in done.stderr
-
-
-def test_the_package_runs_as_a_module():
-    words = [sys.executable, "-m", "lavender", "--version"]
-    assert lv.__version__ in subprocess.run(words, capture_output=True, text=True, check=True).stdout
 
 
 def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
@@ -157,8 +151,7 @@ def test_the_time_of_a_solve_holds_no_loading_of_modules():
         "def watched(*args, **more):\n    print('scipy.sparse' in sys.modules)\n    return real(*args, **more)\n"
         "s.solve = watched\nfrom lavender.cli import main; main(['solve', 'stack(n=3)', '--solver', 'jacobi'])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.startswith("True\n")
+    assert python("-c", code).stdout.startswith("True\n")
 
 
 def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_told(lavender, tmp_path):
@@ -174,7 +167,7 @@ def test_a_model_and_the_folder_of_a_report_are_no_problems_and_the_way_on_is_to
 
 def test_help_is_quick_and_names_every_command():
     code = "import sys, lavender.cli as c\ntry: c.main(['--help'])\nfinally: print(*sys.modules, file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = python("-c", code)
     for name in ("report", "bench", "check", "solve", "solvers"):
         assert name in done.stdout
     # What takes time to load is loaded by the command that needs it.
@@ -274,9 +267,7 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
     """The signal comes where the import of a module begins, whatever the machine's speed."""
     (tmp_path / "sitecustomize.py").write_text(INTERRUPT)  # which Python imports first
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "INTERRUPTED": module}
-    command = [sys.executable, *way, "solvers"]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 130
+    done = python(*way, "solvers", env=environment, status=130)
     assert "lavender: stopped" in done.stderr
     assert "Traceback" not in done.stderr
 
@@ -296,7 +287,7 @@ def test_names_are_whole_in_the_narrowest_terminal(lavender, monkeypatch, words,
 
 def test_another_program_keeps_its_own_ctrl_c():
     words = "import signal, lavender, lavender.cli; assert signal.getsignal(2) is signal.default_int_handler"
-    subprocess.run([sys.executable, "-c", words, "lavender"], check=True, timeout=600)
+    python("-c", words, "lavender")
 
 
 def test_doctor_tells_what_looks_wrong_in_a_problem(lavender, path, tmp_path):
@@ -369,26 +360,25 @@ def test_a_working_directory_that_is_gone_is_said(lavender, path, tmp_path, word
 
 
 def _unread(*words):
-    """Exit code and words of errors of a command whose output nobody reads."""
+    """Words of errors of a command whose output nobody reads, and which ends as if somebody did."""
     reader, writer = os.pipe()
     os.close(reader)
-    command = [sys.executable, "-m", "lavender", *map(str, words)]
-    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, text=True)
+    done = python("-m", "lavender", *words, stdout=writer, **TOLD)
     os.close(writer)
-    return done.returncode, done.stderr
+    return done.stderr
 
 
 @pytest.mark.parametrize("words", ["cases", "solvers", "--help", "run --help", "explain toy_stack"])
 def test_a_pipe_that_nobody_reads_ends_a_command_quietly(words):
-    assert _unread(*words.split()) == (0, "")
+    assert _unread(*words.split()) == ""
 
 
 def test_files_are_written_whoever_reads(path, tmp_path):
     made = [tmp_path / name for name in ("x.csv", "x.svg", "x.npz")]
     words = ("run", "stack", "--steps", 3, "--trace", made[0], "--plot", made[1])
-    assert _unread(*words) == (0, "")
-    assert _unread("solve", path, "--output", made[2]) == (0, "")
-    assert _unread("reference", path) == (0, "")
+    assert _unread(*words) == ""
+    assert _unread("solve", path, "--output", made[2]) == ""
+    assert _unread("reference", path) == ""
     assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
 
 

@@ -1,5 +1,6 @@
 """Whoever writes a file writes a regular one, whole, behind its links; what is no file is left as it is."""
 
+import contextlib
 import errno
 import os
 import signal
@@ -62,6 +63,17 @@ everybody = pytest.mark.parametrize(
 )
 
 BEFORE = b"what stood there"
+
+
+@contextlib.contextmanager
+def room(size):
+    """Files of this process may have so many bytes."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @everybody
@@ -134,47 +146,35 @@ def test_a_full_disk_leaves_the_file_of_before(where, suffix, write, made, tmp_p
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    if where == "where it is renamed":
+    renamed = where == "where it is renamed"
+    if renamed:
         monkeypatch.setattr(os, "replace", full)
-    else:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1, limits[1]))  # a second byte is one too many
-    try:
-        with pytest.raises(lv.InputError, match=r"No space left|cannot write"):
-            write(made, path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with (
+        contextlib.nullcontext() if renamed else room(1),  # a second byte is one too many
+        pytest.raises(lv.InputError, match=r"No space left|cannot write"),
+    ):
+        write(made, path)
     assert path.read_bytes() == BEFORE
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
 
 
 @needs_hdf5
-@pytest.mark.parametrize("room", [1, 4096, 16384, 24576])
-def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, room):
+@pytest.mark.parametrize("size", [1, 4096, 16384, 24576])
+def test_an_fclib_file_beyond_the_room_is_an_error(tmp_path, size):
     """HDF5 itself ends the process by a signal where a write fails that is not its first."""
     path = tmp_path / "p.hdf5"
     lv.Problem.contact(np.eye(3), [1.0, 0.0, 0.0], 0.5).save(path)
     before = path.read_bytes()
     a = np.random.default_rng(0).normal(size=(60, 60))
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-        with pytest.raises(lv.InputError, match="cannot write"):
-            lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with room(size), pytest.raises(lv.InputError, match="cannot write"):
+        lv.Problem.contact(a @ a.T, np.ones(60), np.full(20, 0.5)).save(path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["p.hdf5"]
 
 
 def test_a_lock_without_room_says_so(tmp_path):
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))
-        with pytest.raises(lv.InputError, match="cannot write"):
-            Store(tmp_path / "records.jsonl")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with room(0), pytest.raises(lv.InputError, match="cannot write"):
+        Store(tmp_path / "records.jsonl")
 
 
 def test_a_name_as_long_as_any_may_be_is_written_and_who_may_read_a_file_stays(made, tmp_path):

@@ -1,6 +1,5 @@
 """A time limit is the caller's clock: played here by counted work, so that nothing hangs on the machine."""
 
-import subprocess
 import sys
 
 import numpy as np
@@ -8,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 from calls import dense, over_velocities
 from random_problems import FORMS, random_contact_problem
+from worked import python
 
 import lavender as lv
 from benchmarks.made import fresh
@@ -269,8 +269,7 @@ for problem in problems:
     lv.solve(problem, time_limit=0.01)
 print(sorted(set(sys.modules) - before))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
+    assert python("-c", code).stdout.strip() == "[]"
 
 
 def test_the_package_loads_what_auto_needs_and_a_name_its_own_file():
@@ -289,8 +288,7 @@ lv.solve(lv.Problem.lcp([[2.0]], [1.0]), "jacobi", time_limit=0.01)
 print(sorted(set(sys.modules) - before))
 print(list(lv.registry.specs())[:3], list(lv.registry.specs())[-1], lv.registry.get("jacobi").own)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    first, second, third = done.stdout.splitlines()
+    first, second, third = python("-c", code).stdout.splitlines()
     assert first == "[] False"
     assert "lavender.solvers.jacobi" in second and "external" not in second and "lemke" not in second
     # The order of the table, whoever was asked for first.

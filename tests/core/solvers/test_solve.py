@@ -23,7 +23,6 @@ REFUSED = {
     "a matrix and a vector": (lambda: lv.solve(np.eye(2), [1.0, -1.0]), lv.InputError, "Problem.lcp"),
     "no such solver": (lambda: lv.solve(TINY, "psg"), lv.UnknownName, "pgs"),
     "no such option": (lambda: lv.solve(TINY, "jacobi", omgea=1.0), lv.UnknownName, "omega"),
-    "an option of others": (lambda: lv.solve(TINY, "direct", order="reverse"), lv.CapabilityError, "order"),
     "negative tol": (lambda: lv.solve(TINY, "pgs", tol=-1.0), lv.InputError, "tol"),
     "no time": (lambda: lv.solve(TINY, "pgs", time_limit=-1.0), lv.InputError, "time_limit"),
     "one start of many": (lambda: lv.solve_many([TINY], impulse=[0.0, 0.0]), lv.InputError, "impulses="),
@@ -61,11 +60,6 @@ REFUSED = {
     ),
     "no convex iterations": (lambda: lv.solve(TINY, "nncg", convex=-1), lv.InputError, "convex"),
     "no callback": (lambda: lv.solve(TINY, "pgs", callback=3), lv.InputError, "callback"),
-    "history of a finite solver": (
-        lambda: lv.solve(TINY, "direct", history=True),
-        lv.CapabilityError,
-        "history",
-    ),
 }
 
 

@@ -42,12 +42,6 @@ def test_a_solver_in_a_process_of_its_own_has_one_too():
     assert all(0.0 <= r.motion < 1.0 for r in records)
 
 
-def test_a_campaign_has_motion_errors():
-    plan = bench.CampaignPlan(levels=(1e-3,), budgets=(4,), orders=(), motion=True)
-    records = bench.campaign(["stack(n=8)"], ["pgs"], plan, workers=1)
-    assert all(r.motion_speed > 0.0 for r in records)
-
-
 def test_speed_levels_are_reached_by_tighter_residuals():
     plan = bench.Plan(levels=(1e-1,), speed_levels=(1e-2, 1e-4), **SHORT)
     assert plan.motion
@@ -79,15 +73,6 @@ def test_no_speed_level_without_a_reference():
 def test_senseless_speed_levels_are_refused(level):
     with pytest.raises(lv.InputError, match="speed level"):
         bench.Plan(speed_levels=(level,))
-
-
-def test_what_has_nothing_to_do_is_described_so():
-    from lavender.lab.bench.cases import describe, resolve
-
-    (idle,) = resolve([lv.Problem.lcp([[1.0]], [-1.0], name="idle")])
-    (busy,) = resolve(["stack(n=4)"])
-    assert describe(idle, "run").nothing_to_do
-    assert not describe(busy, "run").nothing_to_do
 
 
 def test_motions_are_measured_from_an_exact_solution_and_a_claim_beyond_its_residual_is_contradicted(

@@ -31,6 +31,21 @@ def first(name):
     return PHENOMENA[name].values(PHENOMENA[name].cases[0])
 
 
+@pytest.fixture
+def apart():
+    """A process for engines that is ended whatever became of it."""
+    made = Apart(limit=600.0)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def broken(request, monkeypatch):
+    """The same for engines that fail."""
+    monkeypatch.setattr("lavender.lab.phenomena.running.MODULE", "broken_engines")
+    return request.getfixturevalue("apart")
+
+
 # -- phenomena ------------------------------------------------------------------------------------
 
 
@@ -199,61 +214,48 @@ def test_mujoco_creeps_and_lifts_as_it_is_known_to():
         ("leaves", "exit status 0"),
     ],
 )
-def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, monkeypatch):
-    monkeypatch.setattr("lavender.lab.phenomena.running.MODULE", "broken_engines")
-    apart = Apart(limit=2.0 if name == "sleeps" else 600.0)
+def test_an_engine_that_fails_is_a_note_and_the_next_has_a_process(name, words, broken):
+    broken.limit = 2.0 if name == "sleeps" else 600.0
     scene = PHENOMENA["stick"].scene()
     way = dataclasses.replace(OTHERS[0], name=name)
-    try:
-        found = apart.track(way, scene, 1.0, 0.1)
-        assert isinstance(found, str)
-        assert words in found
-        if name != "babbles":  # it sleeps on
-            apart.limit = 600.0
-            again = apart.track(dataclasses.replace(way, name="leaves"), scene, 1.0, 0.1)
-            assert again == "its process ended: exit status 0"
-    finally:
-        apart.end()
+    found = broken.track(way, scene, 1.0, 0.1)
+    assert isinstance(found, str)
+    assert words in found
+    if name != "babbles":  # it sleeps on
+        broken.limit = 600.0
+        again = broken.track(dataclasses.replace(way, name="leaves"), scene, 1.0, 0.1)
+        assert again == "its process ended: exit status 0"
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="reads /proc")
-def test_a_program_that_an_engine_waits_for_ends_with_it(monkeypatch, tmp_path):
-    monkeypatch.setattr("lavender.lab.phenomena.running.MODULE", "broken_engines")
-    apart = Apart(limit=6.0)
+def test_a_program_that_an_engine_waits_for_ends_with_it(broken, tmp_path):
+    broken.limit = 6.0
     way = dataclasses.replace(OTHERS[0], name=f"waits {tmp_path / 'number'}")
-    try:
-        assert apart.track(way, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 6 s"
-        number = int((tmp_path / "number").read_text())
-        state = Path(f"/proc/{number}/stat")
-        for _ in range(12_000):  # the system takes a moment
-            if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
-                break
-            time.sleep(0.05)
-        else:
-            pytest.fail("it runs on")
-    finally:
-        apart.end()
+    assert broken.track(way, PHENOMENA["stick"].scene(), 1.0, 0.1) == "no answer within 6 s"
+    number = int((tmp_path / "number").read_text())
+    state = Path(f"/proc/{number}/stat")
+    for _ in range(12_000):  # the system takes a moment
+        if not state.exists() or state.read_text().rpartition(")")[2].split()[0] == "Z":
+            return
+        time.sleep(0.05)
+    pytest.fail("it runs on")
 
 
-def test_a_system_that_starts_no_process_is_a_note(monkeypatch):
+def test_a_system_that_starts_no_process_is_a_note(apart, monkeypatch):
     def refuse(*_, **__):
         raise OSError(11, "no more processes")
 
     monkeypatch.setattr("lavender.base.apart.process.subprocess.Popen", refuse)
-    found = Apart().track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
+    found = apart.track(OTHERS[0], PHENOMENA["stick"].scene(), 1.0, 0.1)
     assert found == "its process does not start: [Errno 11] no more processes"
 
 
-def test_what_an_engine_raises_is_told_and_its_process_stays():
-    apart = Apart()
+def test_what_an_engine_raises_is_told_and_its_process_stays(apart):
     scene = PHENOMENA["stick"].scene()
-    try:
-        for _ in range(2):
-            found = apart.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
-            assert found == 'it failed: KeyError: "nobody\'s"'
-            assert apart.alive
-    finally:
-        apart.end()
+    for _ in range(2):
+        found = apart.track(dataclasses.replace(OTHERS[0], name="nobody's"), scene, 1.0, 0.1)
+        assert found == 'it failed: KeyError: "nobody\'s"'
+        assert apart.alive
 
 
 def test_an_engine_that_is_missing_is_a_note(monkeypatch):

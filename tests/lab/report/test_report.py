@@ -282,11 +282,6 @@ def test_a_page_is_small(tmp_path):
     assert report.write(found, tmp_path, figures=False).stat().st_size < most
 
 
-def test_advice_names_nobody_where_nobody_got_there():
-    found = records_of(record("a", "x", 1.0, 0.5))
-    assert all(a.best is None for a in by_level(found))
-
-
 def test_advice_by_time_takes_the_best_residual_within_the_budget():
     found = records_of(
         record("a", "rough", 0.01, 1e-2), record("a", "rough", 5.0, 1e-7),

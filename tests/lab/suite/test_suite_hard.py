@@ -130,13 +130,6 @@ def test_painleve_has_three_solutions_and_each_is_named():
     assert set(painleve_solutions(painleve(slide=0.5).problem)) == {"open"}
 
 
-def test_states_of_contacts_of_every_size():
-    normals = lv.Problem.contact(np.eye(2), [1.0, -1.0], [0.0, 0.0])
-    assert contact_states(normals, [1.0, 0.0]) == ["stick", "open"]
-    mixed = suite.pyramid(2, friction="coulomb").problem
-    assert contact_states(mixed, np.zeros(mixed.m)) == ["open"] * mixed.n_blocks
-
-
 @pytest.mark.parametrize(
     "name", ["arch", "arch(n=25)", "card_house", "card_house(levels=5)", "big_box", "slab(n=5)"]
 )
