@@ -12,8 +12,8 @@
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
-                                at up to MOST times the cost), `admm` or, of J and M, `nncg`, and sweeps as long as
-                                these gain; all together LAST times Newton's cost
+                                at up to MOST times the cost or LITTLE), `admm` or, of J and M, `nncg`, and sweeps as
+                                long as these gain; all together LAST times Newton's cost
     at last                     a certificate that there is no solution (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -50,6 +50,7 @@ MOST = 10.0  # times its counted cost, that Newton's method has before both go i
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
+LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any case
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
@@ -119,14 +120,14 @@ class Tree:
         except BREAKDOWN:
             return {}
 
-    def _rows_may_pay(self, over: NewtonState | None, left: float) -> bool:
+    def _rows_may_pay(self, over: NewtonState | None, left: float, least: float = 0.0) -> bool:
         """Whether rows of an A that is formed of J and M are counted to cost less than `left` times what velocities do,
-        and are there in time, with what of SciPy reads them.
+        or `least` [ns], and are there in time, with what of SciPy reads them.
         """
         problem = self.problem
         if over is None or over.general is None or problem.cones.has_round or self.is_late:
             return False
-        if costs.newton_cost(costs.formed(problem), self.law) >= left * over.cost:
+        if costs.newton_cost(costs.formed(problem), self.law) >= max(left * over.cost, least):
             return False
         return not (
             self.deadline.is_set and self.deadline.passed(over_rows(problem) + 3.0 * forming(problem))
@@ -208,9 +209,12 @@ class Tree:
         yield from self.sweeps_first(self.newton)
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
-        self.left = (LAST - MOST) * unit - self.begun
-        if "newton over rows" not in self.states and self._rows_may_pay(self.states.get("newton"), MOST):
+        if "newton over rows" not in self.states and self._rows_may_pay(
+            self.states.get("newton"), MOST, LITTLE
+        ):
             self.states |= self.prepared("newton over rows")
+            unit = min(max(state.cost for state in self.states.values()), max(unit, LITTLE))
+        self.left = (LAST - MOST) * unit - self.begun
         for k in range(TURNS):
             before = self.best
             for stage in self.in_turn(2.0**k):
