@@ -189,16 +189,6 @@ def test_without_memory_it_is_plain_admm_by_hand():
         u = u + 1.6 * (x - z)
 
 
-def test_wrong_options_are_refused():
-    problem = random_lcp(1)
-    for memory in (-1, 17, 0.5):
-        with pytest.raises(lv.InputError, match="memory"):
-            lv.solve(problem, "admm", memory=memory)
-    for alpha in (0.0, 2.0):
-        with pytest.raises(lv.InputError, match="relaxation"):
-            lv.solve(problem, "admm", relaxation=alpha)
-
-
 @pytest.mark.parametrize("m", [0, 4])
 def test_work_is_told_once_however_a_run_is_cut(m):
     problem = lv.Problem.lcp(np.eye(m), np.ones(m))

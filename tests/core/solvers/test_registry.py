@@ -152,10 +152,3 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
         registry.load.cache_clear()
         monkeypatch.undo()
         registry.specs()
-
-
-def test_entry_points_are_read_from_the_group_that_is_documented():
-    assert "lavender.solvers" in registry.__doc__
-    assert all(
-        e.group == "lavender.solvers" for e in importlib.metadata.entry_points(group="lavender.solvers")
-    )

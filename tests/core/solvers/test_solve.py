@@ -42,16 +42,18 @@ REFUSED = {
         "whole number from 1",
     ),
     **{
-        f"damping {omega}": (
-            lambda omega=omega: lv.solve(TINY, "jacobi", omega=omega),
+        f"{name} with {option} {x}": (
+            lambda name=name, option=option, x=x: lv.solve(TINY, name, **{option: x}),
             lv.InputError,
-            "omega",
+            option,
         )
-        for omega in (0.0, -1.0, np.inf)
-    },
-    **{
-        f"memory of {n}": (lambda n=n: lv.solve(TINY, "anderson", memory=n), lv.InputError, "memory")
-        for n in (0, 17)
+        for name, option, values in (
+            ("jacobi", "omega", (0.0, -1.0, np.inf)),
+            ("anderson", "memory", (0, 17)),
+            ("admm", "memory", (-1, 17, 0.5)),
+            ("admm", "relaxation", (0.0, 2.0)),
+        )
+        for x in values
     },
     "sweeps of another law": (
         lambda: lv.solve(random_contact_problem(1, friction="cone"), "nncg", sweep="pgs"),

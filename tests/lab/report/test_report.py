@@ -66,6 +66,13 @@ def records_of(*made, structure=None, law=None):
     return found
 
 
+def shown(found, width=200, **more):
+    """What the terminal shows of it."""
+    out = io.StringIO()
+    print_report(found, Console(file=out, width=width), **more)
+    return out.getvalue()
+
+
 def by_level(records):
     return [a for line in report.advice(records) for a in line.by_level.values()]
 
@@ -334,10 +341,8 @@ def test_claims_failures_and_spreads():
         )
         assert next(c.wrong for c in report.claims(more) if c.solver == "x") == wrong
         assert sum(bool(f.contradicted) for f in report.failures(more)) == wrong
-        console = Console(file=io.StringIO(), width=200)
-        print_report(Report(more), console)
         counted = f", the first of {wrong}" if wrong > 1 else ""
-        assert f"false claim{counted}: a, x: says CONVERGED" in console.file.getvalue()
+        assert f"false claim{counted}: a, x: says CONVERGED" in shown(Report(more))
     assert [(f.solver, f.status) for f in report.failures(found)] == [
         ("x", "CONVERGED"),
         ("y", "CRASHED (SIGSEGV)"),
@@ -484,10 +489,8 @@ def test_changes_beyond_noise_are_named(tmp_path):
     text = report.write(Report(new, old), tmp_path, figures=False).read_text()
     assert "Against the earlier run" in text
     assert text.count("slower 3 times") == 2  # to both levels
-    shown = io.StringIO()
-    print_report(Report(new, old), Console(width=200, file=shown), whole=True)
     for said in (
-        shown.getvalue(),
+        shown(Report(new, old), whole=True),
         (tmp_path / "summary.md").read_text(),
     ):  # the page's tables, from top to bottom
         assert said.count("slower 3 times") == 2 and "Against" in said

@@ -2,13 +2,10 @@
 
 import dataclasses
 import html
-import html.parser
-import io
 import re
 import sys
 
 import pytest
-from rich.console import Console
 
 import lavender as lv
 from lavender import bench, report
@@ -17,9 +14,9 @@ from lavender.lab.report.contents import advice_table
 from lavender.lab.report.findings import Report
 from lavender.lab.report.paper import write_paper
 from lavender.lab.report.style import looks
-from lavender.lab.report.terminal import ADDED, LINES, print_report
+from lavender.lab.report.terminal import ADDED, LINES
 from lavender.lab.report.verdict import verdict
-from tests.lab.report.test_report import record, records_of
+from tests.lab.report.test_report import record, records_of, shown
 
 
 def test_each_run_says_how_busy_the_machine_was(real):
@@ -50,27 +47,24 @@ def test_a_loaded_machine_is_told_in_terminal_page_summary_and_paper(tmp_path, b
     made = [record(f"c{i}", "pgs", 1e-3, 1e-7, load=6.0 if i < busy else 1.1) for i in range(20)]
     found = Report(records_of(*made))
     said = "The machine was busy: load 6.0 on 2 cores while this was timed."
-    shown = io.StringIO()
-    print_report(found, Console(file=shown, width=200))
     index = report.write(found, tmp_path, figures=False)
     method = write_paper(found, tmp_path / "paper") / "method.tex"
     places = (index, tmp_path / "summary.md", method)
-    for text in (shown.getvalue(), *(p.read_text(encoding="utf-8") for p in places)):
+    for text in (shown(found), *(p.read_text(encoding="utf-8") for p in places)):
         assert (said in text) == (busy == 20)
     assert found.busy[: len(said)] == (said if busy == 20 else "")
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_tables_stay_within_the_terminal_and_nothing_is_cut(real, width):
-    out = io.StringIO()
-    print_report(Report(real[0]), Console(width=width, file=out), whole=True)
-    assert max(map(len, out.getvalue().splitlines())) <= width
-    assert "…" not in out.getvalue()
+    out = shown(Report(real[0]), width, whole=True)
+    assert max(map(len, out.splitlines())) <= width
+    assert "…" not in out
     found = tables.advice(real[0])
     for name in {line.name for line in found}:
-        assert name in out.getvalue()
+        assert name in out
     for best in (a.best for line in found for a in (*line.by_level.values(), *line.by_time.values())):
-        assert best is None or best.solver in out.getvalue()
+        assert best is None or best.solver in out
 
 
 @pytest.mark.parametrize("width", [20, 40, 80, 10_000])
@@ -87,9 +81,7 @@ def test_in_short_the_terminal_shows_25_lines_within_its_width(cases, width):
         found.add(dataclasses.replace(found.cases[name], suspicions=("something looks wrong",)))
         found.add(bench.Skip("run", name + "b", "", "did not load: " + "x" * 100))
         found.add(bench.Skip("run", name, "newton", "takes laws linear"))
-    out = io.StringIO()
-    print_report(Report(found), Console(width=width, file=out))
-    lines = out.getvalue().splitlines()
+    lines = shown(Report(found), width).splitlines()
     assert len(lines) + ADDED <= (LINES if width > 20 else 35)  # a sentence takes what it takes
     assert max(map(len, lines)) <= width
     assert lines[0].startswith("Use solver_0")
@@ -102,8 +94,10 @@ def test_the_first_screen_is_a_sentence_a_line_and_a_figure(real, tmp_path):
     first = html.unescape(page[page.index("<body>") : page.index('<details class="part"')])
     told = verdict(real[0]).told
     assert [t.text in first for t in told] == [True] + [False] * (len(told) - 1)
-    shown = re.findall(r"<pre>(.*?)</pre>", first, re.DOTALL)
-    assert shown == [told[0].line, told[0].in_c]  # C is in a tab of its own
+    assert re.findall(r"<pre>(.*?)</pre>", first, re.DOTALL) == [
+        told[0].line,
+        told[0].in_c,
+    ]  # C is in a tab of its own
     assert 'id="in-python" checked' in first
     assert first.count("<svg") == 1
     assert 'class="b"' in first

@@ -1,21 +1,18 @@
 """How sure a recommendation is: resamplings, misses that count, drift, and what others take by their own interface."""
 
-import io
 import math
 import random
 import re
 
 import pytest
-from rich.console import Console
 
 from lavender import bench, report
 from lavender.lab.report import tables
 from lavender.lab.report.findings import Report
 from lavender.lab.report.tables.finals import in_time, lines, to_level
-from lavender.lab.report.terminal import print_report
 from lavender.lab.report.text import seconds
 from lavender.lab.report.verdict import verdict
-from tests.lab.report.test_report import record, records_of
+from tests.lab.report.test_report import record, records_of, shown
 
 CASES = [f"case {i}" for i in range(6)]
 ROBOTS = {"ant": 1.0, "cheetah": 3.0, "hopper": 0.7, "humanoid": 5.0, "walker": 1.5, "reacher": 0.4}
@@ -221,11 +218,10 @@ def test_the_headline_is_of_all_sequences():
     assert verdict(found).text.startswith(
         "Use auto: it solves the 12 steps of your 3 sequences in 1.00 ms on average, warm from the step before, down"
     )
-    told, out = verdict(found).told[0], io.StringIO()
+    told = verdict(found).told[0]
     assert told.line == 'solution = lv.solve(problem, "auto", impulse=start, tol=1e-6)'
     assert len(told.code) == 5  # with the loop that carries impulses, which a terminal shows on request
-    print_report(Report(found), Console(file=out, width=400))
-    assert out.getvalue().splitlines()[1] == f"    {told.line}  # the lines around it: --tables"
+    assert shown(Report(found), 400).splitlines()[1] == f"    {told.line}  # the lines around it: --tables"
 
 
 @pytest.mark.parametrize("way", ["call", "steps"])
@@ -242,13 +238,12 @@ def test_the_first_screen_has_one_time_for_each_solver(way):
         made.records = [
             bench.Record(**{**vars(r), **more, "step": CASES.index(r.case)}) for r in made.records
         ]
-    found, out = Report(made), io.StringIO()
+    found = Report(made)
     first, second = (choice for _, choice in found.verdict.raced)
     assert first.solver == "newton" and f"in {seconds(first.score)} on average" in found.verdict.told[0].text
     (line,) = found.lines
     assert line.by_level[1e-6].ranking[0].score < 0.7 * first.score  # alone it was quicker
-    print_report(found, Console(file=out, width=200))
-    table = [re.split(r"  +", row.strip()) for row in out.getvalue().partition("\n\n")[2].splitlines()]
+    table = [re.split(r"  +", row.strip()) for row in shown(found).partition("\n\n")[2].splitlines()]
     start = "carried" if way == "steps" else "cold"
     assert table[0] == ["solver", "to 1e-6", "asked", "timed"]
     assert table[1] == ["newton", seconds(first.score), f"to 1e-6, {start}", "in turns"]

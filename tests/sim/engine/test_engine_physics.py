@@ -195,8 +195,5 @@ def test_a_box_grips_more_on_the_diagonal(more):
 def test_what_no_scene_of_boxes_has_is_told():
     with pytest.raises(lv.UnknownName, match="friction_shape"):
         lv.Scene("stack", friction_shape="square")
-    for stepper in ("xpbd", "avbd"):
-        with pytest.raises(lv.InputError, match="by a disk"):
-            lv.Scene("stack", friction_shape="box", stepper=stepper)
     with pytest.raises(lv.InputError, match="no spin friction"):
         lv.Simulation(lv.Scene("spinner", friction_shape="box"))
