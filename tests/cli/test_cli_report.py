@@ -342,7 +342,7 @@ def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tm
     assert len(again) == plain  # made again, they stand for the earlier ones
 
 
-def test_nothing_is_cut_off_in_a_pipe(path, tmp_path):
+def test_nothing_is_cut_off_in_a_pipe(tmp_path):
     long = tmp_path / ("a" * 100 + ".npz")
     io.save(stack(8), long)
     words = ("report", long, "--solvers", "sequential_impulses,pgs", *QUICK, "--tables")

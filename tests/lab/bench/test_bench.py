@@ -152,7 +152,7 @@ def test_a_refused_case_and_a_file_that_does_not_load_are_named(tmp_path):
     assert "lcp" in refused.reason
 
 
-def test_a_method_of_free_rows_is_measured_as_its_method_with_bounds_and_a_note_says_so(tmp_path, capsys):
+def test_a_method_of_free_rows_is_measured_as_its_method_with_bounds_and_a_note_says_so(capsys):
     free = lv.Problem.linear(np.diag([2.0, 3.0]), np.ones(2), name="free")
     records = bench.run([stack(4), free], ["gauss_seidel"], QUICK)
     assert {(r.case, r.solver) for r in records} == {("stack", "pgs"), ("free", "gauss_seidel")}

@@ -129,9 +129,9 @@ def test_slopes_by_the_linear_program(slope, holds):
 # -- laws of one body, by small steps -------------------------------------------------------------
 
 
-def one_body(name, case, wrong=1.0):
+def one_body(name, wrong=1.0):
     """Coulomb's law on one body in steps of 2e-5 s, friction `wrong` times what it should be, as a track."""
-    p = PHENOMENA[name].values(case)
+    p = PHENOMENA[name].values({})
     h, look = 2e-5, 1 / 60
     mu = wrong * p["mu"]
     angle = math.atan(p["slope"] * p["mu"]) if name in ("stick", "slide") else 0.0
@@ -163,21 +163,10 @@ def one_body(name, case, wrong=1.0):
     return p, Track(t, place, turn, speed)
 
 
-@pytest.mark.parametrize(
-    ("name", "case"),
-    [
-        ("stick", {}),
-        ("slide", {}),
-        ("stop", {}),
-        ("roll", {}),
-        ("roll_to_rest", {}),
-        ("spin_down", {}),
-        ("lift", {}),
-    ],
-)
-def test_small_steps_of_coulombs_law_are_within_every_bound(name, case):
+@pytest.mark.parametrize("name", ["stick", "slide", "stop", "roll", "roll_to_rest", "spin_down", "lift"])
+def test_small_steps_of_coulombs_law_are_within_every_bound(name):
     phenomenon = PHENOMENA[name]
-    p, track = one_body(name, case)
+    p, track = one_body(name)
     for q in phenomenon.quantities:
         assert phenomenon.measure(p, track)[q.name] <= 0.1 * q.bound, q.name
 
@@ -185,5 +174,5 @@ def test_small_steps_of_coulombs_law_are_within_every_bound(name, case):
 @pytest.mark.parametrize("name", ["slide", "stop", "roll", "roll_to_rest", "spin_down"])
 def test_friction_of_four_fifths_is_out_of_a_bound(name):
     phenomenon = PHENOMENA[name]
-    p, track = one_body(name, {}, wrong=0.8)
+    p, track = one_body(name, wrong=0.8)
     assert any(phenomenon.measure(p, track)[q.name] > q.bound for q in phenomenon.quantities)

@@ -171,7 +171,7 @@ def test_an_answer_is_no_worse_than_its_start(name, limit):
 
 
 @pytest.mark.parametrize("name", ["J and M, dense", "matrix, lcp", "bodies, coulomb"])
-def test_the_judge_begins_only_what_he_can_end(name, clock, monkeypatch):
+def test_the_judge_begins_only_what_he_can_end(name, clock):
     """What he sets up fits, his pass behind it does not."""
     problem = fresh(PROBLEMS[name]())
     limit = residuals.setup_time(problem) + 0.9 * judging_time(problem)

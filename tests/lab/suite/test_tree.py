@@ -243,7 +243,7 @@ def test_sweeps_that_promise_little_give_way():
 
 
 @pytest.mark.parametrize("name", ["wild(seed=12)", "wild(seed=24)", "wild(seed=3)", "granularF(n=9)"])
-def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name, monkeypatch):
+def test_what_would_not_end_in_time_is_neither_counted_nor_begun(name):
     """With the least of time sweeps have all of it."""
     problem = suite.case(name).problem
     reference(problem)
