@@ -1,8 +1,5 @@
 """Cones: what blocks may be, bounds, and the NumPy projection against its conditions."""
 
-import copy
-import pickle
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -83,16 +80,8 @@ def test_bounds_of_contact_rows_are_spelled_in_one_way():
     two = lv.Cones([0, 3], [1], [5.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.5], [0.0])
     assert one == two
     assert one.lower[0] == 0.0
-
-
-def test_arrays_stay_read_only_in_copies_and_pickles():
-    cones = lv.Cones.contacts(np.array([0.5]))
-    for other in (cones, copy.deepcopy(cones), pickle.loads(pickle.dumps(cones))):
-        assert other == cones
-        for name in ("ptr", "kind", "lower", "upper", "mu", "patch_radius"):
-            assert not getattr(other, name).flags.writeable
     with pytest.raises(TypeError):
-        hash(cones)
+        hash(one)
 
 
 @given(seed=seeds, size=st.floats(1e-3, 1e3))

@@ -234,7 +234,8 @@ def test_problems_and_solutions_are_copied_and_pickled_after_use(again):
         twin, result = again(problem), again(solution)
         assert twin == problem
         assert not twin.b.flags.writeable
-        assert not twin.cones.ptr.flags.writeable
+        for name in ("ptr", "kind", "lower", "upper", "mu", "patch_radius"):
+            assert not getattr(twin.cones, name).flags.writeable
         assert twin.rows is None or not twin.rows.jac.flags.writeable
         np.testing.assert_array_equal(lv.solve(twin, "pgs").impulse, solution.impulse)
         np.testing.assert_array_equal(result.slack, solution.slack)

@@ -1,7 +1,5 @@
 """Contacts that resist rolling: what they are, how they are judged, saved and solved."""
 
-import itertools
-
 import numpy as np
 import pytest
 from random_problems import as_matrix, random_contact_problem, touching
@@ -74,6 +72,5 @@ def test_cones_join_restrict_and_project():
     assert both.spin_rows.tolist() == [-1, -1, 13, -1]
     assert both.rolling.tolist() == [0.1, 0.1, 0.2, 0.0]
     x = lv.cones.project(both, np.ones(both.n_rows))
-    for i, j in itertools.product(range(3), range(1)):
-        r = both.rolling_rows[i]
-        np.testing.assert_allclose(np.hypot(x[r + j], x[r + 1]), both.rolling[i])
+    for r, most in zip(both.rolling_rows[:3], both.rolling[:3], strict=True):
+        np.testing.assert_allclose(np.hypot(x[r], x[r + 1]), most)
