@@ -32,6 +32,7 @@ class Plan:
     newton: float  # ns, Newton's method as counted; inf where it does not take the problem
     sweep: float  # ns, one sweep
     stages: tuple[Stage, ...]  # the first lines, each taken where those before it did not solve the problem
+    in_turn: tuple[str, ...]  # who then goes on in turn, with doubled work
 
     def data(self) -> Mapping[str, Any]:
         """As JSON has it; costs in nanoseconds, None where a number has no bound."""
@@ -46,7 +47,8 @@ class Plan:
         for stage in self.stages:
             most = f"up to {stage.iterations:.3g} iterations" if stage.iterations < 1e9 else "to its end"
             lines.append(f"  {stage.solver:<18}{most:<26}{stage.why}")
-        lines.append("then these in turn with doubled work, and a certificate that there is no solution")
+        told = ", ".join(self.in_turn)
+        lines.append(f"then {told} in turn with doubled work, and a certificate that there is no solution")
         return "\n".join(lines)
 
 
@@ -90,7 +92,8 @@ def explain(problem: Problem, tol: float = 1e-6) -> Plan:
     reference(problem)
     tree, small = Tree(problem), who(problem)
     tree.tried = problem.generalized is not None and bool(small)
+    stages = tuple(islice(tree, LINES))
     return Plan(
         rows=problem.m, law=problem.law, operator=problem.operator, tol=tol, small=small, newton=tree.newton,
-        sweep=tree.sweep, stages=tuple(islice(tree, LINES)),
+        sweep=tree.sweep, stages=stages, in_turn=tuple(stage.solver for stage in tree.in_turn(1.0)),
     )  # fmt: skip

@@ -94,6 +94,8 @@ def test_the_tail_doubles(name):
         last[stage.solver] = stage.iterations
     other = "admm" if tree.problem.generalized is None else "nncg"
     assert {"anderson", "newton", other} <= set(last)
+    told = lv.explain(FIRST[name][0]())
+    assert {"anderson", "newton", other} <= set(told.in_turn) and other in str(told).splitlines()[-1]
 
 
 def test_sweeps_first_have_the_counted_cost():
