@@ -7,7 +7,7 @@ Arrays are read where they stand, in float32 or float64: what is made of one wor
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any, overload
 
 import numpy as np
@@ -489,8 +489,4 @@ def _joined(cones: Any, n: int) -> Cones:
     each = list(cones)
     if len(each) != n or not all(isinstance(c, Cones) for c in each):
         raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
-    offset = np.cumsum([0, *(c.n_rows for c in each)])
-    ptr = np.concatenate([*(c.ptr[:-1] + at for c, at in zip(each, offset, strict=False)), offset[-1:]])
-    names = [f.name for f in fields(Cones) if f.name != "ptr"]
-    parts = (np.concatenate([getattr(c, name) for c in each] or [np.zeros(0)]) for name in names)
-    return Cones(ptr.astype(np.int32), *parts)
+    return Cones._joined(each)

@@ -18,7 +18,7 @@ perhaps one spin row, perhaps two rows that roll. With lambda [N s] the bounds a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -156,6 +156,14 @@ class Cones:
         cones = object.__new__(cls)
         cones._take(made)
         return cones
+
+    @classmethod
+    def _joined(cls, each: Iterable[Cones]) -> Cones:
+        """The blocks of each, one after the other."""
+        made = kernels.joined([cones._blocks for cones in each])
+        if made is None:
+            raise InputError("together these have more rows than 32-bit numbers count")
+        return cls._of(made)
 
     def _checked(self) -> kernels.Blocks:
         # The long way: what can be made to fit, and words for what cannot.
@@ -507,10 +515,7 @@ class Cones:
         """These blocks, then those of `other`."""
         if not isinstance(other, Cones):
             return NotImplemented
-        made = kernels.joined(self._blocks, other._blocks)
-        if made is None:
-            raise InputError("together these have more rows than 32-bit numbers count")
-        return Cones._of(made)
+        return Cones._joined((self, other))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):

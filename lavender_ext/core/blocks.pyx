@@ -137,20 +137,29 @@ cdef void put(Blocks to, Py_ssize_t block, Py_ssize_t row, const blocks_t* p) no
     (<int32_t*>to.at.ptr)[block + p.n_blocks] = <int32_t>row + p.n_rows
 
 
-def joined(Blocks a, Blocks b):
-    """The blocks of a, then those of b."""
-    cdef Py_ssize_t k = a.at.n_blocks, m = a.at.n_rows
-    if k + b.at.n_blocks >= 2147483647 or m + b.at.n_rows >= 2147483647:
+def joined(list each):
+    """The blocks of each, one after the other; None where they have more rows than 32-bit numbers count."""
+    cdef Py_ssize_t k = 0, m = 0
+    cdef Blocks one
+    for one in each:
+        k += one.at.n_blocks
+        m += one.at.n_rows
+    if k >= 2147483647 or m >= 2147483647:
         return None
-    cdef Blocks made = room_of(k + b.at.n_blocks, m + b.at.n_rows)
-    put(made, 0, 0, &a.at)
-    put(made, k, m, &b.at)
-    made.is_free = a.is_free and b.is_free
-    made.is_bounded_rows = a.is_bounded_rows and b.is_bounded_rows
-    made.has_round = a.has_round or b.has_round
-    made.has_rolling = a.has_rolling or b.has_rolling
-    made.has_ellipse = a.has_ellipse or b.has_ellipse
-    made.single_rows = a.single_rows and b.single_rows
+    cdef Blocks made = room_of(k, m)
+    (<int32_t*>made.at.ptr)[0] = 0
+    made.is_free = made.is_bounded_rows = made.single_rows = True
+    k = m = 0
+    for one in each:
+        put(made, k, m, &one.at)
+        k += one.at.n_blocks
+        m += one.at.n_rows
+        made.is_free &= one.is_free
+        made.is_bounded_rows &= one.is_bounded_rows
+        made.single_rows &= one.single_rows
+        made.has_round |= one.has_round
+        made.has_rolling |= one.has_rolling
+        made.has_ellipse |= one.has_ellipse
     return made
 
 
