@@ -41,9 +41,7 @@ class Derived:
         self.lock, self.process = RLock(), _process  # held while a `once` is worked out, in this process
         self.nothing: bool | None = None  # whether doing nothing is right
         self.judged: Judged | None = None  # the judge's pass over a result that is about to be returned
-        self.proof: Any = (
-            None  # the last certificate that was looked at, and what it proves (`judge.certificates`)
-        )
+        self.proof: Any = None  # the last certificate that was looked at, and what it proves
         self.view: Data | None = None  # in generalised coordinates: what kernels read, from the beginning
         self.spread: int | None = None  # how far apart blocks that share a body stand
         self.small: Any = None  # the compiled call of a problem of few rows, False where it has none
