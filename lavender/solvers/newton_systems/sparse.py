@@ -68,10 +68,9 @@ class SparseRows:
                 self.rows.data[self.diagonal] += (
                     1.0 / s.v
                 )  # inf for a row that no longer moves: the step fails
-        self.instead = None
-        self.made = bool(np.isfinite(self.rows.data).all())
-        if self.made and not self.factor_panels():
-            self._superlu()
+        self.instead, self.made = None, False  # and so after Ctrl-C
+        if np.isfinite(self.rows.data).all():
+            self.made = self.factor_panels() or self._superlu()
         return self.made
 
     def _coupled(self, left: FloatArray, right: FloatArray | None, own: float) -> FloatArray:
@@ -107,19 +106,20 @@ class SparseRows:
             x = self.solve_panels(r)
             if x is not None:
                 return x
-            self._superlu()
+            self.made = self._superlu()
         if not self.made:
             return np.full_like(r, np.nan)
         found: FloatArray = self.instead(r)
         return found
 
-    def _superlu(self) -> None:
+    def _superlu(self) -> bool:
         matrix = self.rows.copy()
         matrix.eliminate_zeros()
         try:
             self.instead = sparse_lu(matrix, permc_spec="COLAMD").solve
         except RuntimeError:
-            self.made = False
+            return False
+        return True
 
 
 def _graph(sc: Solve, a: sp.csr_array) -> tuple[IntArray, IntArray]:

@@ -407,6 +407,14 @@ def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):
         np.testing.assert_allclose(solution.impulse, expected.impulse, rtol=0, atol=1e-8)
 
 
+def test_ctrl_c_within_the_first_factor_is_told_and_no_other_error(monkeypatch):
+    def stopped(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sparse.SparseRows, "factor_panels", stopped)
+    assert lv.solve(sparse_rows(2), "newton", tol=1e-10).status is lv.Status.INTERRUPTED
+
+
 def test_pivots_inside_panels_are_refined_or_given_up():
     """[[e, 1], [1, e]] of two panels has no stable LU without an exchange between them."""
     problem = sparse_rows(3, even=False)
