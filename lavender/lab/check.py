@@ -213,6 +213,11 @@ def cross_check(
         except LavenderError as error:  # refused only after a look at the numbers
             rows.append(CrossCheckRow(name, REFUSED, note=str(error)))
             continue
+        except Exception as error:  # a plug-in may raise anything: it costs its own row
+            if get(run).own:
+                raise
+            rows.append(CrossCheckRow(name, NOT_SOLVED, note=f"{type(error).__name__}: {error}"))
+            continue
         rows.append(replace(compare(problem, name, solution, optimum), ran="" if other is None else run))
     if optimum is not None or any(row.verdict == AGREES_UNCOMPARED for row in rows):
         rows = [replace(r, verdict=INEXACT) if r.verdict in (PROVED, NEAR_NONE) else r for r in rows]

@@ -105,6 +105,16 @@ def test_a_liar_is_contradicted(plug_in):
     assert not table.ok
     assert [r.solver for r in table.contradicted] == ["liar"]
     assert "says CONVERGED" in table["liar"].note
+
+
+def test_what_a_plug_in_raises_costs_its_own_row(plug_in):
+    def broken(problem, impulse):
+        raise RuntimeError("boom")
+
+    plug_in(broken, "broken")
+    table = cross_check(bounded_problem(2), ["broken", "direct"])
+    assert table["broken"].verdict == check.NOT_SOLVED and table["broken"].note == "RuntimeError: boom"
+    assert table["direct"] in table.agreed and not table.ok
     assert table["direct"].verdict == "agrees"
 
 
