@@ -120,10 +120,12 @@ def shape_of(what: str, value: Any) -> tuple[int, ...]:
 
 
 def places(i: Any, n: int) -> int | list[int]:
-    """What an index names of n things: a whole number one of them; a slice, a mask (n,) or whole numbers a list."""
+    """What an index names of n worlds: a whole number one of them; a slice, a mask (n,) or whole numbers a list."""
     if isinstance(i, slice):
         return list(range(*i.indices(n)))
     if hasattr(i, "__index__") and np.ndim(i) == 0:
+        if not -n <= i < n:
+            raise IndexError(f"world {i}; there are {n}")
         return range(n)[i]
     chosen: list[int] = np.arange(n)[list(i)].tolist()
     return chosen

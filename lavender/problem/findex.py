@@ -44,8 +44,8 @@ def order_of(findex: Any, count: int | None = None) -> IntArray:
 
 def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Cones]:
     """(`order_of` the rows, their blocks), checked."""
+    findex = as_array("findex", findex, (m,), dtype=np.int32)
     order = order_of(findex, m)
-    findex = np.asarray(findex)
     low = as_array("lower", lower, (m,), finite=False, unit="N s")
     high = as_array("upper", upper, (m,), finite=False, unit="N s")
     follows = findex >= 0

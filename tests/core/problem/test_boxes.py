@@ -83,8 +83,9 @@ def test_findex_comes_back_in_any_order(seed):
     np.testing.assert_allclose(low2, low[rows], rtol=1e-15)
     named = np.where(findex < 0, -1, rows[findex]) if m else findex
     np.testing.assert_array_equal(named, given_[rows])
-    again = lv.Problem.from_findex(a2, b2, low2, high2, findex, guess=problem.guess)
-    assert again == problem
+    for kind in (np.int64, np.float32):
+        again = lv.Problem.from_findex(a2, b2, low2, high2, findex.astype(kind), guess=problem.guess)
+        assert again == problem
 
 
 @pytest.mark.parametrize(

@@ -241,6 +241,8 @@ def test_worlds_are_chosen_as_entries_of_an_array_are():
     for wrong in (5, -6, mask[:4], [5], "a"):
         with pytest.raises(IndexError):
             many[wrong]
+    with pytest.raises(IndexError, match="world 5; there are 5"):
+        batch[5]
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
