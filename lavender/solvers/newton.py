@@ -15,7 +15,9 @@
    pass from stick to slip.
 
 Problems in generalised coordinates are first solved over their velocities (`newton_systems/general.py`), without
-forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity".
+forming A. If that fails, 1 to 4 follow over the rows of A, unless form="velocity". Where velocities stand for bodies,
+of which two at most meet in every block (free bodies of an engine), 1 to 4 are over these bodies, at once under
+Coulomb's law and where many contacts are rigid (`SmallCall.may_cost`).
 
 1 to 4 are compiled (`lavender_ext/newton/plan.pxd`) and run one factorisation at a time; in between, Python checks the
 clock, Ctrl-C and certificates. `newton_systems/` makes their linear systems. Form "velocity" factors I + K^T V K over
@@ -38,7 +40,7 @@ from lavender.judge.solution import Claim, Status, counted
 from lavender.problem import OPERATORS, Problem
 from lavender.solvers.costs import SOFT, STEPS, Count, factorisations, newton_cost
 from lavender.solvers.newton_systems import general
-from lavender.solvers.newton_systems.systems import System, is_dense, make_system
+from lavender.solvers.newton_systems.systems import System, bodies_of, is_dense, make_system
 from lavender.solvers.registry import Solver, SolverSpec
 from lavender.solvers.setup_times import (
     analysed,
@@ -145,25 +147,27 @@ class Newton(Solver):
             )
         if problem.m == 0:
             return NewtonState(problem, None)
-        if problem.generalized is not None and self.form != "impulse":
+        bodies = kernel = None
+        over_velocities = problem.generalized is not None and self.form != "impulse"
+        if over_velocities:
             kernel = general.prepare(problem)
-            if kernel is not None:
-                return NewtonState(problem, None, kernel)
-            if self.form == "velocity":
-                raise CapabilityError(
-                    f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
-                    "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
-                    "or sweeps"
-                )
+        if self.form != "impulse" and (kernel is None or NEWTON.may_cost(problem, kernel) == 0.0):
+            bodies = bodies_of(problem)  # interior points are the shorter way
+        if bodies is None and kernel is not None:
+            return NewtonState(problem, None, kernel)
+        if bodies is None and over_velocities and self.form == "velocity":
+            raise CapabilityError(
+                f"form='velocity' has room for a matrix of {general.ROOM:.1e} values over the velocities of an "
+                "island (dense or with the factor's own fill); this problem has a larger one: use form='impulse' "
+                "or sweeps"
+            )
         if problem.cones.has_round:
             raise CapabilityError(
                 "round cones of more than two tangents are solved over velocities alone: form='impulse' does not take "
                 f"them, and form='velocity' has room for {general.ROOM:.1e} values of an island's matrix"
             )
-        form = self.form
-        if form == "auto":
-            form = "impulse" if problem.rows is None or problem.rows.n_bodies == 0 else "velocity"
-        system = make_system(problem, form, like)
+        form = "impulse" if bodies is None else "velocity"
+        system = make_system(problem, form, like, bodies)
         return NewtonState(problem, system if system.solve.m else None)
 
     def update(self, state: NewtonState, problem: Problem) -> NewtonState:
@@ -216,8 +220,10 @@ class Newton(Solver):
         problem, deadline = state.problem, Deadline(time_limit)
         claim = general.run(problem, state.general, impulse, max_iter, tol, time_limit)
         left = max_iter - claim.iterations
-        ended = claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED)
-        if ended or self.form == "velocity" or left <= 0 or problem.m > ROWS or problem.cones.has_round:
+        if claim.status not in (Status.STALLED, Status.NUMERICAL_ERROR, Status.DIVERGED) or left <= 0:
+            return claim
+        bodies = bodies_of(problem)
+        if bodies is None and (self.form == "velocity" or problem.m > ROWS or problem.cones.has_round):
             return claim
         w, e = np.empty(problem.m), np.empty(problem.m)
         best, floor = quick(problem, impulse, w, e, True)
@@ -226,7 +232,7 @@ class Newton(Solver):
         before = impulse.copy()
         if not best <= WARM:
             impulse[:] = problem.start()
-        system = make_system(problem, "impulse")
+        system = make_system(problem, "impulse" if bodies is None else "velocity", bodies=bodies)
         more = self._run_system(
             problem, system if system.solve.m else None, impulse, left, tol, deadline.left(1e-3)
         )

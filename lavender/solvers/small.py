@@ -23,6 +23,7 @@ from lavender.problem import Problem
 from lavender.solvers.costs import RATES, SOFT, STEPS, SWEEPS, factorisations, sweep_cost
 from lavender.solvers.islands import islands
 from lavender.solvers.newton_systems import general
+from lavender.solvers.newton_systems.systems import DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.setup_times import forming
 from lavender_ext.small.call import Bounded, Friction, Small
@@ -41,6 +42,7 @@ SWEPT = 32  # the most sweeps of a part before its first factorisation
 QUARTER = 0.25  # of the time left, that islands may take
 SPLIT = 200.0  # ns for each row of what tells islands apart
 TREE = 2e5  # ns, Python's share of two lines of the tree, which one compiled call does without
+SHARED = 10.0  # rows for each velocity, from which N is full and small beside what it is made of
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
@@ -49,7 +51,8 @@ def limits(sweeps: float, most: float = MOST) -> Limits:
     count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"]
-    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most]))
+    rows = SMALL_ROWS, DENSE_ROWS, SHARED
+    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most, *rows]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:
@@ -107,7 +110,7 @@ def who(problem: Problem) -> str:
         kernel = general.prepare(problem)
         if kernel is None or AUTO.limits is None:
             return ""
-        cost, most = AUTO.limits.cost(problem.metric, kernel.work)
+        cost, most = AUTO.limits.cost(problem.metric, kernel.work, kernel.islands)
         return f"newton over velocities, counted to take {1e-3 * cost:.3g} us" if cost <= most else ""
     small = prepared(problem)
     if small is None:
@@ -127,6 +130,10 @@ class SmallCall:
     pivots: bool  # bounded rows
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
+
+    def may_cost(self, problem: Problem, kernel: Any) -> float:
+        """What the call over J and M may cost as counted [ns]; 0 where it is not made whatever it costs."""
+        return 0.0 if self.limits is None else float(self.limits.cost(problem.metric, 0.0, kernel.islands)[1])
 
     def attempt(
         self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = inf

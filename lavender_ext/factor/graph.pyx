@@ -207,3 +207,56 @@ def tree_pairs(Data p):
                     if t > body[i, 1]:
                         body[i, 1] = t
     return body_pairs(body, g.n, True)
+
+
+cdef enum:
+    OF_BODY = 6                 # velocities at most
+
+
+def bodies_in(Data p, order):
+    """(body (k, 2), n, column (nv,)): velocities of J and M as those of n bodies, of which each block touches two; or None.
+
+    A body is a run of at most six velocities, in the order given, of which neighbours stand mostly in the same panels of Y.
+    column: 6 b + place of each velocity; body: -1 where a block touches fewer; `order` is that of `Generalized`.
+    """
+    p.prepare()
+    cdef const generalized_t* g = &p.general
+    cdef int32_t i, b, c, q, t, last = -1, size = 0, n = 0, k = p.blocks.n_blocks
+    cdef int32_t[::1] given = np.arange(g.n, dtype=np.int32) if order is None else np.argsort(order).astype(np.int32)
+    cdef int32_t[:, ::1] marks = np.full((4, g.n + 1), -1, np.int32)
+    cdef int32_t* before = &marks[0, 0]                 # the velocity before each,
+    cdef int32_t* on = &marks[1, 0]                     # panels that have it,
+    cdef int32_t* both = &marks[2, 0]                   # and the one before too
+    cdef int32_t* seen = &marks[3, 0]
+    body_array, column_array = np.full((k, 2), -1, np.int32), np.empty(g.n, np.int32)
+    cdef int32_t[:, ::1] body = body_array
+    cdef int32_t[::1] column = column_array
+    for i in range(g.n):
+        c = given[i]
+        before[c], last = last, c
+        on[c] = both[c] = 0
+    for b in range(g.n_panels):
+        for q in range(g.pcol[b], g.pcol[b + 1]):
+            seen[g.cols[q]] = b
+        for q in range(g.pcol[b], g.pcol[b + 1]):
+            c = g.cols[q]
+            on[c] += 1
+            both[c] += before[c] >= 0 and seen[before[c]] == b
+    for i in range(g.n):
+        c = given[i]
+        if i > 0 and size < OF_BODY and 2 * both[c] >= max(on[c], on[before[c]]):
+            size += 1
+        else:
+            n, size = n + 1, 1
+        column[c] = OF_BODY * (n - 1) + size - 1
+    for i in range(k):
+        b = g.home[i]
+        for q in range(g.pcol[b], g.pcol[b + 1]):
+            t = column[g.cols[q]] // OF_BODY
+            if body[i, 0] < 0:
+                body[i, 0] = t
+            elif t != body[i, 0] and t != body[i, 1]:
+                if body[i, 1] >= 0:
+                    return None
+                body[i, 1] = t
+    return body_array, n, column_array

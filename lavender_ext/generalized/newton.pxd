@@ -43,7 +43,7 @@ cdef enum:
     IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
     LINE_STEPS = 24             # evaluations of one line search
     RENEW = 16                  # steps after which s is formed anew
-    ROUNDS = 60                 # rounds of Coulomb friction
+    ROUNDS = 12                 # of Coulomb friction: what these leave is not for this method
 
 
 # -- along a line ----------------------------------------------------------------------------------------------

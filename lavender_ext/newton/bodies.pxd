@@ -8,8 +8,10 @@ from libc.math cimport sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memset
 
+from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport factor_t, sparse_t
 from lavender_ext.factor.graph cimport eliminate_bodies, pattern_room
 from lavender_ext.factor.symbolic cimport block_pattern, block_tree
@@ -174,6 +176,23 @@ cdef inline void panel_of(const blocks_t* p, const rows_t* r, double* root, doub
     fill_panel(p, r, root, root + 9 * <int64_t>n, panel)
 
 
+cdef inline void panel_of_velocities(const blocks_t* p, const generalized_t* g, const int32_t* body, const int32_t* column,
+                                     double* panel) noexcept nogil:
+    """K (rows, 12) where velocities are those of bodies: column (n), body (n_blocks, 2) of `graph.bodies_in`."""
+    cdef int32_t i, j, q, c, b, nc
+    cdef const double* y
+    cdef double* row
+    for i in range(p.n_blocks):
+        b = g.home[i]
+        nc = g.pcol[b + 1] - g.pcol[b]
+        for j in range(p.ptr[i], p.ptr[i + 1]):
+            y = g.y + g.pval[b] + <int64_t>(j - g.prow[b]) * nc
+            row = panel + 12 * <int64_t>j
+            for q in range(nc):
+                c = column[g.cols[g.pcol[b] + q]]
+                row[c % 6 + (0 if c // 6 == body[2 * i] else 6)] = y[q] / sqrt(p.d[j])
+
+
 cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
                                 bint lu, const sparse_t* super, const int64_t* spot, double** x) noexcept nogil:
     """Panel (rows, 12), of each body these columns alone, and the factor in PARTS of zeros; super: its panels."""
@@ -189,8 +208,10 @@ cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, 
     f.nval, f.mval, f.lval, f.uval, f.dval, f.work, f.work2 = x[1], x[2], x[3], x[4], x[5], x[6], x[7]
 
 
-cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const blocks_t* p, const rows_t* r) noexcept nogil:
+cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const view_t* v) noexcept nogil:
     """Everything of s in real (`body_room`): what every form has, then panel and factor."""
+    cdef const blocks_t* p = &v.p
+    cdef const rows_t* r = v.r
     cdef int32_t i
     cdef int32_t column[6]
     cdef int64_t size[PARTS]
@@ -198,7 +219,7 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const b
     cdef double* panel
     cdef double* x
     memset(real, 0, own_room(p.n_rows, s.sc.small) * sizeof(double))
-    panel = furnish(s, NULL, r, real)
+    panel = furnish(s, v, real)
     x = panel + 12 * <int64_t>p.n_rows
     for i in range(6):
         column[i] = i

@@ -12,7 +12,7 @@ from libc.stdint cimport int32_t
 from lavender_ext.newton.cones cimport (KEPT_V, cone_affine, cone_combined, cone_gap, cone_length, cone_parts, cone_size,
                                         cone_step, dual_head, gather, is_high, is_low, kept, load_dual, on_normal,
                                         row_limit, scatter, slack_dual, store_dual)
-from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
+from lavender_ext.newton.elements cimport elements_t, is_row
 
 
 cdef inline double ipm_start(const elements_t* e, const double* hz, double dual, double* z, double* u1,
@@ -87,13 +87,49 @@ cdef inline double ipm_start(const elements_t* e, const double* hz, double dual,
     return degree
 
 
+cdef inline bint is_soft(const elements_t* e, int32_t i) noexcept nogil:
+    """Has a row of element i any compliance?"""
+    cdef int32_t j
+    for j in range(e.ptr[i], e.ptr[i + 1]):
+        if e.theta[j] != 0.0:
+            return True
+    return False
+
+
+cdef inline void soften(const elements_t* e, int32_t i, double* v, double* bt) noexcept nogil:
+    """V and B^T of the same element with its theta: B <- B L^-T, L L^T = I + B^T theta B, for the V that B has then."""
+    cdef int32_t j = e.ptr[i], nr = e.ptr[i + 1] - j, k, l, t
+    cdef double x
+    cdef double low[36]
+    for k in range(nr):
+        for l in range(k + 1):
+            x = 1.0 if k == l else 0.0
+            for t in range(nr):
+                x += bt[k * nr + t] * e.theta[j + t] * bt[l * nr + t]
+            for t in range(l):
+                x -= low[k * nr + t] * low[l * nr + t]
+            low[k * nr + l] = sqrt(x) if k == l else x / low[l * nr + l]
+    for k in range(nr):
+        for l in range(nr):
+            x = bt[k * nr + l]
+            for t in range(k):
+                x -= low[k * nr + t] * bt[t * nr + l]
+            bt[k * nr + l] = x / low[k * nr + k]
+    for k in range(nr):
+        for l in range(nr):
+            x = 0.0
+            for t in range(nr):
+                x += bt[t * nr + k] * bt[t * nr + l]
+            v[k * nr + l] = x
+
+
 cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u1, const double* u2, double delta,
                                double* v, double* bt, double* gap) noexcept nogil:
-    """V = (W + theta + delta)^-1 of (3) for each element, B^T with V = B B^T where theta = 0, and the gap G z . u.
+    """V = (W + theta + delta)^-1 of (3) for each element, B^T with V = B B^T, and the gap G z . u.
 
-    bt may be NULL.
+    bt may be NULL where no element is a contact.
     """
-    cdef int32_t i, j, k, l, n, nr, q, t, g, first
+    cdef int32_t i, j, k, l, n, nr, q, g, first
     cdef bint more
     cdef double x, y, r, total = 0.0
     cdef double s[4]
@@ -101,8 +137,7 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
     cdef double h[4]
     cdef double c[4]
     cdef double root[4]
-    cdef double a[36]
-    cdef double b[36]
+    cdef double a[6]
     for i in range(e.n):
         j = e.ptr[i]
         nr = e.ptr[i + 1] - j
@@ -120,10 +155,7 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
                 bt[q] = sqrt(v[q])
             continue
         for k in range(nr * nr):
-            v[q + k] = 0.0
-        if bt != NULL:
-            for k in range(nr * nr):
-                bt[q + k] = 0.0
+            v[q + k] = bt[q + k] = 0.0
         x = 0.0
         more = False
         a[0] = 1.0
@@ -144,30 +176,15 @@ cdef inline void ipm_scale(const elements_t* e, const double* z, const double* u
                 a[first + k] = h[k]
                 for l in range(n - 1):
                     v[q + (first + k) * nr + first + l] = c[k * (n - 1) + l]
-                    if bt != NULL:
-                        bt[q + (first + k) * nr + first + l] = root[k * (n - 1) + l]
+                    bt[q + (first + k) * nr + first + l] = root[k * (n - 1) + l]
         for k in range(nr):
             for l in range(nr):
                 v[q + k * nr + l] += x * a[k] * a[l]
-        if bt != NULL:
-            r = sqrt(x)
-            for k in range(nr):
-                bt[q + k] = r * a[k]
-        y = 0.0
+        r = sqrt(x)
         for k in range(nr):
-            y += e.theta[j + k]
-        if y > 0.0:                                     # V <- (I + V theta)^-1 V
-            for k in range(nr):
-                for l in range(nr):
-                    a[k * nr + l] = v[q + k * nr + l] * e.theta[j + l] + (1.0 if k == l else 0.0)
-            invert_small(a, b, nr)
-            for k in range(nr):
-                for l in range(nr):
-                    a[k * nr + l] = 0.0
-                    for t in range(nr):
-                        a[k * nr + l] += b[k * nr + t] * v[q + t * nr + l]
-            for k in range(nr * nr):
-                v[q + k] = a[k]
+            bt[q + k] = r * a[k]
+        if is_soft(e, i):
+            soften(e, i, v + q, bt + q)
     gap[0] = total
 
 

@@ -70,9 +70,9 @@ cdef inline int32_t rows_start(const view_t* v, const options_t* o, room_t* r, c
     aim(n, &v.p, v.a, NULL, NULL)
     x = lay_judge(n, r.real)
     lay_index(n, m, r.index + head())
-    find_elements(&n.sc, &v.p, v.a, NULL)
+    find_elements(&n.sc, v)
     memset(x, 0, own_room(m, n.sc.small) * sizeof(double))
-    x = furnish(n, v.a, NULL, x)
+    x = furnish(n, v, x)
     n.s.form, n.s.wide = DENSE, o.wide
     n.s.h, n.s.whole, n.s.lower = x, x + m * m, x + 2 * m * m
     n.s.symmetric = dense_matrix(&n.sc, v.a, <int32_t>m, n.s.swap, x)
@@ -94,11 +94,11 @@ cdef inline int32_t bodies_start(const view_t* v, const options_t* o, room_t* r,
             return ROOM
         memset(n, 0, sizeof(newton_t))
         lay_bodies(n, a, r.index + head(), &v.p, v.r)
-        find_elements(&n.sc, &v.p, NULL, v.r)
+        find_elements(&n.sc, v)
         make_pattern(&n.sc, a, v.r)
         r.laid = 1
     if not grant(r, r.n_index, judge_room(&v.p, v.r, NULL) + body_room(n, a, &v.p, v.r)):
         return ROOM
     aim(n, &v.p, NULL, v.r, NULL)
-    furnish_bodies(n, a, lay_judge(n, r.real), &v.p, v.r)
+    furnish_bodies(n, a, lay_judge(n, r.real), v)
     return begin(n, o, lam)

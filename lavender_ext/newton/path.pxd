@@ -88,7 +88,8 @@ cdef enum:                      # where a path stands
 cdef enum:
     PATHS = 3                   # with a c of their own
     STEPS = 600                 # factorisations of one at most
-    FIRST_STEPS = 40            # on the first tau
+    FIRST_STEPS = 15            # on the first tau,
+    RAISES = 3                  # which is so often raised where they do not end
     CORRECTIONS = 4             # factors of one point
     SIMPLIFIED = 3              # steps with one factor
     REPEATED = 4                # factors that make a point exact
@@ -113,6 +114,7 @@ cdef inline double exact_of() noexcept nogil:
 
 
 cdef inline double path_compliance() noexcept nogil:
+    """eps, where z is of the size of g."""
     return 1e-9
 
 
@@ -189,7 +191,7 @@ cdef inline void smooth_contact(const elements_t* e, int32_t i, const double* z,
 cdef inline void smooth(newton_t* n, const double* z, double tau, bint derived) noexcept nogil:
     """F of z into n.f and y into n.t1, with a compliance eps; with `derived` small matrices and dF / d log tau (n.c)."""
     cdef const elements_t* e = n.s.e
-    cdef double eps = path_compliance()
+    cdef double eps = n.path.eps
     cdef int32_t i, j, k, l, t, q, nr
     cdef double x
     cdef double p[36]
@@ -228,7 +230,7 @@ cdef inline void change_of_y(newton_t* n, const double* dz, double* dy) noexcept
     cdef int32_t j
     system_times(&n.s, dz, dy)
     for j in range(n.s.e.m):
-        dy[j] = dz[j] - dy[j] - path_compliance() * dz[j]
+        dy[j] = dz[j] - dy[j] - n.path.eps * dz[j]
 
 
 cdef inline double rate_of(const newton_t* n, int32_t which, const double* dy, double dl, double tau,
@@ -313,12 +315,13 @@ cdef inline void begin_path(newton_t* n) noexcept nogil:
     x.size = sqrt(x.size / m)
     x.start = x.l = logarithm(0.3 * x.size)
     x.exact = exact_of()
+    x.eps = path_compliance()
     x.near = 1e-2
     x.h = 0.3
     x.last = n.s.factorisations + STEPS
     x.wide = wide_of(x.paths)
     x.paths += 1
-    x.at = x.used = x.marks = x.clean = x.bends = x.shorter = 0
+    x.at = x.used = x.raised = x.marks = x.clean = x.bends = x.shorter = 0
     if 0.0 < x.size < 1.0 / 0.0:
         enter(n, PATH)
 
@@ -329,7 +332,7 @@ cdef inline bint path_factor(newton_t* n, const double* z, double tau) noexcept 
     smooth(n, z, tau, True)
     n.counts[N_PATH] += 1
     n.s.law = COULOMB
-    system_factor(&n.s, OF_NATURAL, path_compliance())
+    system_factor(&n.s, OF_NATURAL, n.path.eps)
     n.path.sign = system_sign(&n.s)
     solve_natural(&n.s, n.f, n.dz)
     solve_natural(&n.s, n.c, n.path.b)
@@ -517,7 +520,13 @@ cdef inline void start(newton_t* n) noexcept nogil:
     x.which = LOG_TAU
     x.speed = -1.0
     if x.used > FIRST_STEPS or not path_factor(n, x.z, tau):
-        leave(n)
+        x.raised += 1
+        if x.raised > RAISES:
+            leave(n)
+        x.l += logarithm(10.0)                          # stacks carry more than their g says,
+        x.eps *= 0.1                                    # and feel a compliance as much more
+        x.start, x.used = x.l, 0
+        memset(x.z, 0, n.s.e.m * sizeof(double))
         return
     along_curve(n, tau, &found)
     advance(n, x.z, &x.l, 0.0)

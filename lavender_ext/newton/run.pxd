@@ -163,6 +163,7 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
     double mark_h[2]
     double wide                 # tau of friction over that of normals
     double size                 # of g
+    double eps                  # compliance
     double start                # first log tau
     double h                    # length of a step
     double before               # of the last one
@@ -179,6 +180,7 @@ cdef struct path_t:             # through smoothed problems, in vectors of other
     int32_t shorter             # times in a row
     int32_t clean               # steps since a return
     int32_t used                # factors of this point
+    int32_t raised              # first tau, so often
     int32_t marks               # points to which it can return
     int32_t paths               # begun
     int32_t last                # factorisations at which it ends
@@ -294,23 +296,19 @@ cdef inline void lay_vectors(newton_t* n, double* room, int64_t m) noexcept nogi
         at[i][0] = room + i * m
 
 
-cdef inline double* furnish(newton_t* n, const csr_t* a, const rows_t* r, double* room) noexcept nogil:
-    """Elements of A or of bodies (`find_elements`) scaled, with vectors and small matrices, in room of zeros; what is behind.
+cdef inline double* furnish(newton_t* n, const view_t* v, double* room) noexcept nogil:
+    """Elements (`find_elements`) scaled, with vectors and small matrices, in room of zeros; what is behind.
 
     What factors is still to come: form, symmetric and what belongs to the form.
     """
     cdef int64_t rows = n.problem.p.n_rows, small = n.sc.small
-    cdef int32_t j
     cdef double* x = room + scaled_real(rows)
     lay_numbers(&n.sc, rows, room)
-    scale_elements(&n.sc, &n.problem.p, a, r, n.problem.w, n.problem.x)
+    scale_elements(&n.sc, v, n.problem.w, n.problem.x)
     lay_vectors(n, x, rows)
     x += VECTORS * rows
     n.s.v, n.s.einv, n.s.p, n.s.pair, n.s.bt = x, x + small, x + 2 * small, x + 3 * small, x + 4 * small
-    for j in range(n.sc.e.m):
-        if n.sc.e.theta[j] != 0.0:                      # B is for rigid cones
-            n.s.bt = NULL
-    if n.sc.e.n == n.sc.e.m:
+    if n.sc.e.n == n.sc.e.m:                            # bounded rows alone
         n.s.bt = NULL
     n.s.e, n.s.f = &n.sc.e, &n.blocks
     n.s.others = NULL

@@ -14,7 +14,8 @@ from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.parts cimport blocks_t, is_round, is_rows, parts_of, parts_t
 from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.velocity cimport rows_velocity
-from lavender_ext.judge.measure cimport rows_slack
+from lavender_ext.core.view cimport view_t
+from lavender_ext.judge.measure cimport general_slack, rows_slack
 from lavender_ext.newton.cones cimport KEPT
 from lavender_ext.newton.elements cimport elements_t
 
@@ -61,30 +62,38 @@ cdef inline double reach_of(const blocks_t* p, int32_t i, int32_t j) noexcept no
     return q.reach[g]
 
 
-cdef inline bint is_empty(const blocks_t* p, const csr_t* a, const rows_t* r, int32_t i, int32_t j) noexcept nogil:
+cdef inline double compliance_of(const view_t* v, int32_t j) noexcept nogil:
+    """Of row j; that of a given A stands on its diagonal."""
+    return v.r.compliance[j] if v.r != NULL else v.g.compliance[j] if v.g != NULL else 0.0
+
+
+cdef inline bint is_empty(const view_t* v, int32_t i, int32_t j) noexcept nogil:
     """Nothing stands in row j of A, of block i."""
+    cdef const rows_t* r = v.r
     cdef int32_t q, b
-    cdef double x = 0.0
-    if a != NULL:
-        for q in range(a.indptr[j], a.indptr[j + 1]):
-            x += fabs(a.data[q])
-        return x == 0.0
-    x = fabs(r.compliance[j])
-    if i < r.n_joints:
+    cdef double x = fabs(compliance_of(v, j))
+    if v.a != NULL:
+        for q in range(v.a.indptr[j], v.a.indptr[j + 1]):
+            x += fabs(v.a.data[q])
+    elif v.g != NULL:
+        for q in range(v.g.jptr[j], v.g.jptr[j + 1]):
+            x += fabs(v.g.jval[q])
+    elif i < r.n_joints:
         for q in range(12 * j, 12 * j + 12):
             x += fabs(r.minv_jac[q])
-        return x == 0.0
-    for q in range(2):
-        b = r.contact_body[2 * (i - r.n_joints) + q]
-        if b >= 0:
-            x += r.inv_mass[b]
-    for q in range(6 * (j - p.ptr[r.n_joints]), 6 * (j - p.ptr[r.n_joints]) + 6):
-        x += fabs(r.swing[q])
+    else:
+        for q in range(2):
+            b = r.contact_body[2 * (i - r.n_joints) + q]
+            if b >= 0:
+                x += r.inv_mass[b]
+        for q in range(6 * (j - v.p.ptr[r.n_joints]), 6 * (j - v.p.ptr[r.n_joints]) + 6):
+            x += fabs(r.swing[q])
     return x == 0.0
 
 
-cdef inline bint stays(const blocks_t* p, const csr_t* a, const rows_t* r, int32_t i, int32_t j, double* at) noexcept nogil:
+cdef inline bint stays(const view_t* v, int32_t i, int32_t j, double* at) noexcept nogil:
     """Row j of block i cannot move; its impulse into `at`."""
+    cdef const blocks_t* p = &v.p
     cdef double x, low, high
     at[0] = 0.0
     if not is_row(p, i):
@@ -93,7 +102,7 @@ cdef inline bint stays(const blocks_t* p, const csr_t* a, const rows_t* r, int32
     if low == high:
         at[0] = low
         return True
-    if not is_empty(p, a, r, i, j):
+    if not is_empty(v, i, j):
         return False
     x = high if p.b[j] > 0.0 else low if p.b[j] < 0.0 else 0.0
     x = x if fabs(x) < 1.0 / 0.0 else 0.0
@@ -132,8 +141,9 @@ cdef inline void lay_numbers(scaled_t* s, int64_t m, double* real) noexcept nogi
     s.e.scaling = real + 8 * m
 
 
-cdef inline void find_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r) noexcept nogil:
-    """Which rows move, and how they stand together, of A or of bodies; in the places of `lay_elements`."""
+cdef inline void find_elements(scaled_t* s, const view_t* v) noexcept nogil:
+    """Which rows move, and how they stand together; in the places of `lay_elements`."""
+    cdef const blocks_t* p = &v.p
     cdef int32_t i, j, g, q, n = 0, m = 0, parts = 0, normal
     cdef int32_t* ptr = <int32_t*>s.e.ptr
     cdef int32_t* part = <int32_t*>s.e.part
@@ -146,7 +156,7 @@ cdef inline void find_elements(scaled_t* s, const blocks_t* p, const csr_t* a, c
     for i in range(p.n_blocks):
         normal = m
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            if stays(p, a, r, i, j, &x):
+            if stays(v, i, j, &x):
                 continue
             s.keep[m] = j
             m += 1
@@ -180,29 +190,32 @@ cdef inline double opening(const scaled_t* s, const blocks_t* p, int32_t i, int3
     return reach_of(p, s.block[i], s.keep[at]) * (1.0 / s.scale[at]) / (1.0 / s.scale[s.e.ptr[i]])
 
 
-cdef inline bint hold(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r) noexcept nogil:
+cdef inline bint hold(scaled_t* s, const view_t* v) noexcept nogil:
     """Impulses of the rows that stay; is any of them other than 0?"""
+    cdef const blocks_t* p = &v.p
     cdef int32_t i, j
     cdef double x
     cdef bint pushed = False
     memset(s.fixed, 0, p.n_rows * sizeof(double))
     for i in range(0 if s.whole else p.n_blocks):
         for j in range(p.ptr[i], p.ptr[i + 1]):
-            if stays(p, a, r, i, j, &x):
+            if stays(v, i, j, &x):
                 s.fixed[j] = x
                 pushed = pushed or x != 0.0
     return pushed
 
 
-cdef inline void scale_elements(scaled_t* s, const blocks_t* p, const csr_t* a, const rows_t* r, double* w,
-                                double* v) noexcept nogil:
-    """Their numbers, in the places of `lay_numbers`; w (rows) and, over bodies, v (6 n) are scratch."""
+cdef inline void scale_elements(scaled_t* s, const view_t* v, double* w, double* scratch) noexcept nogil:
+    """Their numbers, in the places of `lay_numbers`; w (rows) and scratch (velocities) are lost."""
+    cdef const blocks_t* p = &v.p
     cdef int32_t i, j, q, h, g
     cdef double x
-    cdef bint pushed = hold(s, p, a, r)
-    if pushed and a == NULL:
-        rows_velocity(p, r, s.fixed, v)
-        rows_slack(p, r, s.fixed, v, w)
+    cdef bint pushed = hold(s, v)
+    if pushed and v.r != NULL:
+        rows_velocity(p, v.r, s.fixed, scratch)
+        rows_slack(p, v.r, s.fixed, scratch, w)
+    elif pushed and v.g != NULL:
+        general_slack(p, v.g, s.fixed, scratch, w)
     for i in range(s.e.n):
         for q in range(s.e.ptr[i], s.e.ptr[i + 1]):
             j = s.keep[q]
@@ -210,13 +223,13 @@ cdef inline void scale_elements(scaled_t* s, const blocks_t* p, const csr_t* a, 
             s.speed[q] = sqrt(p.nu[j]) * sqrt(p.d[j]) * s.scale[q]
             (<double*>s.e.lower)[q] = low_of(p, s.block[i], j) / s.scale[q]
             (<double*>s.e.upper)[q] = high_of(p, s.block[i], j) / s.scale[q]
-            (<double*>s.e.theta)[q] = r.compliance[j] * s.scale[q] * s.scale[q] if a == NULL else 0.0
-            x = 0.0                                     # (A fixed)_j; theta stands on the diagonal of a given A
-            if pushed and a == NULL:
+            (<double*>s.e.theta)[q] = compliance_of(v, j) * s.scale[q] * s.scale[q]
+            x = 0.0                                     # (A fixed)_j
+            if pushed and v.a == NULL:
                 x = w[j] + p.b[j]
             elif pushed:
-                for h in range(a.indptr[j], a.indptr[j + 1]):
-                    x += a.data[h] * s.fixed[a.indices[h]]
+                for h in range(v.a.indptr[j], v.a.indptr[j + 1]):
+                    x += v.a.data[h] * s.fixed[v.a.indices[h]]
             (<double*>s.e.g)[q] = (p.b[j] - x) * s.scale[q]
     for i in range(s.e.n):
         for g in range(s.e.part[i], s.e.part[i + 1]):

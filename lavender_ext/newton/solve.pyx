@@ -7,17 +7,17 @@ import numpy as np
 from lavender_ext.factor.symbolic import block_panels
 
 from lavender_ext.core.arrays cimport address, zeros
-from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.method cimport Method, method_t
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
+from lavender_ext.core.view cimport view_t
 from lavender_ext.factor.blocks cimport sparse_t
 from lavender_ext.factor.sparse cimport SparsePanels
 from lavender_ext.factor.symbolic cimport block_pattern
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.newton.bodies cimport (PARTS, factor_room, furnish_factor, lay_pattern, order_bodies, order_index,
-                                         panel_of, pattern_t)
+                                         panel_of, panel_of_velocities, pattern_t)
 from lavender_ext.newton.interior cimport ipm_scale
 from lavender_ext.newton.method cimport begin, head, state_of, system_step
 from lavender_ext.newton.path cimport path_compliance, smooth
@@ -141,13 +141,12 @@ cdef class Solve:
     data : Data
         With d and nu, its error of doing nothing known.
     matrix : Data or None
-        Of A in compressed rows; None: over the bodies of `data`.
+        Of A in compressed rows; None: over the bodies of `data`, or what `graph.bodies_in` tells of its velocities.
     """
 
     def __init__(self, Data data, Data matrix=None):
         cdef newton_t* n
-        cdef const csr_t* a = NULL
-        cdef const rows_t* r = NULL
+        cdef view_t v = data.view() if matrix is None else view_t(data.blocks, &matrix.csr, NULL, NULL)
         cdef int64_t rows = data.blocks.n_rows, k
         self.data, self.view, self.own = data, data.view(), method_t(NULL, NULL, system_step)
         self.index = np.zeros(head() + own_index(rows) + 1, np.int32)
@@ -155,17 +154,13 @@ cdef class Solve:
         n = self.n = state_of(&self.space)
         aim(n, &self.view.p, self.view.a, self.view.r, self.view.g)
         n.problem.e0, n.problem.v0 = data.start_energy, data.start_velocity
-        if matrix is not None:
-            a = &matrix.csr
-        else:
-            r = &data.rows
         judge = zeros(judge_room(&n.problem.p, n.problem.r, n.problem.g))
         self.held = [matrix, judge]
         lay_judge(n, <double*>address(judge))
         lay_index(n, rows, self.space.index + head())
-        find_elements(&n.sc, &n.problem.p, a, r)
+        find_elements(&n.sc, &v)
         self.real = zeros(own_room(rows, n.sc.small))
-        furnish(n, a, r, <double*>address(self.real))
+        furnish(n, &v, <double*>address(self.real))
         m = self.m = n.sc.e.m
         k = n.sc.e.n
         self.keep, self.block = part(self.index, n.sc.keep, m), part(self.index, n.sc.block, k)
@@ -210,11 +205,12 @@ cdef class Solve:
         self.n.s.a.indptr, self.n.s.a.indices = <int32_t*>address(indptr), <int32_t*>address(indices)
         self.n.s.a.data = <double*>address(values)
 
-    def jacobian(self):
+    def jacobian(self, const int32_t[:, ::1] pair, const int32_t[::1] column=None):
         """K = D^-1/2 J M^-1/2 (rows, 12) of the bodies, and which of a body's six columns are kept: 1, 2, 3 or 6.
 
-        What is at most 1e-9 (spheres turned by the rounding of their arms) is nothing: H = K K^T + theta has a unit
-        diagonal, and feels 1e-18 of it.
+        pair (blocks, 2) are the bodies of each block; with J and M column (nv,) as well, of `graph.bodies_in`. What is at
+        most 1e-9 (spheres turned by the rounding of their arms) is nothing: H = K K^T + theta has a unit diagonal, and
+        feels 1e-18 of it.
         """
         cdef const rows_t* r = &self.data.rows
         cdef int64_t i, rows = self.data.blocks.n_rows
@@ -223,7 +219,9 @@ cdef class Solve:
         cdef double* k = <double*>address(panel)
         cdef double[::1] root = np.empty(10 * r.n_bodies + 1)
         with nogil:
-            if r.n_bodies:
+            if column is not None:
+                panel_of_velocities(&self.data.blocks, &self.data.general, &pair[0, 0], &column[0], k)
+            elif r.n_bodies:
                 panel_of(&self.data.blocks, r, &root[0], k)
             for i in range(12 * rows):
                 if not -1e-9 <= k[i] <= 1e-9:
@@ -309,7 +307,7 @@ cdef class Solve:
     def smooth(self, const double[::1] z, double tau, double wide=1.0):
         """F (m,) of path.pxd with c = wide, and dF / d log tau (m,); its derivative's small matrices into p, einv and v."""
         cdef newton_t* n = self.n
-        n.s.law, n.path.wide = COULOMB, wide
+        n.s.law, n.path.wide, n.path.eps = COULOMB, wide, path_compliance()
         smooth(n, &z[0], tau, True)
         return np.asarray(<double[:self.m]>n.f).copy(), np.asarray(<double[:self.m]>n.c).copy()
 

@@ -146,10 +146,13 @@ cdef inline void add_along(const elements_t* e, const double* psi, const double*
 
 
 cdef inline void turn(system_t* s, const double* psi) noexcept nogil:
-    """P = L^T B into `pair`, or with a compliance (theta + C W)^-1 = (V^-1 + e_n (psi theta)^T)^-1 B into `v`."""
+    """(theta + C W)^-1 = V (I + e_n c^T) = L P into `v` and P into `pair`, V = (W + theta)^-1 = L L^T,
+
+        c = (psi - t) / (1 + t_n),   t = V theta psi                 (c = psi without a compliance)
+    """
     cdef int32_t i, j, k, l, q, nr
-    cdef double own, x
-    cdef double across[6]
+    cdef double x
+    cdef double t[6]
     cdef double* v
     cdef const elements_t* e = s.e
     for i in range(e.n):
@@ -157,22 +160,18 @@ cdef inline void turn(system_t* s, const double* psi) noexcept nogil:
         nr = e.ptr[i + 1] - j
         q = e.wptr[i]
         v = s.v + q
-        if s.bt != NULL:
-            for k in range(nr):
-                for l in range(nr):
-                    s.pair[q + k * nr + l] = s.bt[q + k * nr + l] + s.bt[q + k * nr] * psi[j + l]
-                    if l:
-                        v[k * nr + l] += v[k * nr] * psi[j + l]
-            continue
-        for l in range(nr):                             # Sherman, Morrison
-            across[l] = 0.0
-            for k in range(nr):
-                across[l] += psi[j + k] * e.theta[j + k] * v[k * nr + l]
-        own = across[0]
+        for k in range(nr):
+            t[k] = 0.0
+            for l in range(nr):
+                t[k] += v[k * nr + l] * e.theta[j + l] * psi[j + l]
+        x = 1.0 / (1.0 + t[0])
+        for l in range(nr):
+            t[l] = (psi[j + l] - t[l]) * x
         for k in range(nr):
             x = v[k * nr]
             for l in range(nr):
-                v[k * nr + l] += x * psi[j + l] - x * ((across[l] + own * psi[j + l]) / (1.0 + own))
+                s.pair[q + k * nr + l] = s.bt[q + k * nr + l] + s.bt[q + k * nr] * t[l]
+                v[k * nr + l] += x * t[l]
 
 
 cdef inline bint interior_step(newton_t* n) noexcept nogil:

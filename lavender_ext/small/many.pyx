@@ -157,7 +157,9 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
             return
         r.index = room.index
         code = lav_start(&v, &o, &r, j.lam)
-    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits) or not has_room(room, 0, r.n_real):
+    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits, r.islands):
+        return
+    if not has_room(room, 0, r.n_real):
         return
     r.real = room.real
     if r.islands <= MOST // STEPS:
@@ -217,15 +219,15 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (13,)."""
+    """Of the numbers of a `limits_t` (16,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
         self.at = (<const limits_t*>&numbers[0])[0]
 
-    def cost(self, Data p, double work):
+    def cost(self, Data p, double work, int islands):
         """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and may cost."""
-        return cost_of(&p.blocks, &p.general, &self.at, work), allowed(&p.blocks, &p.general, &self.at)
+        return cost_of(&p.blocks, &p.general, &self.at, work), allowed(&p.blocks, &p.general, &self.at, islands)
 
 
 def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):

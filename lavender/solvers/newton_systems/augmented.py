@@ -32,8 +32,8 @@ __all__ = ["Augmented"]
 class Augmented:
     """Who factors (1) and (2) for `Solve`; K is made when it is first asked for."""
 
-    def __init__(self, of: Solve, layout: Layout) -> None:
-        self.of, self.layout = of, layout
+    def __init__(self, of: Solve, layout: Layout, bodies: Any) -> None:
+        self.of, self.layout, self.bodies = of, layout, bodies
         self.k: Any = None
         self.lu: Any = None
         self.deadline: Deadline = NEVER
@@ -82,7 +82,7 @@ class Augmented:
 
     def _make(self) -> Any:
         sc, n = self.of, self.layout.n
-        panel, _ = sc.jacobian()
+        panel, _ = sc.jacobian(self.bodies.pair, self.bodies.column)
         size, m = np.diff(sc.ptr), sc.m
         body = np.repeat(self.layout.body, size, axis=0)
         values = panel[sc.keep].reshape(m, 2, 6)

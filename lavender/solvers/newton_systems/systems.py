@@ -6,8 +6,9 @@ or sparse panels). The equations, and all that is solved with them, are in `lave
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+from lavender.base.arrays import IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
@@ -16,6 +17,7 @@ from lavender.solvers.factors import DENSE_LIMIT, WIDE
 from lavender.solvers.newton_systems.augmented import Augmented
 from lavender.solvers.newton_systems.sparse import SparseRows
 from lavender.solvers.setup_times import dense_work
+from lavender_ext.factor import graph
 from lavender_ext.newton.coupled import scaled_entries
 from lavender_ext.newton.solve import Layout, Solve
 
@@ -37,6 +39,26 @@ def is_full(nnz: float, m: int, cones: bool) -> bool:
 def is_dense(nnz: float, m: int, cones: bool) -> bool:
     """Whether H of m rows and nnz entries is held as a full matrix."""
     return m <= DENSE_ROWS or (is_full(nnz, m, cones) and m <= DENSE_LIMIT)
+
+
+class Bodies(NamedTuple):
+    """Between which bodies blocks stand."""
+
+    pair: IntArray  # (n_blocks, 2), -1 where there is none
+    n: int
+    column: IntArray | None = (
+        None  # (nv,) of J and M: six times the body of each velocity, and its place there
+    )
+
+
+def bodies_of(problem: Problem) -> Bodies | None:
+    """Bodies of a problem's rows, or those that velocities of J and M stand for, if two at most meet in every block."""
+    if problem.rows is not None:
+        return Bodies(problem.rows.block_bodies, problem.rows.n_bodies) if problem.rows.n_bodies else None
+    if problem.generalized is None or problem.cones.has_round:
+        return None
+    found = graph.bodies_in(problem.metric, problem.generalized.order)
+    return None if found is None else Bodies(*found)
 
 
 class System:
@@ -71,18 +93,17 @@ class VelocitySystem(System):
     form = "velocity"
     pace = 0.5e-9
 
-    def __init__(self, problem: Problem, like: System | None = None) -> None:
+    def __init__(self, problem: Problem, bodies: Bodies, like: System | None = None) -> None:
         """`like`: an earlier system, whose layout serves again between the same bodies."""
         super().__init__(problem, Solve(problem.metric))
-        rows, solve = problem.rows, self.solve
-        assert rows is not None
-        panel, columns = solve.jacobian()
-        of = rows.block_bodies[solve.block], rows.n_bodies, len(columns)
+        solve = self.solve
+        panel, columns = solve.jacobian(bodies.pair, bodies.column)
+        of = bodies.pair[solve.block], bodies.n, len(columns)
         kept = like.layout if isinstance(like, VelocitySystem) and like.layout.serves(*of) else None
         self.layout: Layout = kept or Layout(*of, PANELS, FEW_COLUMNS, ZEROS)
         self.work = self.layout.work
         solve.over_bodies(panel, columns, self.layout, solve.has_friction and problem.law == "coulomb", WIDE)
-        self.augmented = Augmented(solve, self.layout)
+        self.augmented = Augmented(solve, self.layout, bodies)
         solve.ask(self.augmented)
 
     def until(self, deadline: Deadline) -> None:
@@ -121,7 +142,13 @@ class MatrixSystem(System):
             self.work = (1.0 if self.symmetric else 2.0) * self.sparse.panels.work()
 
 
-def make_system(problem: Problem, form: str, like: System | None = None) -> System:
-    """The system of a problem; form "velocity" or "impulse". `like`: one of the same structure."""
+def make_system(
+    problem: Problem, form: str, like: System | None = None, bodies: Bodies | None = None
+) -> System:
+    """The system of a problem; form "velocity", of its `bodies`, or "impulse". `like`: one of the same structure."""
     reference(problem)
-    return VelocitySystem(problem, like) if form == "velocity" else MatrixSystem(problem)
+    if form == "impulse":
+        return MatrixSystem(problem)
+    bodies = bodies or bodies_of(problem)
+    assert bodies is not None
+    return VelocitySystem(problem, bodies, like)

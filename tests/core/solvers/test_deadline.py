@@ -165,7 +165,7 @@ def test_steps_that_factor_nothing_are_cheap():
         jac, free = rng.normal(size=(48, 30)), rng.normal(size=30)
         problem = lv.Problem.from_jacobian(jac, np.diag(rng.uniform(0.1, 10.0, 30)), free, cones=cones)
         steps, factored, _, _ = AUTO.attempt(problem, None, 1e-6)[1]
-        of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work)[1]
+        of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work, 1)[1]
         most = 1.25 * factored * of_step
         assert most < 0.8 * steps * of_step
         assert AUTO.attempt(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
