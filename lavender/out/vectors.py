@@ -210,7 +210,7 @@ def pack(
             f"{solver} of the library does not take {problem.name or 'this problem'}: see lav_takes"
         )
     impulse, relative = found.impulse, found.residual.relative
-    if solver == "newton" and problem.generalized is None:
+    if solver == "newton" and (problem.generalized is None or form == "velocity"):
         impulse = driven(problem, tol, max_iter)[0]
         relative = lv.residual(problem, impulse).relative
     is_met = solver in OTHER_BITS
@@ -221,9 +221,10 @@ def pack(
 
 
 def driven(problem: lv.Problem, tol: float, budget: int) -> tuple[FloatArray, int]:
-    """Impulse and factorisations of `newton` over A or bodies by the compiled driver, which the library has.
+    """Impulse and factorisations of `newton` by the compiled driver, which the library has.
 
-    `lavender.solve` tries warm sweeps and joints alone before it, and looks for certificates between its turns.
+    `lavender.solve` tries warm sweeps and joints alone before it, looks for certificates between its turns, and solves
+    J and M of free bodies as bodies.
 
     Raises
     ------

@@ -20,7 +20,7 @@ from benchmarks.piles import Pile
 from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
 from lavender.solvers import factors
-from lavender.solvers.newton import Newton
+from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import bodies_of, make_system
 from lavender_ext.core.problem import LAWS
@@ -160,7 +160,7 @@ def test_a_path_begins_where_a_tower_carries_more_than_its_right_hand_side_says(
     system = make_system(problem, "velocity")
     system.solve.without = sum(bit for name, bit in PHASES.items() if name not in ("path", "rounds"))
     impulse = problem.start().copy()
-    claim = Newton()._run_system(problem, system, impulse, 250, 1e-6, None)
+    claim = Newton().run(NewtonState(problem, system), impulse, 250, 1e-6)
     assert claim.status is Status.CONVERGED, str(claim)
     assert lv.residual(problem, impulse).relative <= 1e-6
 
