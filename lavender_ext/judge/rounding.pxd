@@ -67,6 +67,8 @@ cdef inline void squares32(const blocks_t* p, const generalized_t* g, const mass
             f[g.jidx[q]] += g.jval[q] * g.jval[q] * s
     for k in range(n):
         for q in range(mass.ptr[k], mass.ptr[k + 1]):
+            if mass.val[q] == 0.0:                      # none, beside an infinite velocity too
+                continue
             s = mass.val[q] * mass.val[q]
             f[k] += s * xx[mass.idx[q]]
             if mass.idx[q] != k:

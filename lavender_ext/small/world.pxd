@@ -4,10 +4,10 @@ The same numbers as `Generalized` makes of the same arrays: J and the lower tria
 zeros, M = L^T D L in the order given, b = target - J v*. What `Generalized` would put into another order is left to it.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, int64_t
-from libc.string cimport memcmp, memcpy
+from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.door cimport first_unsized, is_number, is_size, largest, least
+from lavender_ext.core.door cimport first_outside, first_unsized, is_number, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport room_t
@@ -63,6 +63,7 @@ cdef struct desk_t:             # of one thread
     room_t room                 # of the world at hand
     room_t tree                 # and the pattern of the last M's factor
     int32_t n_tree              # velocities of that, -1: none
+    int32_t splits              # L of a shared M has another pattern where entries are 0
     mass_t mass                 # of the world at hand
     double* free
 
@@ -92,12 +93,26 @@ cdef inline const double* widened(const worlds_t* w, int32_t which, int64_t firs
 
 
 cdef inline bint has_outside(const double* x, int32_t n) noexcept nogil:
-    """Does the door exclude any of these? Without a branch, so that compilers take several at once."""
-    cdef int32_t i
-    cdef int found = 0
-    for i in range(n):
-        found |= not is_number(x[i])
-    return found
+    """Does the door exclude any of these? Not where even their sum is a number, of which four are added at once."""
+    cdef int32_t i = 0
+    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
+    while i + 4 <= n:
+        s0 += fabs(x[i])
+        s1 += fabs(x[i + 1])
+        s2 += fabs(x[i + 2])
+        s3 += fabs(x[i + 3])
+        i += 4
+    while i < n:
+        s0 += fabs(x[i])
+        i += 1
+    return not is_number((s0 + s1) + (s2 + s3)) and first_outside(x, n) >= 0
+
+
+cdef inline bint put(const double* x, int32_t column, int32_t* idx, double* val) noexcept nogil:
+    """An entry where the next one goes if it is 0: a branch would be guessed. By its bits, of which the sign does not count."""
+    idx[0] = column
+    val[0] = x[0]
+    return (<const uint64_t*>x)[0] << 1 != 0
 
 
 cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
@@ -107,10 +122,7 @@ cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, 
     ptr[0] = 0
     for i in range(m):
         for j in range(n):
-            if a[j] != 0.0:
-                idx[q] = j
-                val[q] = a[j]
-                q += 1
+            q += put(a + j, j, idx + q, val + q)
         a += row
         ptr[i + 1] = q
     return q
@@ -148,23 +160,25 @@ cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, in
 cdef inline int32_t thinned(const int32_t* given, const int32_t* col, const double* x, int32_t n, int32_t* ptr,
                             int32_t* idx, double* val) noexcept nogil:
     """A lower triangle in compressed rows without zeros left of its diagonal; its entries."""
-    cdef int32_t i, k, q = 0, zeros = 0
-    for k in range(given[n]):
-        zeros += x[k] == 0.0
-    if not zeros:
-        memcpy(ptr, given, (n + 1) * sizeof(int32_t))
-        memcpy(idx, col, given[n] * sizeof(int32_t))
-        memcpy(val, x, given[n] * sizeof(double))
-        return given[n]
+    cdef int32_t i, k, q = 0
     ptr[0] = 0
     for i in range(n):
-        for k in range(given[i], given[i + 1]):
-            if x[k] != 0.0 or col[k] == i:
-                idx[q] = col[k]
-                val[q] = x[k]
-                q += 1
+        for k in range(given[i], given[i + 1] - 1):
+            q += put(x + k, col[k], idx + q, val + q)
+        put(x + given[i + 1] - 1, i, idx + q, val + q)
+        q += 1
         ptr[i + 1] = q
     return q
+
+
+cdef inline void find_tree(int32_t n, int64_t most, const int32_t* ptr, const int32_t* idx, int32_t* t) noexcept nogil:
+    """In t (5 n + 1 + most): pointers of L (n + 1), parents (n) and columns (most), behind which all is scratch."""
+    cdef int32_t* rest = t + 2 * n + 1 + most
+    tree_pattern(n, ptr, idx, <int32_t>most, t, t + 2 * n + 1, t + n + 1, rest, rest + n, rest + 2 * n)
+
+
+cdef inline void point_at_tree(const int32_t* t, int32_t n, generalized_t* g) noexcept nogil:
+    g.lptr, g.parent, g.lidx = t, t + n + 1, t + 2 * n + 1
 
 
 cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t* idx, generalized_t* g) noexcept nogil:
@@ -173,17 +187,74 @@ cdef inline bint tree_of(desk_t* d, int32_t n, const int32_t* ptr, const int32_t
     cdef int32_t* t
     if not has_room(&d.tree, 6 * <int64_t>n + 2 + 2 * most, 0):
         return False
-    t = d.tree.index                                    # lptr, parent, scratch (3 n), ptr, idx, lidx
-    g.lptr, g.parent, g.lidx = t, t + n + 1, t + 6 * n + 2 + most
-    if d.n_tree == n and memcmp(t + 5 * n + 1, ptr, (n + 1) * sizeof(int32_t)) == 0 \
-            and memcmp(t + 6 * n + 2, idx, ptr[n] * sizeof(int32_t)) == 0:
+    point_at_tree(d.tree.index, n, g)
+    t = d.tree.index + 5 * n + 1 + most                 # M's
+    if d.n_tree == n and memcmp(t, ptr, (n + 1) * sizeof(int32_t)) == 0 \
+            and memcmp(t + n + 1, idx, ptr[n] * sizeof(int32_t)) == 0:
         return True
     d.n_tree = n
-    memcpy(t + 5 * n + 1, ptr, (n + 1) * sizeof(int32_t))
-    memcpy(t + 6 * n + 2, idx, ptr[n] * sizeof(int32_t))
-    tree_pattern(n, ptr, idx, <int32_t>most, t, <int32_t*>g.lidx, <int32_t*>g.parent, t + 2 * n + 1, t + 3 * n + 1,
-                 t + 4 * n + 1)
+    memcpy(t, ptr, (n + 1) * sizeof(int32_t))
+    memcpy(t + n + 1, idx, ptr[n] * sizeof(int32_t))
+    find_tree(n, most, ptr, idx, d.tree.index)
     return True
+
+
+cdef inline int32_t zeros_of(const double* x, int32_t n, const int64_t* known, int64_t* new) noexcept nogil:
+    """Zeros among x (n); new: is one not `known` to be? As wide as the numbers and without a branch, for lanes."""
+    cdef int64_t zeros = 0, found = 0, zero
+    cdef int32_t k
+    for k in range(n):
+        zero = x[k] == 0.0
+        zeros += zero
+        found |= zero & ~known[k]
+    new[0] = found
+    return <int32_t>zeros
+
+
+cdef inline int32_t whole_tree(const worlds_t* w, desk_t* d, int32_t n, const double* x, generalized_t* g) noexcept nogil:
+    """Entries of a shared M without zeros; -1 where L has not the pattern that it has of the whole M, or there is no room.
+
+    That it has with so many zeros it has with fewer: M is read where it stands, and looked at once.
+    """
+    cdef int64_t most = <int64_t>n * (n + 1) // 2, new
+    cdef int32_t k, zeros, count = w.mass_ptr[n]
+    cdef int32_t* t
+    cdef int32_t* other
+    cdef int32_t* ptr
+    cdef int64_t* known                                 # places of zeros that L's pattern does without
+    if d.splits or not has_room(&d.tree, 2 * (6 * <int64_t>n + 2 + 2 * most), 2 * <int64_t>count):
+        return -1
+    t, known = d.tree.index, <int64_t*>d.tree.real
+    point_at_tree(t, n, g)
+    if d.n_tree != n:
+        d.n_tree = n
+        find_tree(n, most, w.mass_ptr, w.mass_col, t)
+        memset(known, 0, count * sizeof(int64_t))
+    zeros = zeros_of(x, count, known, &new)
+    if new:
+        for k in range(count):
+            known[count + k] = known[k] | (x[k] == 0.0)
+        other, ptr = t + 5 * n + 1 + most, t + 10 * n + 2 + 2 * most
+        places_without(w, n, known + count, ptr, ptr + n + 1)
+        find_tree(n, most, ptr, ptr + n + 1, other)
+        d.splits = memcmp(t, other, (n + 1) * sizeof(int32_t)) != 0 \
+            or memcmp(g.lidx, other + 2 * n + 1, t[n] * sizeof(int32_t)) != 0
+        if d.splits:
+            d.n_tree = -1
+            return -1
+        memcpy(known, known + count, count * sizeof(int64_t))
+    return count - zeros
+
+
+cdef inline void places_without(const worlds_t* w, int32_t n, const int64_t* out, int32_t* ptr, int32_t* idx) noexcept nogil:
+    """The shared M's pattern without the places of `out`, but with its diagonal."""
+    cdef int32_t i, k, q = 0
+    ptr[0] = 0
+    for i in range(n):
+        for k in range(w.mass_ptr[i], w.mass_ptr[i + 1]):
+            idx[q] = w.mass_col[k]
+            q += not out[k] or w.mass_col[k] == i
+        ptr[i + 1] = q
 
 
 cdef inline bint is_ordered(const generalized_t* g, int32_t entries) noexcept nogil:
@@ -202,14 +273,15 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     """World i on the desk; READY, BAD or LEFT."""
     cdef const int64_t* at = w.at + i * PLACES
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
-    cdef int64_t whole = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
-    cdef int64_t numbers = whole + 2 * half + 4 * n + 2 * m + k + 1, wide = whole if m > n else <int64_t>n * n
+    cdef bint whole = True
+    cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
+    cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1, wide = all if m > n else <int64_t>n * n
     cdef const double* a
     cdef int32_t* ptr
     cdef int32_t* idx
     cdef double* x
     cdef double* b
-    if n >= MESH or not has_room(&d.room, m + 1 + whole + n + 1 + half + k + 1, numbers + wide):
+    if n >= MESH or not has_room(&d.room, m + 1 + all + n + 1 + half + k + 1, numbers + wide):
         return LEFT
     ptr, x = d.room.index, d.room.real
     idx = ptr + m + 1
@@ -218,26 +290,34 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     entries = rows_of(a, row, m, n, ptr, idx, x)
     if has_outside(x, entries):
         return BAD
-    ptr, x = idx + whole, x + whole
+    ptr, x = idx + all, x + all
     idx = ptr + n + 1
     if w.mass_ptr != NULL:
         row = entries = w.mass_ptr[n]
         a = widened(w, 1, at[MASS], 1, entries, &row, d.room.real + numbers)
-        entries = thinned(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
+        if has_outside(a, entries):
+            return BAD
+        d.mass.ptr, d.mass.idx, d.mass.val = w.mass_ptr, w.mass_col, a
+        entries = whole_tree(w, d, n, a, g)
+        if entries < 0:
+            d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
+            entries = thinned(w.mass_ptr, w.mass_col, a, n, ptr, idx, x)
+            whole = False
     else:
         row = w.mass_row
         a = widened(w, 1, at[MASS], n, n, &row, d.room.real + numbers)
         entries = triangle_of(a, row, w.asymmetry, n, ptr, idx, x)
-    if entries < 0 or has_outside(x, entries):
-        return BAD
-    d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
-    if not tree_of(d, n, ptr, idx, g):
+        if entries < 0 or has_outside(x, entries):
+            return BAD
+        d.mass.ptr, d.mass.idx, d.mass.val = ptr, idx, x
+        whole = False
+    if not whole and not tree_of(d, n, ptr, idx, g):
         return LEFT
     if is_ordered(g, entries):
         return LEFT
     x += half
     g.lval, g.inv_pivot, g.root = x, x + half, x + half + n
-    if tree_factor(n, ptr, idx, d.mass.val, g.lptr, g.lidx, x, <double*>g.root, <double*>g.inv_pivot) >= 0:
+    if tree_factor(n, d.mass.ptr, d.mass.idx, d.mass.val, g.lptr, g.lidx, x, <double*>g.root, <double*>g.inv_pivot) >= 0:
         return BAD
     for j in range(n):
         (<double*>g.root)[j] = sqrt(g.inv_pivot[j])

@@ -120,6 +120,23 @@ def test_triangles_of_m_are_read_as_m_is(dtype):
         assert_same(many, k, lv.solve(whole[k]))
 
 
+def test_zeros_of_a_shared_m_come_and_go():
+    """One more in each world, which elimination fills; in the last a velocity no longer reaches those before it."""
+    jac, mass, free = worlds(8)
+    i, j = np.tril_indices(18)
+    jac[:, :6, :17] = 0.0
+    for k in range(1, 7):
+        at = (1, 2, 2, 3, 3, 3)[:k], (0, 0, 1, 0, 1, 2)[:k]
+        mass[k][at] = mass[k][at[::-1]] = 0.0
+    mass[7, 17, 11:17] = mass[7, 11:17, 17] = 0.0
+    for order in (slice(None), slice(None, None, -1)):
+        given = jac[order], mass[order], free[order]
+        packed = given[1][:, i, j], j, np.searchsorted(i, np.arange(19))
+        many = lv.solve_many(lv.Batch(given[0], packed, given[2], cones=DISKS))
+        for k in range(8):
+            assert_same(many, k, lv.solve(lv.Batch(*given, cones=DISKS)[k]))
+
+
 def test_worlds_of_several_sizes_of_velocities():
     small, large = worlds(3, 6, 7), worlds(2, 6, 11, seed=4)
     jac, mass, free = (np.concatenate([x.ravel(), y.ravel()]) for x, y in zip(small, large, strict=True))
