@@ -21,9 +21,11 @@ cdef enum:                      # how `make_numbers` ended
     TOO_MANY = 2
 
 
-cdef struct made_t:             # of a problem in generalised coordinates; `free` both
+cdef struct made_t:             # of a problem in generalised coordinates; `free` both, of which the next may be made
     int32_t* marks              # scratch (2 n), prow, pcol, pval (k + 1 each), empty (m + 1), home (k), cols
     double* numbers             # d, nu, step (m + 1 each), Y
+    ssize_t n_marks             # as many as there is room for,
+    ssize_t n_numbers           # 0 at first
     int32_t* empty              # inside marks
     int32_t n_empty
     int32_t n_panels

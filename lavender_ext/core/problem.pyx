@@ -210,34 +210,39 @@ cdef double entries_of(const generalized_t* g, double* on) noexcept nogil:
 
 
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil:
-    """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended."""
+    """Panels, Y, d, nu and step of a problem in generalised coordinates, which then points at them; how it ended.
+
+    out: zeros, or what an earlier problem leaves.
+    """
     cdef int32_t n = g.n, k = p.n_blocks, m = p.n_rows, n_cols, i, b = 0
     cdef int32_t* home
-    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, room = 2 * <ssize_t>g.jptr[m] + 64, most
+    cdef ssize_t head = 2 * <ssize_t>n + 3 * (<ssize_t>k + 1) + m + 1 + k, room = 2 * <ssize_t>g.jptr[m] + 64, most, size
     cdef int32_t* w
-    out.marks = NULL
-    out.numbers = NULL
     most = 2147483647 - head
     while True:
-        w = <int32_t*>malloc((head + room) * sizeof(int32_t))
-        out.marks = w
+        if out.n_marks < head + room:
+            free(out.marks)
+            out.marks = <int32_t*>malloc((head + room) * sizeof(int32_t))
+            out.n_marks = head + room if out.marks != NULL else 0
+        w = out.marks
         if w == NULL:
             return NO_MEMORY
         out.n_panels = panel_pattern(g, k, p.ptr, w, w + 2 * n, w + 2 * n + k + 1, w + 2 * n + 2 * (k + 1), w + head,
                                      <int32_t>room, &n_cols, &out.values)
         if out.n_panels >= 0:
             break
-        free(w)
-        out.marks = NULL
         if room >= most:
             return TOO_MANY
         room = 2 * room if 2 * room < most else most
-    if out.values < 2147483647.0:
-        out.numbers = <double*>malloc((3 * (<ssize_t>m + 1) + <ssize_t>out.values + 1) * sizeof(double))
+    if out.values >= 2147483647.0:
+        return TOO_MANY
+    size = 3 * (<ssize_t>m + 1) + <ssize_t>out.values + 1
+    if out.n_numbers < size:
+        free(out.numbers)
+        out.numbers = <double*>malloc(size * sizeof(double))
+        out.n_numbers = size if out.numbers != NULL else 0
     if out.numbers == NULL:
-        free(w)
-        out.marks = NULL
-        return NO_MEMORY if out.values < 2147483647.0 else TOO_MANY
+        return NO_MEMORY
     out.empty = w + head - (m + 1) - k
     home = w + head - k
     for i in range(k):
@@ -332,18 +337,21 @@ cdef class Data:
 
     def prepare(self):
         """d, nu, step and Y of a problem in generalised coordinates, where they are not known yet."""
-        cdef made_t made
+        cdef made_t made = made_t(NULL, NULL, 0, 0, NULL, 0, 0, 0.0)
         cdef blocks_t blocks = self.blocks
         cdef generalized_t general = self.general
         cdef int32_t end
         if self.ready:
             return
         end = make_numbers(&blocks, &general, &made)
+        if end == MADE:
+            self.adopt(&made)
+            return
+        free(made.marks)
+        free(made.numbers)
         if end == TOO_MANY:
             raise OverflowError(f"M^-1 J^T has {made.values:.3g} entries, more than 32-bit indices reach")
-        if end != MADE:
-            raise MemoryError(f"{made.values:.3g} entries of M^-1 J^T")
-        self.adopt(&made)
+        raise MemoryError(f"{made.values:.3g} entries of M^-1 J^T")
 
     cdef void adopt(self, made_t* made):
         # What `make_numbers` made becomes this one's; freed where another thread was first with the same.

@@ -58,7 +58,8 @@ cdef enum:
 cdef struct job_t:
     blocks_t p
     generalized_t g
-    made_t made                 # of the data, or in this call; NULL between
+    made_t made                 # of the data, or of this call
+    bint known                  # it is this problem's
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
     int32_t cold                # 1: from doing nothing, else from lam as it is
     double most                 # ns that it may cost as counted, then what it has come to is the result; inf: to the end
@@ -138,13 +139,20 @@ cdef inline void judge_job(job_t* j, double* x) noexcept nogil:
     j.floor = relative(j.score.floor_energy, j.score.floor_velocity, j.begin[0], j.begin[1])
 
 
+cdef inline bint has_numbers(job_t* j) noexcept nogil:
+    """d, Y and what goes with them, worked out now unless they are known; within the door?"""
+    if not j.known:
+        j.known = make_numbers(&j.p, &j.g, &j.made) == MADE
+    return j.known and first_outside(j.p.d, j.p.n_rows) < 0
+
+
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef view_t v
     cdef options_t o = options_t(NEWTON, MOST, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
     cdef room_t r
     cdef int32_t m = j.p.n_rows, code = ROOM
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
-    if j.made.marks == NULL and make_numbers(&j.p, &j.g, &j.made) != MADE or first_outside(j.p.d, m) >= 0:
+    if not has_numbers(j):
         return
     if not has_room(room, 0, 3 * <ssize_t>m + j.g.n):
         return
@@ -179,23 +187,12 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     j.solved = j.relative <= tol
 
 
-cdef inline void forget(job_t* j, bint known) noexcept nogil:
-    """What was worked out of its data, unless it was known before."""
-    if not known:
-        free(j.made.marks)
-        free(j.made.numbers)
-    j.made.marks = NULL
-    j.made.numbers = NULL
-
-
 cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
     """The problem of `p` from `start` (m,) [N s], or from doing nothing where it is None."""
     cdef const double[::1] given
     j.p, j.g = p.blocks, p.general
-    j.made.marks = NULL
-    j.made.numbers = NULL
-    if p.ready:
-        j.made = p.made
+    j.known = p.ready
+    j.made = p.made
     j.begin[0], j.begin[1], j.begin[2] = p.start_energy, p.start_velocity, p.start_relative
     j.lam, j.both = lam, both
     j.solved, j.spent, j.cold, j.most = False, False, start is None, INFINITY
@@ -248,8 +245,11 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
         solve_job(&j, &room, &limits.at, tol)
         free(room.index)
         free(room.real)
-    if not known and j.made.numbers != NULL:
+    if not known and j.known:
         p.adopt(&j.made)
+    elif not known:
+        free(j.made.marks)
+        free(j.made.numbers)
     remember(&j, p)
     return result(&j, p, impulse, results)
 
@@ -262,7 +262,7 @@ cdef enum:                      # what is known of a world when it is done, rows
     START_ENERGY = 4            # of doing nothing
     START_SPEED = 5
     START_RELATIVE = 6
-    RHS_ENERGY = 7              # of b
+    RHS_ENERGY = 7              # of b, where the judge alone was asked
     PUSH = 8                    # N s, |e| of the worst row
     N_NUMBERS = 9
 
@@ -400,7 +400,7 @@ cdef class Worlds:
             if self.code_at[i] == READY:
                 remember(&self.jobs[i], data[i])
 
-    cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, job_t* j) noexcept nogil:
+    cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, const made_t* made, job_t* j) noexcept nogil:
         """World i for `solve_job` or for the judge."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
@@ -410,9 +410,10 @@ cdef class Worlds:
                 return LEFT
         else:
             code = lay_world(&self.w, i, desk, &j.p, &j.g)
-            j.made.marks, j.made.numbers = NULL, NULL
             j.begin[0] = -1.0
-            j.solved, j.spent, j.cold, j.lam = False, False, self.cold, self.lam + at[AT_ROW]
+            j.solved, j.spent, j.cold, j.known, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
+        if not j.known:
+            j.made = made[0]
         j.most = INFINITY
         if not has_room(both, 0, 2 * at[ROWS] + 1):
             return LEFT
@@ -423,7 +424,6 @@ cdef class Worlds:
         """The judge's numbers, and v+ of arrays."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef double* v
-        cdef double size
         cdef int64_t n = self.w.n + 1
         cdef int32_t k
         self.number[RELATIVE * n + i], self.number[FLOOR * n + i] = j.relative, j.floor
@@ -431,7 +431,6 @@ cdef class Worlds:
         self.number[SPEED * n + i] = j.score.velocity if j.score.finite else INFINITY
         for k in range(3):
             self.number[(START_ENERGY + k) * n + i] = j.begin[k]
-        norms_of_rhs(&j.p, &self.number[RHS_ENERGY * n + i], &size)
         self.worst_at[i] = j.score.worst
         self.number[PUSH * n + i] = fabs(j.both[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
         for k in range(4):
@@ -447,40 +446,40 @@ cdef class Worlds:
                self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
         return READY
 
-    cdef int32_t solve(self, int64_t i, desk_t* desk, room_t* room, room_t* both, const limits_t* limits, double tol,
-                       double most) noexcept nogil:
+    cdef int32_t solve(self, int64_t i, desk_t* desk, room_t* room, room_t* both, made_t* made, const limits_t* limits,
+                       double tol, double most) noexcept nogil:
         cdef job_t j
-        cdef int32_t code = self.lay(i, desk, both, &j)
+        cdef int32_t code = self.lay(i, desk, both, made, &j)
+        cdef bint known = j.known
         if code != READY:
             return code
         if j.p.n_rows == 0:
             return self.empty(i, desk)
         j.most = most
-        cdef bint known = j.made.marks != NULL
         solve_job(&j, room, limits, tol)
         if j.solved:
             self.keep_result(i, &j, desk)
         else:
             memcpy(&self.count[4 * i], j.counts, sizeof(j.counts))
-        forget(&j, known)
+        if not known:
+            made[0] = j.made                            # whose room the next one has
         if self.jobs != NULL:
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
         return READY if j.solved else TRIED
 
-    cdef int32_t judge(self, int64_t i, desk_t* desk, room_t* room, room_t* both, bint narrow) noexcept nogil:
+    cdef int32_t judge(self, int64_t i, desk_t* desk, room_t* room, room_t* both, made_t* made, bint narrow) noexcept nogil:
         """The judge alone, beside the floor of float32 where `narrow`; empty rows are left to the caller."""
         cdef job_t j
-        cdef int32_t k, code = self.lay(i, desk, both, &j), m = j.p.n_rows
-        cdef bint known
+        cdef int32_t k, code = self.lay(i, desk, both, made, &j), m = j.p.n_rows
+        cdef bint known = j.known
+        cdef double size
         cdef double* x
         if code != READY:
             return code
         if m == 0:
             return self.empty(i, desk)
-        known = j.made.marks != NULL
         code = LEFT
-        if (known or make_numbers(&j.p, &j.g, &j.made) == MADE) and j.made.n_empty == 0 and first_outside(j.p.d, m) < 0 \
-                and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
+        if has_numbers(&j) and j.made.n_empty == 0 and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
             code, x = READY, room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
@@ -495,7 +494,9 @@ cdef class Worlds:
                     x[k] = x[k] + x[m + k] + x[2 * m + k]
                 j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
             self.keep_result(i, &j, desk)
-        forget(&j, known)
+            norms_of_rhs(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
+        if not known:
+            made[0] = j.made
         return code
 
     def __dealloc__(self):
@@ -512,6 +513,7 @@ cdef class Hand:
     cdef Worlds worlds
     cdef room_t room
     cdef room_t both
+    cdef made_t made
     cdef desk_t desk
     cdef const unsigned char[::1] stop
 
@@ -523,6 +525,8 @@ cdef class Hand:
         free(self.room.real)
         free(self.both.index)
         free(self.both.real)
+        free(self.made.marks)
+        free(self.made.numbers)
         free(self.desk.room.index)
         free(self.desk.room.real)
         free(self.desk.tree.index)
@@ -554,13 +558,13 @@ cdef class Hand:
                 if i >= n:
                     return DONE_ALL
                 if judges:
-                    code = w.judge(i, &self.desk, &self.room, &self.both, narrow)
+                    code = w.judge(i, &self.desk, &self.room, &self.both, &self.made, narrow)
                     if code == READY:
                         code = judges
                 elif at == NULL:
                     code = LEFT
                 else:
-                    code = w.solve(i, &self.desk, &self.room, &self.both, at, tol, most)
+                    code = w.solve(i, &self.desk, &self.room, &self.both, &self.made, at, tol, most)
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i
