@@ -10,7 +10,7 @@ Rows that stand together and reach the same columns share a panel: one list of c
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.tree cimport ldl_solve, take_from
+from lavender_ext.core.tree cimport ldl_solve, take_from, take_two
 
 
 cdef enum:
@@ -115,13 +115,12 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
                                int32_t* n_cols, double* n_values) noexcept nogil:
     """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
-    cdef int32_t i, q, k, c, first, last, count = 0, before = -1, at = 0, n = 0, top = -1, nv = g.n, end, entries
+    cdef int32_t i, q, k, c, first, last, count = 0, before = -1, at = 0, n = 0, top = -1, nv = g.n, end, entries, odd
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
     cdef const int32_t* parent = g.parent
     cdef uint64_t on = 0, held = 0
     cdef double values = 0.0
-    cdef bint same
     prow[0] = 0
     pcol[0] = 0
     pval[0] = 0
@@ -134,12 +133,10 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
         last = ptr[i + 1]
         end = jptr[last]
         entries = end - jptr[first]
-        same = entries == before                        # the entries of the block before
-        q = jptr[first]
-        while same and q < end:
-            same = jidx[q] == jidx[q - entries]
-            q += 1
-        if not same:
+        odd = entries - before                          # 0 where it has the entries of the block before
+        for q in range(jptr[first], end if odd == 0 else 0):
+            odd |= jidx[q] ^ jidx[q - entries]
+        if odd:
             on = 0
             top = -1
             for q in range(jptr[first], end):
@@ -237,8 +234,9 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
     cdef const int32_t* lptr = g.lptr
     cdef const int32_t* lidx
     cdef const double* l
+    cdef const double* u
     cdef const double* root = g.root
-    cdef double z
+    cdef double z, top, low
     cdef double* x
     for a in range(nc):
         place[cols[a]] = a
@@ -249,27 +247,38 @@ cdef inline void panel_whiten(const generalized_t* g, int32_t panel, int32_t* pl
         end = jptr[i + 1]
         for q in range(jptr[i], end):
             x[place[jidx[q]]] = jval[q]
-    for a in range(nc - 1, -1, -1):
+    a = nc - 1
+    while a >= 0:
         k = cols[a]
         before = lptr[k]
         count = lptr[k + 1] - before
         l = g.lval + before
         z = root[k]
-        if count == a:                                      # every column before it
-            x = y
+        x = y
+        if count == a > 0 and lptr[cols[a - 1] + 1] - lptr[cols[a - 1]] == a - 1:
+            a -= 1                                          # two with every column before them: the bits of one by one
+            u = g.lval + lptr[cols[a]]
+            for _i in range(rows):
+                top = x[a + 1]
+                low = x[a] - l[a] * top
+                take_two(x, l, top, u, low, a)
+                x[a + 1] = top * z
+                x[a] = low * root[cols[a]]
+                x += nc
+        elif count == a:
             for _i in range(rows):
                 take_from(x, l, x[a], a)
                 x[a] *= z
                 x += nc
         else:
             lidx = g.lidx + before
-            x = y
             for _i in range(rows):
                 if x[a] != 0.0:
                     for p in range(count):
                         x[place[lidx[p]]] -= l[p] * x[a]
                     x[a] *= z
                 x += nc
+        a -= 1
 
 
 cdef inline double dot(const double* x, const double* y, int32_t n) noexcept nogil:

@@ -92,6 +92,18 @@ cdef inline int32_t find_islands(const blocks_t* p, const generalized_t* g, int3
             local[r] = n
             n += 1
         label[b] = local[r]
+    if n == 1:                                          # as most robots are
+        iptr[0], iptr[1], run[0], run[1], cptr[0], at = 0, 1, 0, panels, 0, 0
+        for i in range(g.n):
+            local[i] = -1
+        for q in range(g.pcol[panels]):
+            local[cols[q]] = 0
+        for i in range(g.n):
+            if local[i] == 0:
+                icols[at], local[i] = i, at
+                at += 1
+        cptr[1] = most[0] = at
+        return 1
     for i in range(n + 1):
         iptr[i] = 0
         cptr[i] = 0

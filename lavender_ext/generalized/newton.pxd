@@ -389,14 +389,14 @@ cdef inline void restart(flow_t* f, int32_t island, const double* lam) noexcept 
         f.y[c] = lam[c] if f.formed else f.u[c]
 
 
-cdef inline bint offer(flow_t* f, int32_t island, const double* lam) noexcept nogil:
+cdef inline bint offer(flow_t* f, int32_t island, const double* lam, bint moves) noexcept nogil:
     """Keep lam in `first_best` where its error under the problem's own law is less than is kept; phi must be 0.
 
-    Is it less than the least?
+    With u of `gather`, which says whether it moves. Is the error less than the least?
     """
     cdef double energy, velocity, over
     f.p.law = f.law
-    energy = measure(f, island, lam, gather(f, island, lam, f.u), &velocity)
+    energy = measure(f, island, lam, moves, &velocity)
     over = excess(f, energy, velocity)
     if over < f.wait.kept:
         f.wait.kept = over
@@ -436,11 +436,11 @@ cdef inline int32_t with_coulomb(flow_t* f, int32_t island, double* impulse) noe
                 keep(f, island, f.phi, f.aside)
             keep(f, island, f.best, impulse)
             level(f, island)
-            offer(f, island, impulse)
+            offer(f, island, impulse, gather(f, island, impulse, f.u))
         else:
             if n == MORE:
                 keep(f, island, impulse, f.aside)
-            if n != LOST and offer(f, island, f.best):
+            if n != LOST and offer(f, island, f.best, gather(f, island, f.best, f.u)):
                 keep(f, island, f.best, impulse)
         if x.least <= 1.0:
             return REACHED
@@ -485,7 +485,7 @@ cdef inline int32_t solve_island(flow_t* f, int32_t island, double* impulse) noe
         level(f, island)
         f.wait.at, f.wait.rounds = BEGINS, 0
         f.wait.least = f.wait.kept = 1.0 / 0.0
-        if not offer(f, island, impulse):
+        if not offer(f, island, impulse, not f.still):
             return LOST
         if f.wait.least <= 1.0:
             return REACHED
