@@ -207,6 +207,8 @@ def _product(a: Any, y: FloatArray) -> FloatArray:
     """A^T y of a CSR matrix (k, m): each sum that cancels rounded once, as products of halves of 26 bits are exact."""
     out, size = a.T @ y, abs(a).T @ np.abs(y)
     cancels = np.flatnonzero((size > 0.0) & ~(np.abs(out) > SURE * (len(y) + 2.0) * UNIT * size))
+    if not len(cancels):
+        return out
     columns = a[:, cancels].tocsc()
     halves = []
     for x in (columns.data, y[columns.indices]):

@@ -33,10 +33,12 @@ from lavender.base.arrays import (
     check_not_nan,
     check_sizes,
     equal,
+    read_only,
     shape_of,
     whole_number,
 )
 from lavender.base.errors import InputError
+from lavender.problem.derived import cached_property
 from lavender.problem.friction import (
     LEAST_SHARE,
     SHAPES,
@@ -404,12 +406,12 @@ class Cones:
         second = mu * np.where(np.isin(self.kind, (CONTACT_BOX, CONTACT_ELLIPSE)), self.patch_radius, 1.0)
         return np.stack([np.where(mu <= LEAST_SHARE * second, 0.0, mu), second], axis=1)
 
-    @property
+    @cached_property
     def n_tangents(self) -> IntArray:
         """(k,) tangent rows of each block, 0 on ROW; rows that spin or roll, each with a bound of its own, are none."""
         own = np.diff(self.ptr) - 1 - (self.kind == CONTACT_SPIN)
         own = np.where(self.kind == CONTACT_ROLLING, 2, own)
-        return np.where(self.kind == ROW, 0, own).astype(np.int32)
+        return read_only(np.where(self.kind == ROW, 0, own).astype(np.int32))
 
     def shaped(self, shape: str) -> Cones:
         """The same blocks with contacts of another shape, "disk" (of two coefficients an ellipse) or "box".
@@ -454,7 +456,7 @@ class Cones:
         """(c,) the normal row of each contact."""
         return np.asarray(self.ptr[:-1][self.kind != ROW])
 
-    @property
+    @cached_property
     def reach(self) -> FloatArray:
         """(m,) largest impulse of each row over lambda_n: mu, mu r on `apart_rows`, mu_r on rolling; 0 on others."""
         size = np.diff(self.ptr)
@@ -466,23 +468,23 @@ class Cones:
         out[self.apart_rows[apart]] *= self.patch_radius[apart]
         for k in (0, 1):
             out[self.rolling_rows[rolling] + k] = self.rolling[rolling]
-        return np.asarray(out)
+        return read_only(out)
 
-    @property
+    @cached_property
     def spin_rows(self) -> IntArray:
         """(k,) the spin row of each block, -1 where it has none."""
         spins = (self.kind == CONTACT_SPIN) | ((self.kind == CONTACT_ROLLING) & (np.diff(self.ptr) == 6))
-        return np.where(spins, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32)
+        return read_only(np.where(spins, self.ptr[:-1] + 1 + self.n_tangents, -1).astype(np.int32))
 
-    @property
+    @cached_property
     def apart_rows(self) -> IntArray:
         """(k,) the row of each block that mu patch_radius lambda_n bounds (spin, second side of a box), -1 without."""
-        return np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
+        return read_only(np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32))
 
-    @property
+    @cached_property
     def rolling_rows(self) -> IntArray:
         """(k,) the first of the two rows of each block that roll with a bound of their own, -1 where it has none."""
-        return np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32)
+        return read_only(np.where(self.kind == CONTACT_ROLLING, self.ptr[1:] - 2, -1).astype(np.int32))
 
     def parts(self) -> Iterator[tuple[int, IntArray]]:
         """(block, rows of it that one bound holds together): tangents, then spin or second side, then what rolls."""

@@ -104,7 +104,7 @@ def arrays_of(cones: Cones) -> tuple[FloatArray, FloatArray, IntArray]:
         )
     lower, upper = cones.lower.copy(), cones.upper.copy()
     findex = np.full(cones.n_rows, -1, np.int32)
-    rows, reach = np.flatnonzero(cones.friction_rows), cones.reach
+    rows, reach = np.flatnonzero(cones.friction_rows), cones.reach.copy()
     first = cones.ptr[:-1][cones.is_box] + 1
     reach[first] = cones.coefficients[cones.is_box, 0]  # of a side without friction 0
     upper[rows] = reach[rows]

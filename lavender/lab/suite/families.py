@@ -436,7 +436,8 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
         raise InputError(f"condition is {condition}; 1 or more is needed")
     rng = np.random.default_rng(seed)
     # Twelve digits of each eigenvalue, the last of which no library's power decides.
-    a = np.diag([float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
+    a = np.zeros((n, n))  # before the work: it may not fit
+    np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
     for _ in range(
         4 * n.bit_length()
     ):  # turned in random planes, until every vector has a part of every other
