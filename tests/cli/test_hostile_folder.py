@@ -177,13 +177,14 @@ def show_all(records, figure=True):
     from lavender.lab.report.page import page
     from lavender.lab.report.style import looks
 
-    print_report(Report(records, records), Console(file=text_io.StringIO(), width=140))
     shown = records.latest()
+    report = Report(shown, shown)
+    print_report(report, Console(file=text_io.StringIO(), width=140))
     for record in shown.records:  # whichever is the fastest, and so shown, differs from run to run
         assert code_of(record)
     drawn = figures(shown)
-    page(Report(shown, shown), drawn).encode("utf-8")
-    summary(Report(shown)).encode("utf-8")
+    page(report, drawn).encode("utf-8")
+    summary(report).encode("utf-8")
     drawn = list(drawn) if figure else []
     return matplotlib_figure(drawn[0], looks({r.solver for r in records})) if drawn else None
 

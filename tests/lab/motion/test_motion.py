@@ -378,7 +378,7 @@ def test_equal_seeds_find_equal_motions():
 
 
 def test_choices_have_names_and_are_motions():
-    p = suite.case("granularF(n=3, sliding=0.5)").problem
+    p = suite.case("granularF(n=2, sliding=0.5)").problem
     found = lv.motions(p, n=6)
     most = found.select("dissipation")
     assert most.dissipation == max(m.dissipation for m in found)

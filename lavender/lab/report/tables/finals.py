@@ -8,7 +8,7 @@ the best wins. Noise is of what a score differs by between repetitions of the wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,7 @@ from lavender.lab.report.tables.means import SHIFT, limit_of
 __all__ = ["STARTS", "Final", "Race", "in_time", "lines", "serves_in", "to_level"]
 
 SAMPLES = 500
+AT_ONCE = 1_000_000  # numbers of a few samples
 SURE = 0.8  # share of resamplings below which a second name is told
 SOMETIMES = 0.2  # share from which another is as good a choice
 NOISE = 1.05  # at least: what nobody notices
@@ -129,7 +130,7 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
     def score(values: FloatArray) -> FloatArray:
-        found = np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=1)) - SHIFT
+        found = np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=-1)) - SHIFT
         return np.asarray(np.maximum(found, TICK))
 
     def choice(i: int, value: float) -> Choice:
@@ -232,6 +233,21 @@ def _blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
     return list(found.values())
 
 
+def _drawn(
+    blocks: Sequence[Sequence[int]], repeats: int, most: int
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Up to `most` samples of equally many cases: (samples, cases) and (samples, repetitions), by number."""
+    draw = np.random.default_rng(0)
+    by_count: dict[int, list[tuple[list[int], np.ndarray]]] = {}
+    for _ in range(SAMPLES):
+        cases = [i for b in draw.integers(0, len(blocks), len(blocks)) for i in blocks[b]]
+        by_count.setdefault(len(cases), []).append((cases, draw.integers(0, repeats, repeats)))
+    for alike in by_count.values():
+        for at in range(0, len(alike), most):
+            cases_of, again = zip(*alike[at : at + most], strict=True)
+            yield np.array(cases_of), np.array(again)
+
+
 def _race(
     records: Records,
     some: Sequence[Final],
@@ -243,7 +259,6 @@ def _race(
 ) -> Race:
     n, _, repeats = values.shape
     blocks = _blocks(records, names)
-    draw = np.random.default_rng(0)
     single = np.array([score(values[:, :, k : k + 1]) for k in range(repeats)])  # (repetitions, lines)
     # Two standard errors of the difference of two scores; that of a quartile is 1.36 times a mean's.
     deviation = float(np.median(np.log(single).std(axis=0)))
@@ -251,18 +266,16 @@ def _race(
     whole = score(values)
     wins, losses = np.zeros(n), [[] for _ in range(n)]  # type: ignore[var-annotated]
     lying = np.array([any(r.contradicted for r in f.runs.values()) for f in some])
-    for _ in range(SAMPLES):
-        cases = [i for b in draw.integers(0, len(blocks), len(blocks)) for i in blocks[b]]
-        again = draw.integers(0, repeats, repeats)
-        found = score(values[:, cases][:, :, again])
+    for cases, again in _drawn(blocks, repeats, max(1, AT_ONCE // values.size)):
+        found = score(values[:, cases[:, :, None], again[:, None, :]])  # (lines, samples)
         # A false claim comes last, then whoever misses more cases.
-        behind = missed[:, cases].sum(axis=1) + 1e6 * lying
-        first = behind == behind.min()
-        best = found[first].min()
+        behind = missed[:, cases].sum(axis=2) + 1e6 * lying[:, None]
+        first = behind == behind.min(axis=0)
+        best = np.where(first, found, math.inf).min(axis=0)
         won = first & (found <= noise * best)
-        wins += won
-        for i in np.flatnonzero(~won):
-            losses[i].append(found[i] / best)
+        wins += won.sum(axis=1)
+        for lost, by, ours in zip(losses, found / best, won, strict=True):
+            lost.extend(by[~ours])
     shares = wins / SAMPLES
     # Of those that win about as often as anybody, the one that needs no choice, else by name: a rerun agrees.
     order = sorted(
