@@ -479,7 +479,9 @@ class Cones:
     @cached_property
     def apart_rows(self) -> IntArray:
         """(k,) the row of each block that mu patch_radius lambda_n bounds (spin, second side of a box), -1 without."""
-        return read_only(np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32))
+        return read_only(
+            np.where(self.kind == CONTACT_BOX, self.ptr[1:] - 1, self.spin_rows).astype(np.int32)
+        )
 
     @cached_property
     def rolling_rows(self) -> IntArray:
