@@ -90,7 +90,10 @@ cdef void jacobi_step(void* context, double* lam, int32_t first_sweep, int32_t n
                 relax_tangents(lam + q, w + q, omega * p.step[q], part.reach[g] * lam[j], part.size[g])
 
 
-SWEEPS, SOR, JACOBI = range(3)
+cpdef enum:                     # kinds, which Python names too
+    SWEEPS
+    SOR
+    JACOBI
 
 
 def damping(Data p):
@@ -117,9 +120,9 @@ cdef class Sweeps:
         Of another problem: hands over the room of its pairs, and packs no more.
     """
 
-    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int kind=0, double omega=1.0,
+    def __init__(self, Data p, int32_t[::1] order, int split, int mode, uint64_t[::1] rng, int kind=SWEEPS, double omega=1.0,
                  bint exact=False, Sweeps before=None):
-        self.x.step = sor_step if kind == 1 else jacobi_step if kind == 2 else sweep_step
+        self.x.step = sor_step if kind == SOR else jacobi_step if kind == JACOBI else sweep_step
         self.x.c.omega = omega
         self.lay(p, order, split, mode, rng, exact, exact, 0)
         if before is not None:
