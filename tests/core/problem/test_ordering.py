@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from random_problems import as_matrix, random_contact_problem, random_lcp, seeds, sweeps, touching
 
 import lavender as lv
 from lavender.problem.ordering import ORDERS, block_order, body_ranks, colors, levels
 
 
+@settings(max_examples=30)
 @given(seed=seeds)
 @pytest.mark.parametrize("order", ORDERS)
 def test_named_orders_are_permutations_with_joints_first(order, seed):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lavender as lv
@@ -79,6 +79,7 @@ def outcome(given):
 
 
 @pytest.mark.parametrize("what", SPOILT)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_quick_looks_end_as_the_long_way(what, seed):
     given = spoilt(seed, SPOILT[what])

@@ -29,6 +29,7 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
 
 
 @pytest.mark.parametrize("order", ORDERS)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_sequential_impulses_equal_pgs_on_every_order(order, seed):
     """Twenty sweeps: where strong friction makes the sweeps chaotic, roundings grow tenfold in five."""
