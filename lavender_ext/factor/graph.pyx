@@ -259,4 +259,4 @@ def bodies_in(Data p, order):
                 if body[i, 1] >= 0:
                     return None
                 body[i, 1] = t
-    return body_array, n, column_array
+    return (body_array, n, column_array) if n else None
