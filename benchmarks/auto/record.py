@@ -23,7 +23,7 @@ from lavender.judge.residuals import judged, reference
 from lavender.judge.solution import Status
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
-from lavender.solvers.steps import METHODS
+from lavender.solvers.steps import METHODS, made
 
 __all__ = ["LEVELS", "SOLVERS", "Record", "records"]
 
@@ -86,7 +86,7 @@ def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points]:
     """One curve; what judges its points takes no time of it."""
     fresh = replace(problem.disk, copy=False)
     reference(fresh)
-    solver: Any = registry.get(SOLVERS[name][0]).load()(**SOLVERS[name][1])
+    solver: Any = made(name, fresh)
     lam, points, best = fresh.start(), Points(), math.inf
     with one_thread():
         begun = process_time()

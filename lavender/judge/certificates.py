@@ -50,7 +50,7 @@ NEAR = 1e-6  # what z may reach, beside its terms, for a solver's rounding
 SIMPLE = 16  # rows of a certificate up to which numbers are looked for that make A^T y zero exactly
 TAKES_PART = 1e-6  # of the largest y in the metric of D: below, a row is not named
 NAMED = 6  # blocks of a kind that are named
-POLISHED = 600  # rows of a certificate up to which it is polished, by dense least squares
+POLISHED = 1000  # rows of a certificate up to which it is polished, by dense least squares
 
 
 @dataclass(frozen=True)

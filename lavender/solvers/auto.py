@@ -6,15 +6,17 @@
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
-                                where 100 cost less than it
+                                where 100 cost less than it; of a matrix each contact is solved exactly
     Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile that does
                                 not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
+    a certificate               of J and M with rigid rows: whether the least violation proves that there is no solution;
+                                after SURE times that cost, at once of bounded rows that failed in the compiled call
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE), `admm` or, of J and M, `nncg`, and sweeps as
                                 long as these gain; all together LAST times Newton's cost
-    at last                     a certificate that there is no solution (`certify.py`)
+    at last                     a certificate of others, by a linear program (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
 problem is solved in the same way on every machine. Under a time limit the tree is the same. If it may be short, sweeps
@@ -37,7 +39,7 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
-from lavender.solvers.certify import certify
+from lavender.solvers.certify import certify, least_violation
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
@@ -179,6 +181,11 @@ class Tree:
             return False
         return max(p.bandwidth) <= min(BAND, p.m // 4) and bool(p.is_symmetric)
 
+    @property
+    def is_program(self) -> bool:
+        """Rows of a program whose own velocities tell sooner that there is no solution."""
+        return self.problem.qp is not None and self.problem.matrix is not None
+
     @cached_property
     def is_loose(self) -> bool:
         """Blocks under Coulomb's law that do not roll, nearly each between another pair of bodies or of trees of M, or
@@ -207,7 +214,13 @@ class Tree:
         usual = self.problem.generalized is not None and self.law == "coulomb"
         yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep if usual else 0.0))
         yield from self.sweeps_first(self.newton)
+        if self.problem.generalized is not None and not np.all(self.problem.compliance):
+            if not (self.tried and self.law == "lcp"):
+                yield from self.factorisations(SURE)
+            yield Stage("certificate", 1.0, 0.0, "whether the least violation proves that there is none")
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
+        if self.is_program:
+            return
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
         if "newton over rows" not in self.states and self._rows_may_pay(
             self.states.get("newton"), MOST, LITTLE
@@ -351,6 +364,10 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         stage = next(lines, None)
         if stage is None:
             break
+        if stage.solver == "certificate":
+            if not log.ends_late(tree.newton):
+                least_violation(log)
+            continue
         step = steps.get(stage.solver)
         if step is None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
@@ -373,7 +390,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             if isinstance(step, Sweeps) and step.nearly_there and not log.done():
                 step.finish()
                 return
-    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
+    if log.best > log.tol and log.certificate is None and not tree.is_program and (log.left > 0 or log.vain):
         certify(log)
 
 

@@ -8,6 +8,8 @@ On a contact y is along the normal, as Coulomb's law requires, and z = A^T y sat
 Of Coulomb friction the convex relaxation is asked at last. A y of its that leaves the normals proves nothing for
 Coulomb's law, but tells who fights: with a compliance on the rows of y no such y is left (`conflict_of`).
 
+Of J and M it is what the least violation of J v = target needs (`least_violation`), whatever M is.
+
 One infeasible island makes the problem infeasible. The unsolved islands are tried one by one, because an upper bound in
 another island does not matter.
 """
@@ -28,11 +30,12 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import blocks_of_each
 from lavender.solvers.islands import restrict, rows_of
+from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 
-__all__ = ["Conflict", "certify", "conflict_of"]
+__all__ = ["Conflict", "certify", "conflict_of", "least_violation"]
 
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
@@ -42,6 +45,9 @@ CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 RELAXATION_STEPS = 150  # factorisations that the relaxation has for its proof
 SOFT_STEPS = 300  # and a problem with a compliance
 SOFT = 1e-4, 1e-2  # of d: compliances that are tried
+NEARLY_RIGID = 1e-6, 1e-8, 1e-10  # of d: compliances under which the violation is least
+CLOSE = 1e-6  # tol of these impulses
+DUST = 1e-6  # of the largest y in the metric of D: below, a row of a difference takes no part
 
 
 @dataclass(frozen=True)
@@ -111,10 +117,58 @@ def _newton(
 
 
 @np.errstate(all="ignore")  # what overflows is judged
+def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
+    """Of J and M: the motion that violates J v = target least, near v - v* (nv,) or that of the best impulse.
+
+    With a diagonal mass C in the place of M and compliances eps d, the impulses lambda(eps) of
+
+        min 1/2 (v' - v).C (v' - v) + 1/2 |violation|^2 / (eps d)
+
+    grow as y / eps + a constant where some violation is left, and then J^T y = 0, b.y > 0. A difference of two is a y
+    to many digits, and the judge polishes it. Under Coulomb's law the same without friction.
+    """
+    problem, of = log.problem, log.problem.generalized
+    assert of is not None
+    v, cones = of.change(log.impulse) if v is None else v, problem.cones
+    if problem.law == "coulomb":
+        cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
+    squares = of.jac.multiply(of.jac).tocsr()
+    mass = squares.T @ (1.0 / np.maximum(squares.sum(axis=1), np.finfo(float).tiny))
+    mass[mass == 0.0] = 1.0  # of what no row moves
+    d = squares @ (1.0 / mass)
+    y = lam = np.zeros(of.m)
+    for share in NEARLY_RIGID:
+        soft = Problem.from_jacobian(
+            of.jac,
+            sp.diags_array(mass),
+            v,
+            target=problem.b,
+            cones=cones,
+            compliance=share * d,
+            friction="cone",
+        )
+        kernel = general.prepare(soft)
+        if kernel is None or log.ends_late(LINEAR_PROGRAM):
+            return
+        before, lam = lam, lam.copy()
+        steps = SOFT_STEPS * max(1, kernel.islands)
+        if general.run(soft, kernel, lam, steps, CLOSE, log.time_left).status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        y = lam - before
+        y[(np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))] = 0.0
+        size = np.sqrt(d) * np.abs(y)
+        y[size <= DUST * size.max()] = 0.0
+        if not prove(problem, y, log.tol).reason:
+            break
+    log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)
+
+
+@np.errstate(all="ignore")  # what overflows is judged
 def certify(log: SolveLog) -> None:
     """Look for a certificate that a problem has no solution; under Coulomb's law, else of its relaxation."""
-    _linear_programs(log)
     problem = log.problem
+    if problem.generalized is None:
+        _linear_programs(log)
     if (
         log.certificate is None
         and problem.law == "coulomb"
@@ -125,7 +179,7 @@ def certify(log: SolveLog) -> None:
 
 
 def _linear_programs(log: SolveLog) -> None:
-    """For a problem without upper bounds, any A."""
+    """For rows of bodies or of any A, without upper bounds."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM + 1e9 * loading("scipy.optimize")):
         return

@@ -1,7 +1,7 @@
 """What Newton's method and sweeps cost [ns], counted from their structure: the only numbers that `auto` compares.
 
     Newton   start + n (row m + entry e + work w)                                                             (1)
-    sweep    sweep_row m + entry e, under the cone law sweep_cone e                                           (2)
+    sweep    sweep_row m + entry e, under the cone law over J sweep_cone e                                    (2)
 
 m rows; e multiply-adds of a sweep or entries of A, which one step reads; w multiply-adds of one factorisation and its
 solution, as the solver's own analysis tells them (`NewtonState.count`); n factorisations, by law. Over generalised
@@ -68,9 +68,9 @@ def least(problem: Problem) -> Count:
 
 def sweep_cost(problem: Problem) -> float:
     """(2)."""
-    work = float(sweep_work(problem))
+    cone = problem.law == "cone" and problem.matrix is None
     return float(
-        RATES["sweep row"] * problem.m + RATES["sweep cone" if problem.law == "cone" else "entry"] * work
+        RATES["sweep row"] * problem.m + RATES["sweep cone" if cone else "entry"] * sweep_work(problem)
     )
 
 

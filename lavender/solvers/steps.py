@@ -20,7 +20,7 @@ from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.sweeping import STATUS
 from lavender_ext.small.checked_sweeps import CheckedSweeps, sweeps_left
 
-__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Step", "Sweeps", "setup_time"]
+__all__ = ["METHODS", "Direct", "Iterations", "Newton", "Step", "Sweeps", "made", "setup_time"]
 
 NNCG: dict[str, Any] = {"order": "symmetric", "restart": "against"}
 #: Solver and options of each step.
@@ -41,10 +41,22 @@ AT_MOST = 4.0  # times its count, that a sweep takes: of blocks that are solved 
 FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
 
 
+def made(name: str, problem: Problem) -> Any:
+    """The solver of a step."""
+    solver, options = METHODS[name]
+    if is_exact(problem) and "sweep" in get(solver).options:
+        options = options | {"sweep": "blocks"}
+    return get(solver).load()(**options)
+
+
+def is_exact(problem: Problem) -> bool:
+    """Sweeps solve each block exactly: under the cone law, and where a contact's rows may have unlike units."""
+    return problem.law == "cone" or (problem.law == "coulomb" and problem.matrix is not None)
+
+
 def setup_time(name: str, problem: Problem) -> float:
     """What a step sets up before its first iteration takes [s]; 0: next to nothing."""
-    solver, options = METHODS[name]
-    return get(solver).load()(**options).setup_time(problem)
+    return float(made(name, problem).setup_time(problem))
 
 
 class Step:
@@ -58,7 +70,7 @@ class Step:
 
     def __init__(self, name: str, log: SolveLog) -> None:
         self.name, self.log = name, log
-        self.solver = get(METHODS[name][0]).load()(**METHODS[name][1])
+        self.solver = made(name, log.problem)
 
     def run(self, n: float) -> None:
         """At most n iterations, offered to the log."""
@@ -166,7 +178,7 @@ class Sweeps(Step):
         split = 0 if problem.rows is None else problem.rows.n_joints
         late = deadline.is_set and deadline.passed(FORMING * forming(problem))
         over = problem.metric if late else operator(problem)
-        self.state = CheckedSweeps(problem.metric, over, problem.law == "cone", split)
+        self.state = CheckedSweeps(problem.metric, over, is_exact(problem), split)
 
     def begin(self, log: SolveLog) -> None:
         """From where the log is, or from a given start that is worse than doing nothing."""

@@ -3,7 +3,8 @@
     x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
 
 Where `auto` has a P that fills J in, and its compiled call does not solve the program, it solves the rows (4) of
-`problem/quadratic.py` in its place, which stay sparse.
+`problem/quadratic.py` in its place, which stay sparse; where it does not solve these either, it asks for a proof that
+nobody can, then goes over velocities.
 Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
 program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 """
@@ -17,11 +18,13 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, number, read_only
-from lavender.base.deadline import Stopwatch
+from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.errors import InputError
 from lavender.judge.solution import Claim, Solution, Status
 from lavender.problem import Problem, QPSolution
+from lavender.solvers.certify import least_violation
 from lavender.solvers.registry import SMALL_ROWS, get
+from lavender.solvers.solve_log import SolveLog
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
 __all__ = ["solve_qp"]
@@ -31,7 +34,8 @@ SLOW = 0.1  # where a step leaves more than this of the error, the next has
 SOFTER = 0.1  # this share of D, as long as
 ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, the next step has more of D
 SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
-IDLE = 10  # steps in a row without a smaller error, after which no other is made
+IDLE = 10  # steps in a row without a smaller error, after which no other is made,
+FAILED = 3  # and so many that stall
 TIGHTEST = 1e-15  # tol of a step
 CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
@@ -95,7 +99,7 @@ def solve_qp(
     step = _over_rows if sparse else _over_velocities
     solution, x = step(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)
-    centre, tightest, before, idle = None, tol, np.inf, 0
+    centre, tightest, before, idle, failed = None, tol, np.inf, 0, 0
     if answer.error <= tol and qp.proximal is None:
         return answer
     for _ in range(STEPS):
@@ -124,7 +128,8 @@ def solve_qp(
         answer = qp.solution(solution, tol, x)
         idle = 0 if answer.error < best.error else idle + 1
         best = min(best, answer, key=lambda one: one.error)
-        if idle == IDLE:
+        failed = failed + 1 if solution.status is Status.STALLED else 0
+        if idle == IDLE or failed == FAILED:
             break
     return best
 
@@ -148,20 +153,26 @@ def _over_rows(
         if made is not None:
             return made, None
     b, cones, matrix = qp.over_rows()
-    over = Problem(b, cones, matrix, copy=False)
+    over = Problem(b, cones, matrix, copy=False, qp=qp)
     start = None if impulse is None else qp.start_over_rows(problem.impulse_array(impulse))
     found = solve(over, solver, tol=CLOSER * tol, time_limit=time_limit, impulse=start)
     solved = found.status in (Status.CONVERGED, Status.FLOOR)
     lam, x = qp.impulse_from_rows(found.impulse, found.slack), read_only(found.impulse[: len(qp.q)].copy())
-    if not solved or not (qp.proximal is not None or qp.solution(lam, tol, x).found):
-        left = None if time_limit is None else max(time_limit - watch.seconds, 1e-6)
+    status, proof = Status.CONVERGED, None
+    left = None if time_limit is None else max(time_limit - watch.seconds, 1e-6)
+    if not solved:
+        log = SolveLog(problem, tol, 1, Deadline(left))
+        log.offer(lam)
+        least_violation(log, x - qp.generalized.v_free)
+        status, proof = Status.INFEASIBLE, log.certificate
+    if proof is None and not (solved and (qp.proximal is not None or qp.solution(lam, tol, x).found)):
         return _over_velocities(problem, solver, tol, left, lam if solved else impulse, options)
     claim = Claim(
-        Status.CONVERGED, found.iterations, dict(found.work), f"over the rows of P and J: {found.message}",
-        turns=found.turns,
+        status, found.iterations, dict(found.work), f"over the rows of P and J: {found.message}",
+        certificate=proof, turns=found.turns,
     )  # fmt: skip
     late: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
-    return Solution.late(read_only(lam), Status.CONVERGED, tol, watch.seconds, late), x
+    return Solution.late(read_only(lam), claim.status, tol, watch.seconds, late), x
 
 
 def _distance(answer: QPSolution) -> float:

@@ -384,7 +384,8 @@ cdef class Friction(Small):
     def __init__(self, Data data, start, Data matrix, int split, int most, label=None, int count=1):
         Small.__init__(self, data, start, matrix)
         self.split, self.most, self.count = split, most, count
-        if matrix.blocks.law == CONE:
+        # Within a contact of a matrix that was given, units may be unlike.
+        if matrix.blocks.law == CONE or not (data.factored or data.is_general):
             self.at, self.prepared = gauss_seidel.prepare(matrix)
         if count > 1:
             ptr = np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)

@@ -451,3 +451,26 @@ def test_a_wide_program_without_a_feasible_point_is_proven_infeasible():
     answer = lv.solve_qp(lv.Problem.from_qp(*(qp[name] for name in NAMES)))
     assert answer.solution.status is lv.Status.INFEASIBLE
     assert not answer.found
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_few_rows_that_contradict_each_other_among_many_are_proven_by_the_least_violation(seed, coupled):
+    """No factor of all rows, no turns with doubled work: it ends at the proof, and its twin is solved."""
+    rng = np.random.default_rng(seed)
+    n, fight = 120, rng.choice(200, 3, replace=False)
+    G, x, weight = rng.normal(size=(200, n)), rng.normal(size=n), rng.uniform(0.5, 1.5, 3)
+    h = G @ x + rng.uniform(0.1, 1.0, 200)
+    root = rng.normal(size=(n, n)) if coupled else np.eye(n)
+    box = {"lb": x - 2.0, "ub": x + 2.0} if coupled else {}
+    last, side = -weight @ G[fight], -weight @ h[fight]
+    P, q = root.T @ root / n + 0.1 * np.eye(n), rng.normal(size=n)
+    sides = side - 0.1, side + 2.0 * weight @ (h - G @ x)[fight]
+    none, twin = (
+        lv.solve_qp(lv.Problem.from_qp(P, q, np.vstack([G, last]), np.append(h, at), **box)) for at in sides
+    )
+    assert none.solution.status is lv.Status.INFEASIBLE and not none.solution.contradicted
+    assert not {turn.solver for turn in none.solution.turns} & {"newton over rows", "nncg", "admm"}
+    _, z, _ = none.qp.multipliers(none.solution.certificate)
+    assert set(np.flatnonzero(z)) == {*fight, 200}
+    assert twin.found

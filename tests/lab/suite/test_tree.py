@@ -329,6 +329,21 @@ def test_rows_of_a_follow_for_few_contacts_of_uneven_compliance(seed):
     assert lv.solve(problem, tol=1e-6).success
 
 
+@pytest.mark.parametrize("friction", ["cone", "coulomb"])
+@pytest.mark.parametrize("contacts", [10, 40])
+def test_sweeps_alone_solve_contacts_whose_rows_have_unlike_units(contacts, friction):
+    """Each block is solved exactly: one step along its rows would be as short as the largest unit asks for."""
+    rng = np.random.default_rng(contacts)
+    m, unit = 3 * contacts, 10.0 ** rng.uniform(-2.0, 2.0, 3 * contacts)
+    half, b = rng.standard_normal((m, 2 * m)), rng.standard_normal(m)
+    matrix, cones = (
+        unit[:, None] * (half @ half.T) * unit / m,
+        lv.Cones.contacts(rng.uniform(0.2, 1.0, contacts)),
+    )
+    solution = lv.solve(lv.Problem(unit * b, cones, matrix, friction=friction))
+    assert solution.success and set(solution.work) <= {"sweeps", "restarts"}, solution.message
+
+
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
@@ -355,7 +370,7 @@ def test_where_contacts_roll_the_tree_has_no_step_that_cannot_roll(form):
 
 def test_cones_that_sweeps_do_not_take_have_steps_that_do():
     general = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
-    assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "nncg"}
+    assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "nncg", "certificate"}
     matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
     assert {stage.solver for stage in lv.explain(matrix).stages} == {"admm"}
     assert lv.solve(matrix, tol=1e-4).solver.name == "auto"
