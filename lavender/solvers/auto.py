@@ -11,11 +11,11 @@
                                 not roll, or few entries of A, the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
-    a certificate               of J and M with rigid rows: whether the least violation proves that there is no solution;
-                                after SURE times that cost, at once of bounded rows that failed in the compiled call
+    a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
+                                SURE times that cost, at once of bounded rows that failed in the compiled call
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE), `admm` or, of J and M, `nncg`, and sweeps as
-                                long as these gain; all together LAST times Newton's cost
+                                long as these gain; all together LAST times Newton's cost, and no longer than LONG
     at last                     a certificate of others, by a linear program (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -52,6 +52,7 @@ MOST = 10.0  # times its counted cost, that Newton's method has before both go i
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
+LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
 LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any case
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
@@ -227,7 +228,7 @@ class Tree:
         ):
             self.states |= self.prepared("newton over rows")
             unit = min(max(state.cost for state in self.states.values()), max(unit, LITTLE))
-        self.left = (LAST - MOST) * unit - self.begun
+        self.left = min((LAST - MOST) * unit, LONG) - self.begun
         for k in range(TURNS):
             before = self.best
             for stage in self.in_turn(2.0**k):
@@ -242,8 +243,9 @@ class Tree:
     def factorisations(self, times: float) -> Iterator[Stage]:
         """Newton's method for so many times its counted cost."""
         for name, state in self.states.items():
-            why = f"{times:g} times its counted cost of {words(state.cost)}"
-            yield Stage(name, times * state.steps, times * state.cost, why)
+            share = min(times, max(SURE, LONG / state.cost))
+            why = f"{share:.3g} times its counted cost of {words(state.cost)}"
+            yield Stage(name, share * state.steps, share * state.cost, why)
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for."""

@@ -15,7 +15,7 @@ from lavender.judge.residuals import reference
 from lavender.lab.suite.build import Bodies, Contacts, contact_problem
 from lavender.problem import OPERATORS
 from lavender.solvers import costs
-from lavender.solvers.auto import LAST, LITTLE, MOST, Tree, solve
+from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, Iterations, Newton, Step, Sweeps
@@ -342,6 +342,16 @@ def test_sweeps_alone_solve_contacts_whose_rows_have_unlike_units(contacts, fric
     )
     solution = lv.solve(lv.Problem(unit * b, cones, matrix, friction=friction))
     assert solution.success and set(solution.work) <= {"sweeps", "restarts"}, solution.message
+
+
+def test_what_is_counted_to_take_long_has_no_more_than_that(monkeypatch):
+    problem = random_lcp(0, m=80)
+    before = lv.explain(problem)
+    monkeypatch.setattr("lavender.solvers.auto.LONG", 0.5 * before.newton)
+    tree = Tree(problem)
+    costs_of = [stage.cost for stage in tree if stage.solver == "newton"]
+    assert costs_of == [pytest.approx(SURE * tree.newton)]
+    assert max(stage.cost for stage in before.stages) == pytest.approx(MOST * before.newton)
 
 
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
