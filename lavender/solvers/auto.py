@@ -7,8 +7,8 @@
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
                                 where 100 cost less than it; of a matrix each contact is solved exactly
-    Coulomb's law               for as much again, sweeps of a conjugate gradient (`nncg`); of a loose pile that does
-                                not roll, or few entries of A, the first under the cone law
+    a loose pile                under Coulomb's law, of bodies that do not roll or few entries of A: for as much again,
+                                sweeps of a conjugate gradient (`nncg`), the first under the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
@@ -251,15 +251,15 @@ class Tree:
         """For Newton's cost: first what that is at least, then what it is counted for."""
         short = self.is_short(newton)
         cost = (self.half if short else newton) - self.begun
-        if short and self.law == "coulomb":
+        if short and self.is_loose:
             cost *= 0.5  # nncg has the other half
         pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             why = f"{words(cost)} of what newton costs"
             yield self.sweeps(cost, why, inf if short else newton)
-            if self.law == "coulomb":
-                yield self.iterations("nncg from the cone law" if self.is_loose else "nncg", cost, why)
+            if self.is_loose:
+                yield self.iterations("nncg from the cone law", cost, why)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""

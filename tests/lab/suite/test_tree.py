@@ -41,13 +41,13 @@ def over_velocities(friction, m=120, nv=60):
     return lv.Problem.from_jacobian(jac, mass, rng.normal(size=nv), cones=cones, compliance=0.1, **more)
 
 
-COULOMB = ["anderson", "nncg", "anderson", "nncg", "newton"]
+LOOSE = ["anderson", "nncg", "anderson", "nncg", "newton"]
 # What the first lines of the tree are, of a problem of each kind.
 FIRST = {
     "linear, a matrix": (lambda: as_matrix(suite.hang(n=24).problem), ["direct"]),
     "linear, bodies": (lambda: suite.hang(n=24).problem, ["newton"]),
     "linear, J and M": (lambda: over_velocities(None), ["newton"]),
-    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "nncg", "newton"]),
+    "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
     "the cone law": (
@@ -58,10 +58,10 @@ FIRST = {
         lambda: suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone"),
         ["anderson", "anderson", "newton", "newton", "admm", "anderson"],
     ),
-    "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, COULOMB),
-    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), COULOMB),
-    "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), COULOMB),
-    "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, COULOMB),
+    "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
+    "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
+    "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
+    "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, ["anderson", "anderson", "newton"]),
 }  # fmt: skip
 
 
