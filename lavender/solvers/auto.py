@@ -218,7 +218,9 @@ class Tree:
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
             if not (self.tried and self.law == "lcp"):
                 yield from self.factorisations(SURE)
-            yield Stage("certificate", 1.0, 0.0, "whether the least violation proves that there is none")
+            yield Stage(
+                "certificate", 1.0, self.newton, "whether the least violation proves that there is none"
+            )
         yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
         if self.is_program:
             return

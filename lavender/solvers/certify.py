@@ -34,6 +34,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
+from lavender_ext.core.checks import LEAST
 
 __all__ = ["Conflict", "certify", "conflict_of", "least_violation"]
 
@@ -138,14 +139,9 @@ def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
     d = squares @ (1.0 / mass)
     y = lam = np.zeros(of.m)
     for share in NEARLY_RIGID:
+        eps = np.where(share * d < LEAST, 0.0, share * d)  # rows of dust are empty
         soft = Problem.from_jacobian(
-            of.jac,
-            sp.diags_array(mass),
-            v,
-            target=problem.b,
-            cones=cones,
-            compliance=share * d,
-            friction="cone",
+            of.jac, sp.diags_array(mass), v, target=problem.b, cones=cones, compliance=eps, friction="cone"
         )
         kernel = general.prepare(soft)
         if kernel is None or log.ends_late(LINEAR_PROGRAM):
