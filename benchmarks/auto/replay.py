@@ -37,7 +37,7 @@ Rule = Callable[[Tree], Iterator[Stage]]
 
 def without(name: str) -> Rule:
     """The tree without a solver, but for linear matrices."""
-    return lambda tree: (s for s in tree if s.solver != name or s.iterations == math.inf)
+    return lambda tree: (s for s in tree if not s.solver.startswith(name) or s.iterations == math.inf)
 
 
 def two_lines(tree: Tree) -> Iterator[Stage]:
