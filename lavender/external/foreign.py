@@ -16,6 +16,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, read_only
 from lavender.base.deadline import Deadline
+from lavender.base.errors import InputError
 from lavender.judge.residuals import reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
@@ -30,6 +31,12 @@ class Foreign(Solver):
 
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
+        missing = [m for m in ("prepare", "run") if not callable(getattr(solver, m, None))]
+        if missing:
+            raise InputError(
+                f"solver {name!r}: its factory made a {type(solver).__name__} without {' and '.join(missing)}; "
+                "prepare and run are needed, and update where a problem is replaced (lavender.registry.Solver)"
+            )
 
     def _if_there(self, method: str, *arguments: Any) -> Any:
         asked = getattr(self.solver, method, None)
@@ -70,9 +77,9 @@ class Foreign(Solver):
         wrong = (
             "" if kept else f"made of the impulse an array of shape {handed.shape} and dtype {handed.dtype}"
         )
-        return self._checked(claim, wrong, len(impulse))
+        return self._checked(claim, wrong, len(impulse), max_iter)
 
-    def _checked(self, claim: Any, wrong: str, m: int) -> Claim:
+    def _checked(self, claim: Any, wrong: str, m: int, max_iter: int) -> Claim:
         """The claim with every field checked, or a NUMERICAL_ERROR that says what is wrong."""
         if type(claim) is not Claim:
             wrong = wrong or f"returned a {type(claim).__name__} ({claim!r:.60}); a lavender.Claim is needed"
@@ -84,6 +91,8 @@ class Foreign(Solver):
             wrong = wrong or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
         elif not _counts(claim.iterations):
             wrong = wrong or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
+        elif iterations > max_iter:
+            wrong = wrong or f"claims {iterations} iterations, where {max_iter} were asked for at most"
         elif not isinstance(work, Mapping) or not all(
             isinstance(k, str) and _counts(n) for k, n in work.items()
         ):

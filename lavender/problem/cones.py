@@ -521,6 +521,10 @@ class Cones:
             return NotImplemented
         return Cones._joined((self, other))
 
+    def __radd__(self, other: object) -> Cones:
+        """What `sum` begins with is 0."""
+        return self if other == 0 else NotImplemented
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Cones):
             return NotImplemented

@@ -93,10 +93,10 @@ class QPSolution:
     tol: float = 1e-6
 
     def __str__(self) -> str:
+        if self.ray is not None:
+            return f"unbounded: the objective falls for ever along ray; at x it is {self.objective:.6g}"
         how = "" if self.solution is None else f"{self.solution.status.name}, "
-        words = (
-            "unbounded" if self.ray is not None else "solved" if self.found else f"not solved to {self.tol:g}"
-        )
+        words = "solved" if self.found else f"not solved to {self.tol:g}"
         return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
 
     @cached_property

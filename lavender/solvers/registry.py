@@ -17,7 +17,7 @@ from typing import Any, Protocol
 
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
-from lavender.base.errors import InputError, SolverUnavailable, UnknownName
+from lavender.base.errors import InputError, SolverUnavailable, UnknownName, last_words
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -250,11 +250,22 @@ class SolverSpec:
         return other if bounds else None
 
     def load(self) -> Callable[..., Solver]:
-        """The factory, imported now if it was not before."""
+        """The factory, imported now if it was not before.
+
+        Raises
+        ------
+        SolverUnavailable
+            There is none where the spec says.
+        """
         if not isinstance(self.factory, str):
             return self.factory
         module, _, attribute = self.factory.partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        try:
+            return getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise SolverUnavailable(
+                f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
+            ) from error
 
 
 def _way_round(law: str, laws: frozenset[str]) -> str:

@@ -45,7 +45,8 @@ class Plan:
             lines.append(f"first one compiled call: {self.small}")
         lines.append(f"newton is counted to take {words(self.newton)}, a sweep {words(self.sweep)}")
         for stage in self.stages:
-            most = f"up to {stage.iterations:.3g} iterations" if stage.iterations < 1e9 else "to its end"
+            count = f"{max(1.0, round(stage.iterations)):.3g}"
+            most = f"up to {count} iterations" if stage.iterations < 1e9 else "to its end"
             lines.append(f"  {stage.solver:<23}{most:<26}{stage.why}")
         told = ", ".join(self.in_turn)
         lines.append(f"then {told} in turn with doubled work, and a certificate that there is no solution")

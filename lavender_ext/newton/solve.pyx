@@ -79,7 +79,7 @@ cdef void call_solve(void* at, int32_t augmented, double* x) noexcept with gil:
         found = self.others.solve(augmented, np.asarray(view))
         view[:] = found
     except BaseException as error:
-        self.raised = error
+        self.raised = self.raised or error              # the first one, of which this may come
         self.n.stop = 1
         view[:] = np.nan
 

@@ -234,6 +234,7 @@ def test_an_empty_row_that_nothing_fulfils_is_infeasible_and_one_that_asks_nothi
 def test_an_unbounded_program_has_a_ray(hessian, q, rows):
     answer = lv.solve_qp(lv.Problem.from_qp(hessian, q, **rows))
     assert not answer.found
+    assert str(answer).startswith("unbounded: the objective falls for ever")
     d = answer.ray
     assert np.abs(d).max() == 1.0
     np.testing.assert_allclose(hessian @ d, 0.0, atol=1e-6)

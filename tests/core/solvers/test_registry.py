@@ -55,6 +55,27 @@ def test_a_missing_package_is_named_with_what_installs_it():
     assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
 
 
+def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register):
+    for factory in ("no_such_module_1:Solver", "math:Solver"):
+        register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
+        with pytest.raises(
+            lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"
+        ):
+            lv.solve(TINY, "absent")
+    half = type("Half", (), {"prepare": lambda self, problem: problem})
+    register(lv.SolverSpec("half", half, {"lcp"}, summary="of a test"))
+    with pytest.raises(lv.InputError, match="made a Half without run"):
+        lv.solve(TINY, "half")
+
+
+def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
+    solution = lv.solve(TINY, name, max_iter=5)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "claims 7 iterations, where 5 were asked for at most" in solution.message
+    assert lv.solve(TINY, name, max_iter=7).iterations == 7
+
+
 def test_a_refusal_names_the_way_round():
     contact = lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5])
     lcp_only = dataclasses.replace(SPEC, laws=frozenset({"linear", "lcp"}))
