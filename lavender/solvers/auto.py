@@ -2,13 +2,14 @@
 
     the start is a solution     nothing is done
     a small problem             at most 64 rows, or small islands under friction, or velocities that cost less than 100
-                                sweeps: one compiled call (`small.py`); if that does not solve it, as any other
+                                sweeps, but not many contacts of bodies: one compiled call (`small.py`); if that does
+                                not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
                                 where 100 cost less than it; of a matrix each contact is solved exactly
-    a loose pile                under Coulomb's law, of bodies that do not roll or few entries of A: for as much again,
-                                sweeps of a conjugate gradient (`nncg`), the first under the cone law
+    a loose pile                under Coulomb's law, PILE contacts or more, of bodies that do not roll or few entries of
+                                A: for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
@@ -57,7 +58,7 @@ LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any 
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
-PILE = 200  # blocks of J and M, below which sweeps under Coulomb's law alone end sooner
+PILE = 130  # blocks, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
 SHORT = 3.0 * SURE  # times the counted cost, below which a limit may be short
@@ -193,12 +194,12 @@ class Tree:
         of few entries of A: sweeps then decide what sticks.
         """
         p = self.problem
-        if self.law != "coulomb" or p.cones.has_more_parts:
+        if self.law != "coulomb" or p.cones.has_more_parts or p.n_blocks < PILE:
             return False
         if p.matrix is not None:
             return len(p._compressed[1]) < SPARSE * p.m**2
         if p.rows is None:
-            return p.n_blocks >= PILE and 4 * graph.tree_pairs(p.derived.view) > 3 * p.n_blocks
+            return 4 * graph.tree_pairs(p.derived.view) > 3 * p.n_blocks
         pairs = graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) if p.rows.n_bodies else 0
         return 4 * pairs > 3 * p.n_blocks
 

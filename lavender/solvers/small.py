@@ -43,6 +43,7 @@ QUARTER = 0.25  # of the time left, that islands may take
 SPLIT = 200.0  # ns for each row of what tells islands apart
 TREE = 2e5  # ns, Python's share of two lines of the tree, which one compiled call does without
 SHARED = 10.0  # rows for each velocity, from which N is full and small beside what it is made of
+COLUMNS = 12.0  # velocities of two bodies
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
@@ -51,7 +52,7 @@ def limits(sweeps: float, most: float = MOST) -> Limits:
     count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"]
-    rows = SMALL_ROWS, DENSE_ROWS, SHARED
+    rows = SMALL_ROWS, DENSE_ROWS, SHARED, COLUMNS
     return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most, *rows]))
 
 

@@ -45,8 +45,9 @@ class Plan:
             lines.append(f"first one compiled call: {self.small}")
         lines.append(f"newton is counted to take {words(self.newton)}, a sweep {words(self.sweep)}")
         for stage in self.stages:
-            count = f"{max(1.0, round(stage.iterations)):.3g}"
-            most = f"up to {count} iterations" if stage.iterations < 1e9 else "to its end"
+            most = "to its end"
+            if stage.iterations < 1e9:
+                most = f"up to {max(1.0, float(round(stage.iterations))):.3g} iterations"
             lines.append(f"  {stage.solver:<23}{most:<26}{stage.why}")
         told = ", ".join(self.in_turn)
         lines.append(f"then {told} in turn with doubled work, and a certificate that there is no solution")

@@ -28,7 +28,8 @@ cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double most                 # what all may cost to be asked at all
     double coulomb_rows         # of an island beyond which it is not under Coulomb's law,
     double cone_rows            # and where a contact of the cone law is rigid,
-    double dense                # unless so many rows share a velocity
+    double dense                # unless so many rows share a velocity,
+    double columns              # or a row reaches more of them: else they may be those of bodies (`graph.bodies_in`)
 
 
 cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
@@ -61,12 +62,21 @@ cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limi
     return count * step_cost(p, g, l, work)
 
 
+cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogil:
+    """Does no row reach more velocities?"""
+    cdef int32_t b
+    for b in range(g.n_panels):
+        if g.pcol[b + 1] - g.pcol[b] > columns:
+            return False
+    return True
+
+
 cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands) noexcept nogil:
     """What it may cost [ns], 0 where it is not asked: with a rigid row as much as sweeps, which may do with less."""
     cdef bint rubs = has_friction(p), soft = is_soft(p, g)
     cdef double each = l.sweep_cone if p.law != COULOMB and rubs else l.entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
     cdef double most = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows
-    if rubs and islands * most < p.n_rows < l.dense * g.n:
+    if rubs and islands * most < p.n_rows < l.dense * g.n and are_short(g, l.columns):
         return 0.0
     return l.most if soft else min(l.most, l.start + l.sweeps * sweep)

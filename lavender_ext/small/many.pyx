@@ -216,7 +216,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (16,)."""
+    """Of the numbers of a `limits_t` (17,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):
