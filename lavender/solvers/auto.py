@@ -8,8 +8,8 @@
                                 factorisations that `newton` is counted for
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
                                 where 100 cost less than it; of a matrix each contact is solved exactly
-    a loose pile                under Coulomb's law, PILE contacts or more, of bodies that do not roll or few entries of
-                                A: for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
+    a loose pile                PILE contacts or more under Coulomb's law that do not roll, nearly each of another pair:
+                                for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
@@ -58,7 +58,7 @@ LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any 
 FEW = 32.0  # sweeps before a factor that may fill
 SPARSE = 0.05  # share of entries, below which A is sparse
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
-PILE = 130  # blocks, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
+PILE = 130  # contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
 SHORT = 3.0 * SURE  # times the counted cost, below which a limit may be short
@@ -190,14 +190,20 @@ class Tree:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Blocks under Coulomb's law that do not roll, nearly each between another pair of bodies or of trees of M, or
-        of few entries of A: sweeps then decide what sticks.
+        """Contacts under Coulomb's law that do not roll, nearly each between another pair of bodies or of trees of M:
+        sweeps then decide what sticks.
         """
         p = self.problem
-        if self.law != "coulomb" or p.cones.has_more_parts or p.n_blocks < PILE:
+        if self.law != "coulomb" or p.cones.has_more_parts or np.count_nonzero(p.cones.is_contact) < PILE:
             return False
-        if p.matrix is not None:
-            return len(p._compressed[1]) < SPARSE * p.m**2
+        if p.matrix is not None:  # blocks between the same two bodies share the columns of A
+            indptr, indices, _ = p._compressed
+            summed = np.concatenate([[0], np.cumsum(indices, dtype=np.int64)])
+            rows = p.cones.ptr[:-1]
+            columns = np.stack(
+                [indptr[rows + 1] - indptr[rows], summed[indptr[rows + 1]] - summed[indptr[rows]]]
+            )
+            return 4 * np.unique(columns, axis=1).shape[1] > 3 * p.n_blocks
         if p.rows is None:
             return 4 * graph.tree_pairs(p.derived.view) > 3 * p.n_blocks
         pairs = graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) if p.rows.n_bodies else 0
