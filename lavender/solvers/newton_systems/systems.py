@@ -42,13 +42,11 @@ def is_dense(nnz: float, m: int, cones: bool) -> bool:
 
 
 class Bodies(NamedTuple):
-    """Between which bodies blocks stand."""
+    """Between which bodies blocks stand; of J and M, which velocities are those of a body."""
 
     pair: IntArray  # (n_blocks, 2), -1 where there is none
     n: int
-    column: IntArray | None = (
-        None  # (nv,) of J and M: six times the body of each velocity, and its place there
-    )
+    column: IntArray | None = None  # (nv,) six times the body of each velocity, and its place there
 
 
 def bodies_of(problem: Problem) -> Bodies | None:
