@@ -148,6 +148,8 @@ def decide_empty_rows(problem: Problem, impulse: FloatArray, tol: float) -> tupl
         return None
     # What is behind a normal is bounded by its impulse.
     asks = empty[(problem.b[empty] != 0.0) & ~cones.friction_rows[empty]]
+    if problem.law == "cone":  # a normal that separates bears friction of a contact that slides
+        asks = asks[(problem.b[asks] > 0.0) | ~np.append(cones.friction_rows, False)[asks + 1]]
     if not len(asks):
         return None
     for i in np.setdiff1d(asks, problem.vanished_rows).tolist():

@@ -17,7 +17,7 @@ from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
-from lavender_ext.core.parts cimport blocks_t, is_rows
+from lavender_ext.core.parts cimport CONE, blocks_t, is_rows
 from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
@@ -119,6 +119,8 @@ cdef inline bint settle_empty_rows(const job_t* j, double tol) noexcept nogil:
                     return False
             if p.b[k] == 0.0 or (not is_rows(p, i) and k > p.ptr[i]):
                 continue                                # asks nothing: tangents and spin have bounds of mu lambda_n
+            if p.b[k] < 0.0 and p.law == CONE and not is_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
+                continue                                # a normal that separates bears friction of a contact that slides
             bound = p.upper[k] if p.b[k] > 0.0 else p.lower[k]
             if fabs(bound) < INFINITY:
                 j.lam[k] = bound

@@ -305,6 +305,26 @@ def test_a_solution_given_back_is_kept(name):
             assert again.iterations == 0
 
 
+@pytest.mark.parametrize("form", ["A", "J and M"])
+@pytest.mark.parametrize("name", lv.available(law="cone", impulse=True, external=False))
+def test_a_normal_that_moves_nothing_bears_friction_of_the_relaxed_law(name, form):
+    """Its row of A is zero, and it separates as it slides: w_n = mu |w_t| > 0 beside lambda_n > 0."""
+    b, impulse = [-0.5, 2.0, 0.0], np.array([2.0, 1.0, 0.0])  # w = (0.5, -1, 0) m/s
+    if form == "A":
+        problem = lv.Problem.contact(np.diag([0.0, 1.0, 1.0]), b, [0.5], friction="cone")
+    else:
+        problem = lv.Problem.from_jacobian(
+            np.eye(3)[:, 1:], np.eye(2), [0, 0], target=b, cones=lv.Cones.contacts([0.5]), friction="cone"
+        )
+        if registry.get(name).refuses(problem) is not None:
+            pytest.skip("takes no J and M")
+    kept = lv.solve(problem, name, tol=1e-9, impulse=impulse)
+    assert (kept.status, kept.iterations) == (lv.Status.CONVERGED, 0)
+    assert kept.impulse.tolist() == impulse.tolist()
+    cold = lv.solve(problem, name, tol=1e-9)
+    assert cold.success, cold
+
+
 @pytest.mark.parametrize("name", lv.available(impulse=True, resumable=True))
 def test_a_warm_start_is_used_and_not_modified(name):
     for problem in examples(registry.get(name)):
