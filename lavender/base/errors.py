@@ -84,8 +84,8 @@ BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, MemoryError, TooLarge)
 
 
 def last_words(error: BaseException) -> str:
-    """Its class and what it says."""
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
+    """Its class and what it says, on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".removesuffix(": ").split())
 
 
 class SolveFailed(LavenderError):

@@ -115,6 +115,7 @@ class Foreign(Solver):
             work={k: int(n) for k, n in work.items()},
             dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
             certificate=certificate,
+            message=" ".join(claim.message.split()),
             turns=(),
         )
 

@@ -126,7 +126,7 @@ class SolverSpec:
     Raises
     ------
     InputError
-        A law or operator that does not exist, an empty name.
+        A law or operator that does not exist, an empty name or none.
     """
 
     name: str
@@ -165,9 +165,10 @@ class SolverSpec:
     own = False  # of this package; other solvers get copies, and what they return is checked (`external/foreign.py`)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
         if (
-            not self.name
-            or not set(self.laws) <= set(LAWS)
+            not set(self.laws) <= set(LAWS)
             or not self.laws
             or not set(self.operators) <= set(OPERATORS)
             or not set(self.boxes) <= {"coulomb", "cone"}
@@ -241,7 +242,14 @@ class SolverSpec:
                 "takes no contacts that resist what rolls: use one of those that do, lavender.available(problem) lists "
                 "them, or leave the rows that roll out"
             )
-        return self.refusal(problem) if self.refusal is not None else None
+        if self.refusal is None:
+            return None
+        try:
+            return self.refusal(problem) or None
+        except Exception as error:
+            if self.own:
+                raise
+            return f"cannot say whether it takes the problem: {last_words(error)}"
 
     def standing_in(self, problem: Problem) -> SolverSpec | None:
         """The same method with bounds, where a problem's bounds are what this one refuses; else None."""
@@ -262,7 +270,7 @@ class SolverSpec:
         module, _, attribute = self.factory.partition(":")
         try:
             return getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
+        except Exception as error:
             raise SolverUnavailable(
                 f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
             ) from error

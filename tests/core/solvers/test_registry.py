@@ -25,15 +25,16 @@ def named(name, **more):
     "wrong",
     [
         {"name": ""},
+        {"name": 3},
         {"laws": frozenset()},
         {"laws": frozenset({"lcp", "lpc"})},
         {"operators": frozenset({"rows", "tensor"})},
         {"operators": frozenset()},
     ],
-    ids=["no name", "no law", "unknown law", "unknown operator", "no operator"],
+    ids=["no name", "no text as a name", "no law", "unknown law", "unknown operator", "no operator"],
 )
 def test_a_spec_that_makes_no_sense_is_refused(wrong):
-    with pytest.raises(lv.InputError, match=r"laws|operators"):
+    with pytest.raises(lv.InputError, match=r"laws|operators|name"):
         dataclasses.replace(SPEC, **wrong)
 
 
@@ -55,17 +56,42 @@ def test_a_missing_package_is_named_with_what_installs_it():
     assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
 
 
-def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register):
+def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
         with pytest.raises(
             lv.errors.SolverUnavailable, match=f"'absent' cannot be imported from '{factory}'"
         ):
             lv.solve(TINY, "absent")
+    broken = tmp_path / "broken_module_1.py"
+    broken.write_text("raise RuntimeError('needs a licence')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register(lv.SolverSpec("absent", "broken_module_1:Solver", {"lcp"}, summary="of a test"), replace=True)
+    with pytest.raises(lv.errors.SolverUnavailable, match="RuntimeError: needs a licence"):
+        lv.solve(TINY, "absent")
     half = type("Half", (), {"prepare": lambda self, problem: problem})
     register(lv.SolverSpec("half", half, {"lcp"}, summary="of a test"))
     with pytest.raises(lv.InputError, match="made a Half without run"):
         lv.solve(TINY, "half")
+
+
+def test_a_refusal_that_raises_refuses_for_its_own_solver_alone(register):
+    register(named("unsure", refusal=lambda problem: 1 / 0))
+    register(named("sure", refusal=lambda problem: False))
+    reason = "cannot say whether it takes the problem: ZeroDivisionError: division by zero"
+    assert (lv.known(TINY)["unsure"], lv.known(TINY)["sure"]) == (reason, None)
+    with pytest.raises(lv.CapabilityError, match="ZeroDivisionError"):
+        lv.solve(TINY, "unsure")
+
+
+def test_what_a_plug_in_says_stands_on_one_line(plug_in):
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {}, "two\nlines"))
+    assert lv.solve(TINY, name).message == "two lines"
+
+    def fails(problem, impulse):
+        raise ArithmeticError("two\nlines")
+
+    assert lv.solve(TINY, plug_in(fails)).message == "ArithmeticError: two lines"
 
 
 def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
