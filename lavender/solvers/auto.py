@@ -5,9 +5,11 @@
                                 sweeps, but not many contacts of bodies: one compiled call (`small.py`); if that does
                                 not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
-                                factorisations that `newton` is counted for
+                                factorisations that `newton` is counted for; as long, but after sweeps, bounded rows
+                                whose factor is dense
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
-                                where 100 cost less than it; of a matrix each contact is solved exactly
+                                and, but for a matrix, cones where 150 cost less than it; of a matrix each contact is
+                                solved exactly
     a loose pile                PILE contacts or more under Coulomb's law that do not roll, nearly each of another pair:
                                 for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
@@ -56,7 +58,8 @@ LAST = 200.0  # times Newton's counted cost, that all have together
 LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
 LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any case
 FEW = 32.0  # sweeps before a factor that may fill
-SPARSE = 0.05  # share of entries, below which A is sparse
+MANY = 150.0  # sweeps before Newton's method on linear rows and cones: only where these cost less
+SPARSE, DENSE = 0.05, 0.5  # shares of entries, below which A is sparse, and above which it is dense
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
 PILE = 130  # contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
@@ -184,6 +187,16 @@ class Tree:
         return max(p.bandwidth) <= min(BAND, p.m // 4) and bool(p.is_symmetric)
 
     @property
+    def is_dense(self) -> bool:
+        """Bounded rows of a matrix of most entries, or of an unsymmetric one that is not sparse: `direct` factors only
+        rows that are free.
+        """
+        p = self.problem
+        if p.matrix is None or self.law != "lcp":
+            return False
+        return len(p._compressed[1]) > (DENSE if p.is_symmetric else SPARSE) * p.m**2
+
+    @property
     def is_program(self) -> bool:
         """Rows of a program whose own velocities tell sooner that there is no solution."""
         return self.problem.qp is not None and self.problem.matrix is not None
@@ -216,12 +229,13 @@ class Tree:
                 yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
         if not self.is_short(self.least) and self.is_narrow:
-            why = f"bounded rows of a narrow band: {ROUNDS:g} times newton's factorisations"
-            yield Stage("direct", ROUNDS * costs.factorisations(self.law), self.least, why)
+            yield self.rounds(self.least, "bounded rows of a narrow band")
         # Fill is most of what J and M cost, and only an analysis tells it: they are swept as long as is usual before.
         usual = self.problem.generalized is not None and self.law == "coulomb"
         yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep if usual else 0.0))
         yield from self.sweeps_first(self.newton)
+        if self.is_dense:
+            yield self.rounds(self.newton, "a dense factor, of the rows that are free")
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
             if not (self.tried and self.law == "lcp"):
                 yield from self.factorisations(SURE)
@@ -256,13 +270,20 @@ class Tree:
             why = f"{share:.3g} times its counted cost of {words(state.cost)}"
             yield Stage(name, share * state.steps, share * state.cost, why)
 
+    def rounds(self, cost: float, why: str) -> Stage:
+        """Of `direct`, so many times what Newton's method is counted for."""
+        why = f"{why}: {ROUNDS:g} times newton's factorisations"
+        return Stage("direct", ROUNDS * costs.factorisations(self.law), cost, why)
+
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for."""
         short = self.is_short(newton)
         cost = (self.half if short else newton) - self.begun
         if short and self.is_loose:
             cost *= 0.5  # nncg has the other half
-        pays = short or self.law != "linear" or costs.SWEEPS * self.sweep <= newton
+        # Newton's method then takes what it is counted for.
+        sure = self.law == "linear" or (self.law == "cone" and self.problem.matrix is None)
+        pays = short or not sure or MANY * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             why = f"{words(cost)} of what newton costs"

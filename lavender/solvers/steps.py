@@ -36,6 +36,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 FIRST = 32  # sweeps before the first prediction of their remaining number
 MOST = 2**30  # iterations of one call
+NEAR = 0.02  # relative residual, up to which Newton's method under friction begins from another's impulse
 PROBE = 0.5  # share of the time left that iterations of unknown pace may take
 AT_MOST = 4.0  # times its count, that a sweep takes: of blocks that are solved exactly
 FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
@@ -94,7 +95,9 @@ class Step:
 
 
 class Newton(Step):
-    """From the state whose factor was counted; if it ends in vain, once more from doing nothing."""
+    """From the state whose factor was counted; from doing nothing under friction of which sweeps left much, and once
+    more if it ends in vain.
+    """
 
     anew = lost = False
 
@@ -108,7 +111,8 @@ class Newton(Step):
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.state.begun:
-            self.impulse = log.problem.start() if self.anew else log.impulse.copy()
+            far = log.best > NEAR and log.problem.law in ("coulomb", "cone")
+            self.impulse = log.problem.start() if self.anew or far else log.impulse.copy()
             self.anew = not (self.impulse - log.problem.start()).any()
         claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
         self.lost = claim.status is Status.STALLED

@@ -18,7 +18,7 @@ from lavender.solvers import costs
 from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.steps import METHODS, Iterations, Newton, Step, Sweeps
+from lavender.solvers.steps import METHODS, NEAR, Iterations, Newton, Step, Sweeps
 from lavender_ext.small import checked_sweeps
 
 
@@ -50,12 +50,17 @@ FIRST = {
     "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
     "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
+    "bounded rows of a dense matrix": (lambda: random_lcp(0, m=80), ["anderson", "anderson", "direct", "newton"]),
     "the cone law": (
-        lambda: suite.granular(n=4, friction="coulomb").problem.relaxed("cone"),
-        ["anderson", "anderson", "newton", "newton"],
+        lambda: suite.granular(n=6, friction="coulomb").problem.relaxed("cone"),
+        ["anderson", "newton", "newton", "admm", "anderson"],
     ),
-    "the cone law, 100 sweeps cost more than newton": (
+    "the cone law, 150 sweeps cost more than newton": (
         lambda: suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone"),
+        ["newton", "newton", "admm", "anderson"],
+    ),
+    "the cone law, a matrix": (
+        lambda: as_matrix(suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone")),
         ["anderson", "anderson", "newton", "newton", "admm", "anderson"],
     ),
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
@@ -230,6 +235,19 @@ def test_a_step_in_parts_is_the_step_at_once(kind):
                 step.run(n)
         got.append(log.best)
     assert max(got) < 1e-2, got
+
+
+@pytest.mark.parametrize("sweeps, from_nothing", [(2, True), (200, False)])
+def test_newton_under_friction_begins_from_nothing_where_much_is_left(sweeps, from_nothing):
+    problem = suite.pyramid(k=4, friction="coulomb").problem
+    reference(problem)
+    log = SolveLog(problem, 1e-13, 10**6)
+    log.offer(lv.solve(problem, "anderson", max_iter=sweeps, tol=1e-13).impulse)
+    assert (log.best > NEAR) == from_nothing
+    step = Newton("newton", log)
+    step.state = Tree(problem).states["newton"]
+    step.run(1)
+    assert step.anew == from_nothing
 
 
 def test_sweeps_that_promise_little_give_way():
