@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError, UnknownName
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
+from lavender.solvers.sweeping import Sweeping, SweepState, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated
 from lavender_ext.core.order import SYMMETRIC
 
@@ -77,20 +76,11 @@ class Accelerated(Sweeping):
         convex = self.convex if problem.law == "coulomb" else 0
         return AcceleratedState(problem, operator(problem), order, exact, self._memory, convex, self._keeps)
 
-    def run(
-        self,
-        state: AcceleratedState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        """`max_iter` iterations, or fewer where a check ends them."""
-        status, done, restarts = state.sweeps.run(state.watch, impulse, max_iter, tol)
-        work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": restarts}
+    def _told(self, state: AcceleratedState, claim: Claim, again: int) -> Claim:
+        done = claim.iterations
+        work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": again}
         sweep = "blocks" if state.exact else "pgs"
-        form = f"{sweep} on {over(state.data)}"
-        return replace(claim(status, done), work=work, form=form)
+        return replace(claim, work=work, form=f"{sweep} on {over(state.data)}")
 
 
 def operator(problem: Problem) -> Any:

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
 from lavender.solvers.registry import SolverSpec
 from lavender.solvers.setup_times import forming
-from lavender.solvers.sweeping import Sweeping, SweepState, claim, over, plan_of, reads_whitened, swept
+from lavender.solvers.sweeping import Sweeping, SweepState, over, plan_of, reads_whitened, swept
 from lavender_ext.sweep import serial
 
 
@@ -34,17 +33,8 @@ class BlockGaussSeidel(Sweeping):
         data = swept(problem)
         return SweepState(problem, data, order, serial.Sweeps(data, *plan_of(order), exact=True))
 
-    def run(
-        self,
-        state: SweepState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        status, done, fallbacks = state.sweeps.run(state.watch, impulse, max_iter, tol)
-        work = {"sweeps": done, "fallbacks": fallbacks}
-        return replace(claim(status, done), work=work, form=over(state.data))
+    def _told(self, state: SweepState, claim: Claim, again: int) -> Claim:
+        return replace(claim, work={**claim.work, "fallbacks": again}, form=over(state.data))
 
 
 SPEC = SolverSpec(

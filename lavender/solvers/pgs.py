@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
 from lavender.problem.ordering import Order
@@ -25,6 +24,7 @@ from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import (
     SweepState,
     Threaded,
+    over,
     plan_of,
     reads_whitened,
 )
@@ -37,16 +37,8 @@ _NONE = np.empty(0, np.int32)
 class PGS(Threaded):
     """Projected Gauss-Seidel; `order`, `ground`, `seed` as in `lavender.problem.ordering`; `threads` with "colored"."""
 
-    def run(
-        self,
-        state: SweepState,
-        impulse: FloatArray,
-        max_iter: int,
-        tol: float,
-        time_limit: float | None = None,
-    ) -> Claim:
-        claim = super().run(state, impulse, max_iter, tol)
-        return replace(claim, form="whitened J") if state.data.is_general else claim
+    def _told(self, state: SweepState, claim: Claim, again: int) -> Claim:
+        return replace(claim, form=over(state.data)) if state.data.is_general else claim
 
     def _forming(self, problem: Problem) -> float:
         return 0.0 if reads_whitened(problem) else forming(problem)

@@ -140,7 +140,12 @@ class Swept(Solver):
         time_limit: float | None = None,
     ) -> Claim:
         """`max_iter` sweeps in one call of the kernel, or fewer where a check ends them; tol = 0 checks nothing."""
-        return claim(*state.sweeps.run(state.watch, impulse, max_iter, tol)[:2])
+        status, done, again = state.sweeps.run(state.watch, impulse, max_iter, tol)
+        return self._told(state, claim(status, done), again)
+
+    def _told(self, state: Any, claim: Claim, again: int) -> Claim:
+        """The claim with what else is to tell: `again` counts fallbacks of exact blocks, or restarts."""
+        return claim
 
 
 @dataclass(frozen=True)
