@@ -97,37 +97,6 @@ cdef public int32_t lav_tree_components(int32_t k, const int32_t* ptr, const gen
     return number(k, parent, label)
 
 
-cdef public int32_t lav_body_pairs(int32_t k, const int32_t* body, int32_t n_bodies, int32_t still, int32_t* first,
-                                   int32_t* mark, int32_t* following) noexcept nogil:
-    """Pairs of bodies with a block between them; those with a static one count where `still` is not 0.
-
-    first, mark (n_bodies + 1) and following (k) are scratch.
-    """
-    cdef int32_t i, b, low, high, count = 0
-    for b in range(n_bodies + 1):
-        first[b] = -1
-        mark[b] = -1
-    for i in range(k):
-        low = body[2 * i]
-        high = body[2 * i + 1]
-        if high < low:
-            low = high
-        following[i] = first[low + 1]                   # a list of the blocks of each lower body
-        first[low + 1] = i
-    for b in range(0 if still else 1, n_bodies + 1):
-        i = first[b]
-        while i >= 0:
-            low = body[2 * i]
-            high = body[2 * i + 1]
-            if high < low:
-                high = low
-            if mark[high + 1] != b:
-                mark[high + 1] = b
-                count += 1
-            i = following[i]
-    return count
-
-
 def least_degree(const int32_t[::1] ptr, const int32_t[::1] near):
     """(n,) vertices in their order of elimination; near[ptr[i]:ptr[i + 1]] are the neighbours of i, without i."""
     cdef int32_t n = <int32_t>ptr.shape[0] - 1, all_ = <int32_t>near.shape[0]
@@ -180,12 +149,22 @@ def tree_components(Data p):
 
 def body_pairs(const int32_t[:, ::1] body, int n_bodies, bint still):
     """Pairs of bodies with a block between them, of blocks between bodies (k, 2); with a static one where `still`."""
-    cdef int32_t k = <int32_t>body.shape[0], count = 0
-    cdef int32_t[::1] scratch = np.empty(2 * n_bodies + k + 2, np.int32)
-    if k:
-        with nogil:
-            count = lav_body_pairs(k, &body[0, 0], n_bodies, still, &scratch[0], &scratch[n_bodies + 1],
-                                   &scratch[2 * n_bodies + 2])
+    cdef int32_t k = <int32_t>body.shape[0], i, b, low, high, count = 0
+    cdef int32_t[::1] first = np.full(n_bodies + 1, -1, np.int32), mark = np.full(n_bodies + 1, -1, np.int32)
+    cdef int32_t[::1] following = np.empty(k, np.int32)
+    with nogil:
+        for i in range(k):
+            low = min(body[i, 0], body[i, 1])
+            following[i] = first[low + 1]               # a list of the blocks of each lower body
+            first[low + 1] = i
+        for b in range(0 if still else 1, n_bodies + 1):
+            i = first[b]
+            while i >= 0:
+                high = max(body[i, 0], body[i, 1])
+                if mark[high + 1] != b:
+                    mark[high + 1] = b
+                    count += 1
+                i = following[i]
     return count
 
 

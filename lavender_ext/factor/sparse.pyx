@@ -26,21 +26,6 @@ cdef enum:
     STRIP = 12                  # columns of a panel of L U that are finished together
 
 
-cdef public int32_t lav_is_mirrored(int32_t n, const int32_t* indptr, const int32_t* indices,
-                                    int32_t* cursor) noexcept nogil:
-    """1 where (i, j) is an entry wherever (j, i) is; columns ascend, cursor (n) is scratch."""
-    cdef int32_t i, j, q
-    for i in range(n):
-        cursor[i] = indptr[i]
-    for i in range(n):
-        for q in range(indptr[i], indptr[i + 1]):
-            j = indices[q]
-            if cursor[j] == indptr[j + 1] or indices[cursor[j]] != i:
-                return 0                                # rows are gone through in order: entry i of row j is next
-            cursor[j] += 1
-    return 1
-
-
 cdef inline int32_t lu_panel(const sparse_t* f, int32_t width, int32_t rows, double* a, double* u, int32_t* swap,
                              double tiny) noexcept nogil:
     """(1), (2) of one panel: columns a (rows, width) with L below, u (rows - width, width) beside; small pivots."""
@@ -219,11 +204,15 @@ def scan(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1
 
 def is_mirrored(const int32_t[::1] indptr, const int32_t[::1] indices):
     """Whether the pattern of a canonical CSR matrix is symmetric."""
-    cdef int32_t n = <int32_t>indptr.shape[0] - 1
-    cdef int32_t[::1] cursor = np.empty(n + 1, np.int32)
-    if n == 0 or indices.shape[0] == 0:
-        return True
-    return bool(lav_is_mirrored(n, &indptr[0], &indices[0], &cursor[0]))
+    cdef int32_t[::1] cursor = np.array(indptr)
+    cdef int32_t i, j, q
+    for i in range(indptr.shape[0] - 1):
+        for q in range(indptr[i], indptr[i + 1]):
+            j = indices[q]
+            if cursor[j] == indptr[j + 1] or indices[cursor[j]] != i:
+                return False                            # rows are gone through in order: entry i of row j is next
+            cursor[j] += 1
+    return True
 
 
 def free_part(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data,

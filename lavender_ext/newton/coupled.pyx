@@ -12,25 +12,6 @@ from lavender_ext.newton.elements cimport elements_t
 from lavender_ext.newton.solve cimport Solve
 
 
-cdef public int32_t lav_element_graph(int32_t n, const int32_t* ptr, const int32_t* element, const int32_t* indptr,
-                                      const int32_t* indices, int32_t* mark, int32_t* to, int32_t* other) noexcept nogil:
-    """Which elements an element's rows of A reach: (to, other) as compressed rows, other as long as A's indices."""
-    cdef int32_t i, j, q, k, count = 0
-    for i in range(n):
-        mark[i] = -1
-    for i in range(n):
-        to[i] = count
-        for j in range(ptr[i], ptr[i + 1]):
-            for q in range(indptr[j], indptr[j + 1]):
-                k = element[indices[q]]
-                if mark[k] != i:
-                    mark[k] = i
-                    other[count] = k
-                    count += 1
-    to[n] = count
-    return count
-
-
 cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* to, const int32_t* other,
                                   int32_t* indptr, int32_t* indices) noexcept nogil:
     """Compressed rows of the graph (to, other) of n elements, each with itself, ascending; indices NULL: indptr alone."""
@@ -48,19 +29,6 @@ cdef public void lav_coupled_rows(int32_t n, const int32_t* ptr, const int32_t* 
                     for j in range(ptr[other[q]], ptr[other[q] + 1]):
                         indices[at] = j
                         at += 1
-
-
-cdef public void lav_coupled_entries(int32_t m, const int32_t* aptr, const int32_t* aind, const double* a,
-                                     const int32_t* indptr, const int32_t* indices, double* out) noexcept nogil:
-    """A, whose columns ascend, on a pattern of its rows that holds its own."""
-    cdef int32_t i, p, q
-    for i in range(m):
-        q = aptr[i]
-        for p in range(indptr[i], indptr[i + 1]):
-            out[p] = 0.0
-            if q < aptr[i + 1] and aind[q] == indices[p]:
-                out[p] = a[q]
-                q += 1
 
 
 cdef inline void coupled_block(const double* h, double* out, int32_t ld, const double* left, const double* right,
@@ -117,12 +85,20 @@ cdef public void lav_coupled(const elements_t* e, const int32_t* to, const int32
 
 def element_graph(const int32_t[::1] ptr, const int32_t[::1] element, const int32_t[::1] indptr,
                   const int32_t[::1] indices):
-    """(indptr, indices) of the graph of elements that A couples; A not empty."""
-    cdef int32_t n = <int32_t>ptr.shape[0] - 1, count
-    to_array, other_array = np.empty(n + 1, np.int32), np.empty(indices.shape[0] + 1, np.int32)
-    cdef int32_t[::1] mark = np.empty(n + 1, np.int32), to = to_array, other = other_array
+    """(indptr, indices) of the graph of elements that A couples: which of them an element's rows of A reach."""
+    cdef int32_t n = <int32_t>ptr.shape[0] - 1, i, j, q, k, count = 0
+    to_array, other_array = np.zeros(n + 1, np.int32), np.empty(indices.shape[0], np.int32)
+    cdef int32_t[::1] mark = np.full(n, -1, np.int32), to = to_array, other = other_array
     with nogil:
-        count = lav_element_graph(n, &ptr[0], &element[0], &indptr[0], &indices[0], &mark[0], &to[0], &other[0])
+        for i in range(n):
+            for j in range(ptr[i], ptr[i + 1]):
+                for q in range(indptr[j], indptr[j + 1]):
+                    k = element[indices[q]]
+                    if mark[k] != i:
+                        mark[k] = i
+                        other[count] = k
+                        count += 1
+            to[i + 1] = count
     return to_array, other_array[:count].copy()
 
 
@@ -154,11 +130,17 @@ def coupled_rows(const int32_t[::1] ptr, const int32_t[::1] to, const int32_t[::
 
 def coupled_entries(const int32_t[::1] aptr, const int32_t[::1] aind, const double[::1] a, const int32_t[::1] indptr,
                     const int32_t[::1] indices):
-    """A on the pattern of `coupled_rows`; A not empty."""
-    out_array = np.empty(indices.shape[0])
+    """A, whose columns ascend, on the pattern of `coupled_rows`, which holds its own."""
+    out_array = np.zeros(indices.shape[0])
     cdef double[::1] out = out_array
+    cdef int32_t i, p, q
     with nogil:
-        lav_coupled_entries(<int32_t>indptr.shape[0] - 1, &aptr[0], &aind[0], &a[0], &indptr[0], &indices[0], &out[0])
+        for i in range(indptr.shape[0] - 1):
+            q = aptr[i]
+            for p in range(indptr[i], indptr[i + 1]):
+                if q < aptr[i + 1] and aind[q] == indices[p]:
+                    out[p] = a[q]
+                    q += 1
     return out_array
 
 
