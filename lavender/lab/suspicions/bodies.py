@@ -238,12 +238,8 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
     if g is None or not 3 <= g.nv <= LARGE:
         return
     mass = g.mass.toarray()
-    inverse = np.linalg.inv(mass)
-    given, other = free_bodies(mass), free_bodies(inverse)
-    if len(other) and not len(given):
-        reason = "three velocities have one mass, uncoupled, in the inverse of M and not in M: was M^-1 given for M?"
-        yield suspect(p, "masses", reason, velocities=other)
-    elif (
+    given = free_bodies(mass)
+    if (
         p.m == g.nv
         and len(given)
         and not _orthogonal(p, g.jac, given)
@@ -255,12 +251,22 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
         yield suspect(p, "J transposed", reason)
     weight = np.abs(g.jac).max(axis=0).toarray().ravel() if p.m else np.zeros(g.nv)
     seen = weight > 0.0
-    if len(other) > len(given) or np.count_nonzero(seen) < 3:
-        return
-    spread = [np.ptp(np.log10(d[seen] / weight[seen] ** 2)) for d in (mass.diagonal(), inverse.diagonal())]
-    if spread[0] > 2.0 and spread[1] < 0.25 * spread[0]:
-        reason = f"effective masses of the velocities span 10^{spread[0]:.1f}, with the inverse of M 10^{spread[1]:.1f}"
-        yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=spread)
+
+    def spread(matrix: FloatArray) -> float:
+        return float(np.ptp(np.log10(matrix.diagonal()[seen] / weight[seen] ** 2)))
+
+    wide = spread(mass) if np.count_nonzero(seen) >= 3 else 0.0
+    if len(given) and not wide > 2.0:
+        return  # and no inverse is made
+    inverse = np.linalg.inv(mass)
+    other = free_bodies(inverse)
+    if len(other) and not len(given):
+        reason = "three velocities have one mass, uncoupled, in the inverse of M and not in M: was M^-1 given for M?"
+        yield suspect(p, "masses", reason, velocities=other)
+    narrow = spread(inverse) if wide > 2.0 else wide
+    if len(other) <= len(given) and narrow < 0.25 * wide:
+        reason = f"effective masses of the velocities span 10^{wide:.1f}, with the inverse of M 10^{narrow:.1f}"
+        yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
 
 
 def free_bodies(mass: FloatArray) -> list[int]:
