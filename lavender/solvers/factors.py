@@ -98,8 +98,8 @@ def permuted_band(problem: Problem, order: IntArray) -> int:
 class Factor(Protocol):
     """Factorisation of A_FF + shift D_FF for changing free sets."""
 
-    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
-        """Factor the rows with place >= 0, numbered in order of rows; how many pivots are not above tiny d."""
+    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
+        """Factor the rows with place >= 0, one at least, in order of rows; how many pivots are not above TINY d."""
         ...
 
     def solve(self, rhs: FloatArray) -> FloatArray:
@@ -114,25 +114,20 @@ class DenseFactor:
         self.a = problem.dense()
         self.d = problem.csr_data.d
 
-    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         free = np.flatnonzero(place >= 0)
         a = self.a.copy() if n_free == len(place) else self.a[np.ix_(free, free)]
         d = self.d[free]
         if shift > 0.0:
             a.flat[:: n_free + 1] += shift * d
-        if n_free == 0:
-            self.c = a
-            return 0
         # Row-major input read as column-major is the transpose: the same matrix, and no copy.
         self.c, info = lapack.dpotrf(a.T, lower=1, overwrite_a=1, clean=0)
         if info != 0:
             return n_free - info + 1
         pivot = np.diagonal(self.c)
-        return int(np.count_nonzero(pivot * pivot <= tiny * d))
+        return int(np.count_nonzero(pivot * pivot <= TINY * d))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        if len(rhs) == 0:
-            return rhs
         return lapack.dpotrs(self.c, rhs, lower=1)[0]
 
 
@@ -165,20 +160,17 @@ class SparseFactor:
         self.pattern = rows_of(mirrored(problem.csr))
         self.whole = Panels(*self.pattern[:2])
 
-    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
-        self.n = n_free
-        if n_free == 0:
-            return 0
+    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         indptr, indices, data = self.pattern
         if n_free == self.m:
             self.panels, d = self.whole.analysed(False), self.d
         else:
             indptr, indices, data = free_part(indptr, indices, data, place, n_free)
             self.panels, d = SparsePanels(indptr, indices, False, WIDE), self.d[place >= 0]
-        return self.panels.factor(data, d, shift, tiny)
+        return self.panels.factor(data, d, shift, TINY)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return self.panels.solve(rhs) if self.n else rhs
+        return self.panels.solve(rhs)
 
 
 def mirrored(matrix: sp.csr_array) -> sp.csr_array:
@@ -226,12 +218,10 @@ class LUFactor:
         if self.sparse:
             load("scipy.sparse.linalg")
 
-    def factor(self, place: IntArray, n_free: int, shift: float, tiny: float = TINY) -> int:
+    def factor(self, place: IntArray, n_free: int, shift: float) -> int:
         self.free = np.flatnonzero(place >= 0)
-        if n_free == 0:
-            return 0
         if self.sparse:
-            return self._factor_sparse(shift, tiny)
+            return self._factor_sparse(shift)
         a = self.a[np.ix_(self.free, self.free)]
         if shift > 0.0:
             a.flat[:: n_free + 1] += shift
@@ -239,18 +229,16 @@ class LUFactor:
         self.lu: Any = (lu, pivot)
         if info != 0:
             return n_free
-        return int(np.count_nonzero(~(np.abs(np.diagonal(lu)) > tiny)))
+        return int(np.count_nonzero(~(np.abs(np.diagonal(lu)) > TINY)))
 
-    def _factor_sparse(self, shift: float, tiny: float) -> int:
+    def _factor_sparse(self, shift: float) -> int:
         a = sp.csc_array(self.a[self.free][:, self.free])
         if shift > 0.0:
             a = sp.csc_array(a + shift * sp.eye_array(len(self.free)))
         self.lu, pivot = _superlu(a)
-        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > tiny)))
+        return len(self.free) if self.lu is None else int(np.count_nonzero(~(pivot > TINY)))
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        if len(rhs) == 0:
-            return rhs
         scale = self.scale[self.free]
         y = scale * rhs
         y = self.lu.solve(y) if self.sparse else lapack.dgetrs(*self.lu, y)[0]

@@ -38,7 +38,9 @@ class Timed:
         self.deadline = Deadline()
 
     def factor(self, place: IntArray, n_free: int, shift: float) -> int:
-        """As `Factor`; -1 if it was not begun."""
+        """As `Factor`, of no row too; -1 if it was not begun."""
+        if n_free == 0:
+            return 0
         if self.deadline.passed(self.seconds):
             return -1
         watch = Stopwatch()
