@@ -31,9 +31,11 @@ LANGUAGES = {
 }
 
 
-@pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("small", [[], ["-DLAV_SWEEPS_ONLY"]], ids=["full", "sweeps"])
-@pytest.mark.parametrize("name", ["gcc", "clang"])
+@pytest.mark.parametrize(
+    ("name", "language"),
+    [*(("gcc", language) for language in LANGUAGES), ("clang", "C99"), ("clang", "C++11")],
+)
 def test_no_warning_in_either_language(folder, tmp_path, name, small, language):
     command, quick = [name], ["-fsyntax-only"]
     if name == "clang" and shutil.which(name) is None:  # zig's compiler is clang's

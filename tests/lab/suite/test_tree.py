@@ -304,9 +304,9 @@ def test_sweeps_that_promise_far_more_than_is_left_end_before_their_time():
             now[0] -= 1e-2
             return now[0]
 
-        sweeps.within(problem.start(), 1.0, 10**5, 1e-6, 32, left, lambda: 5.0, 0.5, 1.0, checked)
+        sweeps.within(problem.start(), 1.0, 20_000, 1e-6, 32, left, lambda: 5.0, 0.5, 1.0, checked)
         done.append(sweeps.done)
-    assert 32 <= done[0] < 1000 and done[1] == 10**5
+    assert 32 <= done[0] < 1000 and done[1] == 20_000
 
 
 @pytest.mark.parametrize(
