@@ -265,7 +265,7 @@ def inverse(p: Problem) -> Iterator[Suspicion]:
         yield suspect(p, "masses", reason, velocities=other)
     narrow = spread(inverse) if wide > 2.0 else wide
     if len(other) <= len(given) and narrow < 0.25 * wide:
-        reason = f"effective masses of the velocities span 10^{wide:.1f}, with the inverse of M 10^{narrow:.1f}"
+        reason = f"effective masses of the velocities span 10^{wide:.1f}, those of M^-1 10^{narrow:.1f}"
         yield suspect(p, "masses", reason + ": was M^-1 given for M?", spread=[wide, narrow])
 
 
