@@ -36,6 +36,7 @@ from lavender.solvers.setup_times import (
     DENSE,
     EACH,
     LAID_OUT,
+    SCIPY,
     START,
     WHOLE,
     analysed,
@@ -240,10 +241,12 @@ class ADMM(Solver):
         if not 0.0 < self.relaxation < 2.0:
             raise InputError(f"relaxation is {self.relaxation!r}; a number between 0 and 2 is needed")
 
+    needs_scipy = True
+
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted; what it leaves is begun behind it if it fits there."""
         scaling = _scaling(problem)
-        return (scaling if scaling <= AT_ONCE else 0.0) + loading("scipy.sparse", "scipy.linalg.lapack")
+        return (scaling if scaling <= AT_ONCE else 0.0) + loading(*SCIPY)
 
     def prepare(self, problem: Problem) -> AdmmState:
         """Scale, where that takes little."""

@@ -71,6 +71,8 @@ class Direct(Solver):
 
         return Lemke()
 
+    needs_scipy = True
+
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""
         return factored(problem) if problem.law == "linear" else over_rows(problem)

@@ -45,6 +45,8 @@ def _sizes(problem: Problem) -> tuple[int, int]:
 class Lemke(Solver):
     """Lemke's complementary pivoting; no options."""
 
+    needs_scipy = True
+
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""
         return over_rows(problem)

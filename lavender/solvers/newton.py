@@ -122,6 +122,8 @@ class Newton(Solver):
 
     form: str = "auto"
 
+    needs_scipy = True
+
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""
         if problem.generalized is not None and self.form != "impulse":

@@ -152,7 +152,7 @@ class ThroughRows(Solver):
     """
 
     def __init__(self, solver: Solver) -> None:
-        self.solver = solver
+        self.solver, self.needs_scipy = solver, solver.needs_scipy
 
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], as counted."""

@@ -94,6 +94,8 @@ class Solver:
         """
         raise NotImplementedError
 
+    needs_scipy = False  # `setup_time` may count parts of SciPy that are not loaded yet
+
     def setup_time(self, problem: Problem) -> float:
         """What `prepare` takes [s], counted from the size of the problem: begun only if that fits in a time limit."""
         return 0.0

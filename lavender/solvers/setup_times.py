@@ -42,7 +42,7 @@ ANALYSED, BAND, PANEL = 6e-8, 1500.0, 1e-9
 # s for each multiply-add of a sweep (`Data.work`): of an elimination of bodies, one of velocities, and an order.
 BODIES, VELOCITIES, ORDERED = 3e-8, 4.5e-8, 1e-7
 SWEPT = 1.5e-9  # s for each multiply-add of a sweep, of its room and of itself
-LOADING = 0.3  # s of a part of SciPy
+LOADING, SCIPY = 0.3, ("scipy.sparse", "scipy.linalg.lapack")  # s of a part of SciPy; what factors need
 DENSE, SPARSE = 1.5e-10, 1e-9  # s for each multiply-add of a first factor
 
 
@@ -76,7 +76,7 @@ def compared(problem: Problem) -> float:
 def over_rows(problem: Problem) -> float:
     """A, whether it is symmetric, and a matrix that a solver makes of it."""
     entries = problem.most_entries
-    loaded = loading("scipy.sparse", "scipy.linalg.lapack") if problem.m > SMALL_ROWS else 0.0
+    loaded = loading(*SCIPY) if problem.m > SMALL_ROWS else 0.0
     full = entries == float(problem.m) ** 2
     laid_out = WHOLE * entries if full else CALLS + LAID_OUT * entries
     return START + forming(problem) + compared(problem) + laid_out + loaded

@@ -14,6 +14,7 @@ import numpy as np
 from lavender.base.arrays import ArrayLike, FloatArray, equal, flag, number, read_only, whole_number
 from lavender.base.deadline import NEVER, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, CapabilityError, InputError, InUse, UnknownName, last_words
+from lavender.base.later import load
 from lavender.external.foreign import Foreign
 from lavender.judge.residuals import (
     Residual,
@@ -27,6 +28,7 @@ from lavender.judge.residuals import (
 from lavender.judge.solution import Claim, Solution, SolverRun, Status
 from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
+from lavender.solvers.setup_times import SCIPY, loading
 from lavender.solving.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solving.outcome import (
     CONVERGED,
@@ -351,6 +353,12 @@ class Prepared:
         anew, self._broken = anew or bool(self._broken), ""
         if deadline.is_set:
             self._late = deadline.passed(self.solver.setup_time(problem))
+            if self._late and self.solver.needs_scipy and loading(*SCIPY):
+                # As processes are started: else no call within the limit would ever have what it needs.
+                watch = Stopwatch()
+                load()
+                deadline.keep(-watch.seconds)
+                self._late = deadline.passed(self.solver.setup_time(problem))
             if self._late:
                 self.state = None
                 return
