@@ -94,6 +94,10 @@ class Derivative:
         # The kernel has all that `vjp` needs, in the order given.
         self._plain = regular and not problem.cones.has_ellipse and (general is None or general.order is None)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is prepared anew."""
+        return derivative, (self.problem, self._impulse)
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the data that this problem has, by which there are gradients."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from _thread import allocate_lock, start_new_thread
 from collections.abc import Callable, Iterable, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -101,6 +102,12 @@ class Many:
         for name, x in known.items():
             self._worlds.numbers[NUMBER[name], i] = x
         self._worlds.worst[i] = found.worst_row
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What came of the worlds, without the loop that has ended."""
+        loop = self._worlds
+        found = SimpleNamespace(numbers=loop.numbers, worst=loop.worst, counts=loop.counts, code=loop.code)
+        return vars(self) | {"_worlds": found, "_data": None}
 
     def __len__(self) -> int:
         return len(self.problems)

@@ -23,7 +23,16 @@ from lavender.problem.batch import Batch
 from lavender.problem.derived import cached_property
 from lavender.solvers.registry import SolverSpec, get
 from lavender.solving.loop import LEAST
-from lavender.solving.solve import COUNTED, check_budget, check_taken, rest_of, seconds_of, solve, unjudged
+from lavender.solving.solve import (
+    COUNTED,
+    NO_TURN,
+    check_budget,
+    check_taken,
+    rest_of,
+    seconds_of,
+    solve,
+    unjudged,
+)
 from lavender_ext.judge.measure import all_finite
 from lavender_ext.small.many import CODE, PLACE, Hand
 
@@ -34,7 +43,6 @@ LATE, ENTRY = (
     5e-9,
 )  # s, of the judge on a world of J and M whose turn comes too late, and for each multiply-add
 UNREAD = 4e-5  # s, of one that he reads later
-NO_TURN = "the time limit was over before its turn: the start, unjudged"
 STATUS = np.array(list(Status), object)
 NUMBER_OF = {status: i for i, status in enumerate(Status)}
 
@@ -67,6 +75,12 @@ class Solutions(Many, Sequence[Solution]):
         self._seconds = 0.0  # share of each
         # Of a batch the loop writes over the starts.
         self._given = None if cold or not isinstance(given, Batch) else starts.copy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"_spec": self._spec.name}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _spec=get(state["_spec"]))
 
     @property
     def impulse(self) -> FloatArray:
@@ -276,7 +290,7 @@ def solve_many(
             deadline.keep(-UNREAD)
             if deadline.passed():
                 check_taken(problem, spec)
-                made.late(i, unjudged(problem, spec, options, start, tol, NO_TURN))
+                made.late(i, unjudged(problem, spec, options, start, tol, f"{NO_TURN}, unjudged"))
                 return
         found = solve(problem, solver, impulse=start, time_limit=deadline.left(LEAST), **more)
         made.keep(i, found if "callback" in options else uninterrupted(found))

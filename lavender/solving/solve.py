@@ -46,6 +46,7 @@ LATER = ("iterations", "work", "solver", "message", "history", "dual", "certific
          "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit
 SET_UP_LATE = "what has to be set up first takes longer than the time limit"
+NO_TURN = "the time limit was over before its turn: the start"
 JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
@@ -504,8 +505,10 @@ def rest_of(
     status: Status = CONVERGED,
 ) -> dict[str, Any]:
     """The fields of a solution of a compiled call that `Solution.late` leaves for later."""
-    assert spec.small is not None
-    claim = spec.small.claim(problem, counts, given, judged.relative, status)
+    if spec.small is None:  # of a world of `solve_many`
+        claim = Claim(status, 0, {}, NO_TURN)
+    else:
+        claim = spec.small.claim(problem, counts, given, judged.relative, status)
     return {
         "residual": told(problem, judged),
         "iterations": claim.iterations,

@@ -1,5 +1,7 @@
 """Worlds by the thousand: the bits of single solves, whatever layout, precision, threads and bad neighbours."""
 
+import copy
+import pickle
 import threading
 
 import numpy as np
@@ -35,6 +37,25 @@ def assert_same(many, i, single):
     assert many.status[i] is own.status is single.status
     assert many.iterations[i] == own.iterations == single.iterations
     assert (own.message, own.work, own.turns) == (single.message, single.work, single.turns)
+
+
+@pytest.mark.parametrize("again", [copy.copy, copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_what_came_of_many_is_copied_and_pickled(again):
+    """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
+    batch = lv.Batch(*worlds(3), cones=DISKS)
+    mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
+    for given in (batch, mixed):
+        many = lv.solve_many(given, tol=1e-10)
+        found = lv.residual_many(given, many.impulse if given is batch else [s.impulse for s in many])
+        twin, verdicts = again(many), again(found)
+        for name in ("impulse", "velocity", "status", "relative", "worst_row", "iterations", "ptr"):
+            np.testing.assert_array_equal(getattr(twin, name), getattr(many, name))
+        assert verdicts.verdict.tolist() == found.verdict.tolist() and str(verdicts[1]) == str(found[1])
+        for i in range(3):
+            assert_same(twin, i, many[i])
+            ones = np.ones_like(many[i].impulse)
+            d = lv.derivative(given[i], many[i])
+            assert again(d).jvp(b=ones).slack.tolist() == d.jvp(b=ones).slack.tolist()
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
