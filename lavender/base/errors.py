@@ -39,7 +39,7 @@ class UnknownName(LavenderError, KeyError):
     def __init__(self, kind: str, name: object, known: Iterable[str]) -> None:
         import difflib  # needed only where something went wrong
 
-        known = sorted(known)
+        known = sorted(set(known))
         plain = {word.lower(): word for word in reversed(known)}
         near = [plain[w] for w in difflib.get_close_matches(str(name).lower(), plain, n=3, cutoff=0.5)]
         hint = (

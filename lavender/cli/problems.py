@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET, console, one_thread
 
 __all__ = ["problems"]
@@ -54,8 +55,12 @@ def problems(
     one_thread()
     names = [group.removeprefix("@") for group in groups]
     for name in names:
-        if certify is None or not is_path(name):
+        if not is_path(name):
             suite.names(f"@{name}")  # an unknown set is refused first
+        elif certify is None:
+            raise InputError(
+                f"{name} is a file or folder, which --certify alone takes; give sets, such as @hard"
+            )
     if certify is not None:
         made = []
         for entry in collection.entries(names):

@@ -32,6 +32,8 @@ def test_who_knows_the_secret_makes_the_same(lavender, tmp_path):
     assert lavender("problems", "--secret", "apple", "--count", 2, "--out", tmp_path / "a")[0] == 0
     assert len(list((tmp_path / "a").iterdir())) == 2
     assert lavender("problems", "@nobody")[0] == 2
+    code, _, err = lavender("problems", tmp_path / "a")
+    assert code == 2 and "--certify alone" in err
 
 
 def test_a_manifest_is_made_with_proofs(lavender, tmp_path, monkeypatch):

@@ -31,6 +31,13 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
     assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == [8, 8, 8]
 
 
+def test_a_recording_of_nothing_is_refused(lavender, tmp_path):
+    words = ["run", "stack", "--set", "n=2", "--steps", "3", "--record", tmp_path / "problems", "--skip"]
+    code, _, err = lavender(*words, "3")
+    assert code == 2 and "skip is 3 of 3 steps" in err and not (tmp_path / "problems").exists()
+    assert lavender(*words, "2")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("words", "last"),
     [

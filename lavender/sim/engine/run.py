@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, whole_number
+from lavender.base.errors import InputError
 from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
 from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
 from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
@@ -92,6 +93,8 @@ def run(
     recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
     steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
+    if record is not None and skip >= steps:
+        raise InputError(f"skip is {skip} of {steps} steps: nothing would be recorded; give a smaller one")
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0

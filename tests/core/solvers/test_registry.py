@@ -125,6 +125,7 @@ def test_an_unknown_name_tells_the_nearest():
     with pytest.raises(lv.UnknownName, match="did you mean 'newton'") as raised:
         lv.get("newtn")
     assert isinstance(raised.value, KeyError)
+    assert str(lv.UnknownName("case", "x", ["one", "two", "one"])).endswith("known: one, two")
     for senseless in ("", None, 7, ["pgs"]):
         with pytest.raises(lv.UnknownName):
             lv.get(senseless)
