@@ -320,6 +320,8 @@ def given_problems(problems: Any, errors: str) -> Any:
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):
         return problems
+    if not isinstance(problems, Iterable):
+        raise InputError(f"problems is {problems!r:.60}; a Batch or problems are needed")
     given = list(problems)
     for problem in given:
         if type(problem) is not Problem:
@@ -329,6 +331,8 @@ def given_problems(problems: Any, errors: str) -> Any:
 
 def of_each(given: Any, impulses: Any) -> list[Any]:
     """Impulses (m,) [N s] of each problem, its guess where there are none."""
+    if not hasattr(impulses, "__len__"):
+        raise InputError(f"impulses is {impulses!r:.60}; one (m,) for each problem is needed")
     if len(impulses) != len(given):
         raise InputError(f"{len(impulses)} impulses for {len(given)} problems; one for each is needed")
     return [

@@ -6,13 +6,13 @@ Arrays are read where they stand, in float32 or float64: what is made of one wor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_sizes, places, precision_of
+from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_sizes, places, precision_of, shape_of
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
@@ -375,6 +375,7 @@ def check_errors(errors: str) -> None:
 
 def _numbers(name: str, x: Any) -> np.ndarray:
     """As float32 or float64, where it stands if it is one of them."""
+    shape_of(name, x)
     given = np.asarray(x)
     if given.dtype not in MADE:
         given = as_array(name, given, (None,) * given.ndim, finite=False)
@@ -486,7 +487,7 @@ def _ragged(name: str, x: np.ndarray, sizes: Any) -> tuple[np.ndarray, Any]:
 
 def _joined(cones: Any, n: int) -> Cones:
     """The blocks of n worlds one after the other."""
-    each = list(cones)
+    each = list(cones) if isinstance(cones, Iterable) else []
     if len(each) != n or not all(isinstance(c, Cones) for c in each):
         raise InputError(f"cones is a Cones, or one for each of {n} worlds; {len(each)} things came")
     return Cones._joined(each)

@@ -17,6 +17,7 @@ from lavender.base.arrays import (
     check_sizes,
     equal,
     read_only,
+    shape_of,
     table_of,
     whole_number,
     words_for,
@@ -127,6 +128,7 @@ class ProblemData:
             check_finite("guess [N s]", guess)
             put(self, "guess", guess)
         if self.key is not None:
+            shape_of("key", self.key)
             key = np.asarray(self.key)
             if (
                 key.shape != (k,)
@@ -220,7 +222,14 @@ class ProblemData:
     # -- names -----------------------------------------------------------------------------------
 
     def block_of(self, row: int) -> int:
-        """Block that holds a row."""
+        """Block that holds a row.
+
+        Raises
+        ------
+        InputError
+            No such row.
+        """
+        row = whole_number("row", row, high=self.m - 1)
         return int(np.searchsorted(self.cones.ptr, row, side="right")) - 1
 
     def row_name(self, row: int) -> str:
@@ -231,7 +240,6 @@ class ProblemData:
         InputError
             No such row.
         """
-        row = whole_number("row", row, high=self.m - 1)
         i = self.block_of(row)
         offset, size = row - int(self.cones.ptr[i]), int(np.diff(self.cones.ptr)[i])
         spin, roll = self.cones.spin_rows[i], self.cones.rolling_rows[i]

@@ -134,6 +134,10 @@ def test_rows_have_names():
     assert random_lcp(1).row_name(3) == "row 3"
     with pytest.raises(lv.InputError, match="row is 99"):
         random_lcp(1).row_name(99)
+    with pytest.raises(lv.InputError, match="row is -1"):
+        random_lcp(1).block_of(-1)
+    with pytest.raises(lv.InputError, match="key is not an array"):
+        replace(random_lcp(1), key=[[1, 2], [3]])
 
 
 def test_pinned_bodies_are_legal():

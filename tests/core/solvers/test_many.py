@@ -329,6 +329,10 @@ def test_a_list_goes_the_same_way_as_a_batch():
     assert found.relative.tobytes() == many.relative.tobytes()
     with pytest.raises(lv.InputError, match="impulses of world 1"):
         lv.residual_many(given, [np.zeros(12), *(np.zeros(3) for _ in range(6))])
+    with pytest.raises(lv.InputError, match="impulses is None; one"):
+        lv.residual_many(given, None)
+    with pytest.raises(lv.InputError, match="problems is 3; a Batch"):
+        lv.solve_many(3)
 
 
 def test_matrices_and_bodies_go_the_same_way():
@@ -373,6 +377,8 @@ def test_matrices_and_bodies_go_the_same_way():
         ({"J": np.zeros((47, 18)), "row_ptr": [0, 12, 24, 36, 48]}, "J has shape"),
         ({"J": np.zeros((48, 18)), "row_ptr": [1, 12, 24, 36, 48]}, "row_ptr must start with 0"),
         ({"J": np.array(["a"])}, "dtype"),
+        ({"J": [[1.0, 2.0], [3.0]]}, "J is not an array of numbers"),
+        ({"cones": None}, "one for each of 4 worlds"),
     ],
 )  # fmt: skip
 def test_a_batch_that_does_not_fit_says_so(change, words):
