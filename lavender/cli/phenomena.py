@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import parameters_of
+from lavender.cli.options import parameters_of, refuse_unused
 from lavender.io.stored import writable, write_text
 from lavender.lab.bench.machine import cpu_name, versions
 from lavender.lab.phenomena import WAYS, Record, chosen, run
@@ -52,7 +52,9 @@ def _names(text: str | None) -> list[str] | None:
     is_flag=True,
     help="Describe each phenomenon, its exact motion and its bounds; run nothing.",
 )
+@click.pass_context
 def phenomena(
+    context: click.Context,
     names: tuple[str, ...],
     steppers: str | None,
     engines: str,
@@ -67,6 +69,7 @@ def phenomena(
     engine is missing, crashed, or cannot build a scene.
     """
     if listed:
+        refuse_unused(context, ["steppers", "engines", "parameters", "limit", "out"], "with --list")
         click.echo(tables.described(chosen(names)))
         return
     if out is not None:

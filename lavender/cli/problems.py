@@ -7,7 +7,8 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, console, one_thread
+from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused
+from lavender.io.stored import writable
 
 __all__ = ["problems"]
 
@@ -32,7 +33,9 @@ __all__ = ["problems"]
 @click.option(
     "--page", type=click.Path(dir_okay=False, path_type=Path), help="Write the catalogue as markdown."
 )
+@click.pass_context
 def problems(
+    context: click.Context,
     groups: tuple[str, ...],
     out: Path | None,
     check: bool,
@@ -53,6 +56,19 @@ def problems(
     from lavender.lab.bench.record import file_name
 
     one_thread()
+    if certify is not None:
+        refuse_unused(context, ["out", "check", "secret", "count", "page"], "with --certify")
+    elif secret is not None:
+        refuse_unused(context, ["check", "page"], "with --secret")
+        if groups:
+            raise InputError(f"{groups[0]} has no effect with --secret: leave it out")
+    else:
+        refuse_unused(context, ["count"], "without --secret")
+        if check:
+            refuse_unused(context, ["out"], "with --check")
+    for path, is_folder in ((out, True), (certify, False), (page, False)):
+        if path is not None:
+            writable(path, is_folder)
     names = [group.removeprefix("@") for group in groups]
     for name in names:
         if not is_path(name):

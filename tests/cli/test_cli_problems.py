@@ -34,6 +34,16 @@ def test_who_knows_the_secret_makes_the_same(lavender, tmp_path):
     assert lavender("problems", "@nobody")[0] == 2
     code, _, err = lavender("problems", tmp_path / "a")
     assert code == 2 and "--certify alone" in err
+    for words, sign in (
+        (("--count", 2), "--count has no effect without --secret"),
+        (("--secret", "apple", "--check"), "--check has no effect with --secret"),
+        (("@walking", "--secret", "apple"), "@walking has no effect with --secret"),
+        (("@walking", "--check", "--out", tmp_path / "b"), "--out has no effect with --check"),
+        (("--certify", tmp_path / "m.json", "--check"), "--check has no effect with --certify"),
+        (("--page", tmp_path / "none" / "page.md"), "make it first"),
+    ):
+        code, _, err = lavender("problems", *words)
+        assert code == 2 and sign in err
 
 
 def test_a_manifest_is_made_with_proofs(lavender, tmp_path, monkeypatch):

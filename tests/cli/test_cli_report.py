@@ -77,6 +77,8 @@ def test_the_list_tells_truths_without_running(lavender):
     assert code == 0
     for name, p in PHENOMENA.items():
         assert f"{name}: {p.title}" in out
+    code, _, err = lavender("phenomena", "--list", "--out", "measured.json")
+    assert code == 2 and "--out has no effect with --list" in err
 
 
 def test_the_terminal_shows_speeds_on_request(lavender, tmp_path):
