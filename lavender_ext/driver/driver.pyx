@@ -12,7 +12,7 @@ from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.newton.method cimport bodies_room, bodies_start, rows_room, rows_start, system_step
 
 
-cdef inline method_t row_of(const view_t* v, const options_t* o) noexcept nogil:
+cdef inline method_t row_of(const view_t* v) noexcept nogil:
     """The table: a method over the form that the problem has."""
     if v.g != NULL:
         return method_t(general_room, general_start, general_step)
@@ -26,18 +26,18 @@ cdef public int32_t lav_room(const view_t* v, const options_t* o, room_t* r) noe
     r[0] = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
     if o.method != NEWTON or v.p.n_rows == 0:
         return 0
-    return row_of(v, o).room(v, o, r)
+    return row_of(v).room(v, o, r)
 
 
 cdef public int32_t lav_start(const view_t* v, const options_t* o, room_t* r, const double* lam) noexcept nogil:
     """From lam (m): MORE, or ROOM with how much is needed."""
-    return row_of(v, o).start(v, o, r, lam)
+    return row_of(v).start(v, o, r, lam)
 
 
 cdef public int32_t lav_step(const view_t* v, const options_t* o, const room_t* r, int32_t work, double* lam,
                              said_t* said) noexcept nogil:
     """`work` units or a few more; lam (m) is the best so far."""
-    return row_of(v, o).step(v, o, r, work, lam, said)
+    return row_of(v).step(v, o, r, work, lam, said)
 
 
 cdef class Driver(Method):
@@ -52,7 +52,7 @@ cdef class Driver(Method):
     def __init__(self, Data data, double most=INFINITY):
         self.data, self.view = data, data.view()
         self.options.method, self.options.wide, self.options.most = NEWTON, has_wide(), most
-        self.own = row_of(&self.view, &self.options)
+        self.own = row_of(&self.view)
         self.fits = lav_room(&self.view, &self.options, &self.space) and self.lay() == ROOM
 
     cdef int32_t lay(self) except -1:

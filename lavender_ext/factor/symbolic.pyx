@@ -145,8 +145,8 @@ cdef public int32_t lav_panels(int32_t n, const int32_t* lptr, const int32_t* li
 
 
 cdef public void lav_panel_rows(int32_t n, int32_t count, int32_t panels, const int32_t* begin, const int32_t* order,
-                                 const int32_t* size, const int32_t* lptr, const int32_t* lind, const int32_t* group,
-                                 int32_t* starts, int32_t* by_place, int32_t* place, int32_t* first, int32_t* of,
+                                 const int32_t* lptr, const int32_t* lind, const int32_t* group, int32_t* starts,
+                                 int32_t* by_place, int32_t* place, int32_t* first, int32_t* of,
                                  int32_t* rptr, int32_t* rows, int64_t* at, int64_t* beside,
                                  double* work) noexcept nogil:
     """From vertices to rows, as `sparse_t` has them; work of L L^T; starts (count + 1) is scratch."""
@@ -215,7 +215,7 @@ def analysed(indptr, indices):
     first = &whole[0] + 5 * n
     rptr = first + k + 1
     with nogil:
-        lav_panel_rows(n, count, k, begin, order, size, lptr, &lind[0], group, s, &whole[0], &whole[0] + n, first,
+        lav_panel_rows(n, count, k, begin, order, lptr, &lind[0], group, s, &whole[0], &whole[0] + n, first,
                         &whole[0] + 2 * n, rptr, rptr + k + 1 + 3 * k, &places[0], &places[0] + k + 1, &work)
     return whole_array, places_array, work
 
@@ -229,7 +229,7 @@ def block_panels(const int32_t[::1] nptr, const int32_t[::1] nind, const int32_t
     cdef int32_t n = <int32_t>nptr.shape[0] - 1, i, j, q, k, p, below = 0
     cdef int32_t[::1] group = np.empty(n + 1, np.int32), one = np.ones(n + 1, np.int32), whole
     cdef int32_t[::1] begin = s * np.arange(n + 1, dtype=np.int32), order = np.arange(n + 1, dtype=np.int32)
-    cdef int32_t[::1] size = np.full(n + 1, s, np.int32), starts = np.empty(n + 1, np.int32)
+    cdef int32_t[::1] starts = np.empty(n + 1, np.int32)
     cdef int64_t[::1] places, spot = np.empty(nind.shape[0] + 1, np.int64)
     cdef int32_t* of
     cdef int32_t* first
@@ -245,7 +245,7 @@ def block_panels(const int32_t[::1] nptr, const int32_t[::1] nind, const int32_t
     first = of + 3 * n * s
     rptr = first + k + 1
     rows = rptr + 4 * k + 1
-    lav_panel_rows(n * s, n, k, &begin[0], &order[0], &size[0], &lptr[0], &lind[0], &group[0], &starts[0], &whole[0],
+    lav_panel_rows(n * s, n, k, &begin[0], &order[0], &lptr[0], &lind[0], &group[0], &starts[0], &whole[0],
                    &whole[0] + n * s, first, of, rptr, rows, &places[0], &places[0] + k + 1, &work)
     for j in range(n):
         for q in range(nptr[j], nptr[j + 1]):

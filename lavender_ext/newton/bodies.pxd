@@ -194,7 +194,7 @@ cdef inline void panel_of_velocities(const blocks_t* p, const generalized_t* g, 
 
 
 cdef inline void furnish_factor(newton_t* s, const pattern_t* a, double* panel, const int32_t* column, int32_t size,
-                                bint lu, const sparse_t* super, const int64_t* spot, double** x) noexcept nogil:
+                                const sparse_t* super, const int64_t* spot, double** x) noexcept nogil:
     """Panel (rows, 12), of each body these columns alone, and the factor in PARTS of zeros; super: its panels."""
     cdef factor_t* f = &s.blocks
     if s.sc.e.m:
@@ -229,4 +229,4 @@ cdef inline void furnish_bodies(newton_t* s, pattern_t* a, double* real, const v
     for i in range(PARTS):
         part[i] = x
         x += size[i]
-    furnish_factor(s, a, panel, column, 6, 1, NULL, NULL, part)
+    furnish_factor(s, a, panel, column, 6, NULL, NULL, part)

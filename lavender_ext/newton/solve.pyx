@@ -255,7 +255,7 @@ cdef class Solve:
         for i in range(PARTS):
             x[i] = <double*>address(values[i])
         self.held += [panel, layout, own, values]
-        furnish_factor(self.n, &a, <double*>address(panel), &columns[0], s, lu, super_, places, x)
+        furnish_factor(self.n, &a, <double*>address(panel), &columns[0], s, super_, places, x)
 
     # -- turns -------------------------------------------------------------------------------------
 

@@ -93,7 +93,7 @@ cdef inline void observe(const blocks_t* p, const rows_t* r, const warm_t* s, do
     violation[0] = low
 
 
-cdef inline int64_t room_of(const blocks_t* p, const rows_t* r, int32_t width) noexcept nogil:
+cdef inline int64_t room_of(const blocks_t* p, int32_t width) noexcept nogil:
     # doubles that `lay_out` hands out
     return (3 + <int64_t>width) * p.n_rows
 

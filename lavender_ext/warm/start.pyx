@@ -15,7 +15,7 @@ def from_guess(Data data, double[::1] impulse, double tol):
         return 0, 0, 0
     cdef int32_t[::1] index = np.empty(data.rows.n_bodies + 2 * data.rows.n_joints + 1, np.int32)
     s.width = band_width(&data.blocks, &data.rows, &index[0])
-    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, &data.rows, s.width))
+    cdef double[::1] real = np.empty(6 * data.rows.n_bodies + room_of(&data.blocks, s.width))
     s.trace = NULL
     lay_out(&s, &real[6 * data.rows.n_bodies], &index[0], &data.blocks, &data.rows)
     with nogil:

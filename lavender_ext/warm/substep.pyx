@@ -69,7 +69,7 @@ cdef public int32_t lav_newton_plan(const int32_t* size, double* real, int32_t* 
     n = method_room(&p, &r)
     scratch[1] = <int32_t>n.n_index if turns else 0
     scratch[0] = band_width(&p, &r, scratch + HEAD + scratch[1])
-    room = room_of(&p, &r, scratch[0]) + p.n_rows
+    room = room_of(&p, scratch[0]) + p.n_rows
     if scratch[1] > 0:
         v = view_t(p, NULL, &r, NULL)
         n.index = scratch + HEAD
@@ -142,7 +142,7 @@ cdef public int32_t lav_newton_substep(const int32_t* size, double* real, int32_
     s.width = scratch[0]
     s.trace = trace
     s.relative = 0.0
-    own = room_of(&p, &r, s.width) + p.n_rows
+    own = room_of(&p, s.width) + p.n_rows
     lay_out(&s, room + p.n_rows, scratch + HEAD + scratch[1], &p, &r)
     how = newton_substep(&p, &r, &s, tol, turns, scratch, room + own, e.impulse, e.dv)
     if p.n_rows > 0 and (turns or how != UNDECIDED):

@@ -126,12 +126,10 @@ def _island(problem: Problem, rows: np.ndarray, friction: np.ndarray) -> tuple[s
         return None, np.inf
     if kappa < 1.0 - MARGIN:
         return "friction is small", kappa
-    return ("nothing slides" if _sticks(problem, rows, friction, kappa, lifting) else None), kappa
+    return ("nothing slides" if _sticks(problem, rows, kappa, lifting) else None), kappa
 
 
-def _sticks(
-    problem: Problem, rows: np.ndarray, friction: np.ndarray, kappa: float, lifting: FloatArray
-) -> bool:
+def _sticks(problem: Problem, rows: np.ndarray, kappa: float, lifting: FloatArray) -> bool:
     """Whether (3) holds of the reference; `lifting` (k,) [kg] is Z_ii of the contacts with friction."""
     found = reference(problem)
     c, x = problem.cones, found.impulse
