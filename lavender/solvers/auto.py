@@ -22,8 +22,8 @@
     at last                     a certificate of others, by a linear program (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
-problem is solved in the same way on every machine. Under a time limit the tree is the same. If it may be short, sweeps
-have the first half; whoever factors begins only if a result would be there in time; and sweeps have the rest.
+problem is solved in the same way on every machine. Under a time limit the tree is the same, but whoever factors begins
+only if a result would be there in time, sweeps before it have at most half of what is left, and sweeps have the rest.
 `Solution.turns` lists what ran, `lavender.explain` what would run.
 """
 
@@ -64,7 +64,6 @@ FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill i
 PILE = 130  # contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
-SHORT = 3.0 * SURE  # times the counted cost, below which a limit may be short
 EARLY = 0.25  # of the counted cost, after which an interior point has an impulse that is worth having
 # Sweeps start from a given guess up to this relative residual, even if doing nothing has less, because the guess tells
 # which rows are free.
@@ -95,7 +94,6 @@ class Tree:
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
         self.problem, self.law, self.deadline = problem, problem.law, deadline
-        self.half = 0.5 * deadline.nanoseconds() if deadline.is_set else 0.0
 
     @cached_property
     def sweep(self) -> float:
@@ -166,12 +164,6 @@ class Tree:
             set_up *= SURE  # a factor of what fills in takes longer than is counted
         return not self.deadline.passed(set_up + needed)
 
-    def is_short(self, newton: float) -> bool:
-        """A limit that Newton's method of this cost [ns] may use up: sweeps leave something before it."""
-        return self.deadline.is_set and self.deadline.passed(
-            3.0 * setup_time("newton", self.problem) + 1e-9 * SHORT * newton
-        )
-
     @property
     def may_fill(self) -> bool:
         """A matrix of few entries without a narrow band."""
@@ -228,7 +220,7 @@ class Tree:
             if self.may_fill:
                 yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
-        if not self.is_short(self.least) and self.is_narrow:
+        if self.is_narrow:
             yield self.rounds(self.least, "bounded rows of a narrow band")
         # Fill is most of what J and M cost, and only an analysis tells it: they are swept as long as is usual before.
         usual = self.problem.generalized is not None and self.law == "coulomb"
@@ -242,7 +234,7 @@ class Tree:
             yield Stage(
                 "certificate", 1.0, self.newton, "whether the least violation proves that there is none"
             )
-        yield from self.factorisations(SURE if self.is_short(self.newton) else MOST)
+        yield from self.factorisations(MOST)
         if self.is_program:
             return
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
@@ -277,17 +269,14 @@ class Tree:
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for."""
-        short = self.is_short(newton)
-        cost = (self.half if short else newton) - self.begun
-        if short and self.is_loose:
-            cost *= 0.5  # nncg has the other half
+        cost = newton - self.begun
         # Newton's method then takes what it is counted for.
         sure = self.law == "linear" or (self.law == "cone" and self.problem.matrix is None)
-        pays = short or not sure or MANY * self.sweep <= newton
+        pays = not sure or MANY * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
             why = f"{words(cost)} of what newton costs"
-            yield self.sweeps(cost, why, inf if short else newton)
+            yield self.sweeps(cost, why, newton)
             if self.is_loose:
                 yield self.iterations("nncg from the cone law", cost, why)
 
@@ -416,12 +405,9 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         if step.over:
             tree.left += stage.cost
         else:
-            step.least, step.cost = stage.least, stage.cost
+            step.least = stage.least
             step.run(stage.iterations)
             tree.best = log.best
-            if isinstance(step, Sweeps) and step.nearly_there and not log.done():
-                step.finish()
-                return
     if log.best > log.tol and log.certificate is None and not tree.is_program and (log.left > 0 or log.vain):
         certify(log)
 

@@ -65,7 +65,6 @@ class Step:
 
     over = False  # it has nothing more to do
     least = np.inf  # iterations that may be predicted to be left, and it goes on
-    cost = np.inf  # ns, of the next turn as counted
     state: Any = None
     impulse: FloatArray  # (m,) N s
 
@@ -173,7 +172,6 @@ class Sweeps(Step):
     """Accelerated sweeps whose checks predict how many are left (`lavender_ext/small/checked_sweeps.pyx`)."""
 
     relative = 1.0  # residual of the last check
-    rest = np.inf  # s, of the sweeps that are predicted to be left under a time limit
     told = 0  # restarts of the turns before
 
     def __init__(self, problem: Problem, deadline: Deadline = NEVER) -> None:
@@ -190,35 +188,14 @@ class Sweeps(Step):
         self.impulse = log.impulse.copy() if log.given is None else log.given
 
     def turn(self, n: int) -> Claim:
-        before = self.state.done
+        before, left = self.state.done, self.log.deadline.left()
         try:
-            left = self.log.deadline.left()
-            if left is not None and 1e-9 * self.cost > PROBE * left:
-                self.until(Deadline(PROBE * left), n, True)
-            else:
-                self.predicted(n)
+            self.sweep(n, NEVER if left is None else Deadline(PROBE * left))
         finally:
             claim = self.taken(before)
         return claim
 
-    def until(self, deadline: Deadline, n: int, checked: bool) -> None:
-        """As many as end in time; `checked`: and are judged in it."""
-        log = self.log
-        room = PROBE, CHUNK_TIME, checked
-        pace = self.state.within(
-            self.impulse, self.relative, n, log.tol, FIRST, deadline.left, log.deadline.left, *room
-        )
-        last = self.state.now
-        if last is not None:
-            self.rest = pace * sweeps_left(self.state.last, self.state.before, last.relative, log.tol)
-
-    @property
-    def nearly_there(self) -> bool:
-        """Under a time limit they go on if they are predicted to end in twice the time that is left, or sooner."""
-        deadline = self.log.deadline
-        return deadline.is_set and not self.over and not deadline.passed(0.5 * self.rest)
-
-    def predicted(self, n: int) -> None:
+    def sweep(self, n: int, until: Deadline) -> None:
         """Between looks at the clock, until more than `least` are predicted to be left."""
         log, state, end = self.log, self.state, self.state.done + n
         chunk, at, before = max(1, int(CHUNK_TIME / self.each)), state.done, self.relative
@@ -226,14 +203,14 @@ class Sweeps(Step):
         while state.done < end:
             due = min(end, at + max(at // 2, FIRST))
             k = min(chunk, due - state.done)
-            left, watch = log.deadline.left(), Stopwatch()
+            left, watch = until.left(), Stopwatch()
             if left is not None:
                 k = min(k, max(1, int(PROBE * left / pace)))
-            state.run(self.impulse, self.relative, k, log.tol, k, FIRST, np.inf)
+            state.run(self.impulse, k, log.tol)
             pace = max(watch.seconds, 1e-9) / k
             self.relative = log.take(state.now)
             ended = STATUS[state.status] is not Status.MAX_ITERATIONS
-            if ended or self.relative <= log.tol or log.late:
+            if ended or self.relative <= log.tol or log.late or until.passed(pace):
                 return
             if state.done >= due:
                 if sweeps_left(due - at, before, self.relative, log.tol) > self.least:
@@ -264,4 +241,6 @@ class Sweeps(Step):
             log.note(self.name, claim, before)
 
         log.end = end
-        self.until(log.deadline, min(log.left, MOST), False)
+        self.state.within(
+            self.impulse, min(log.left, MOST), log.tol, FIRST, log.deadline.left, PROBE, CHUNK_TIME
+        )

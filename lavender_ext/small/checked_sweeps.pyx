@@ -1,9 +1,9 @@
-"""Accelerated sweeps with residual checks that predict their remaining cost: the first turn of `auto` in one call.
+"""Accelerated sweeps with residual checks, from which `auto` predicts how many are left.
 
     rest = n log(now / tol) / log(before / now)         sweeps left, by the contraction of the last n    (1)
 
-They go on while rest is no more than `least`; each time half as many as were done, `first` at least. Where A was formed
-of J and M the checks read A, which costs a sweep and not ten; a residual below tol there is checked by J and M.
+Where A was formed of J and M the checks read A, which costs a sweep and not ten; a residual below tol there is checked
+by J and M.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, log
@@ -21,7 +21,6 @@ run = AcceleratedSweeps.run
 cdef enum:
     MEMORY = 5                  # sweeps that are combined
     PATIENCE = 500              # of their watch
-    HOPELESS = 10               # times the time that is left, which sweeps may promise to take: they gain pace
 
 
 cpdef double sweeps_left(double done, double before, double now, double tol) noexcept nogil:
@@ -51,10 +50,8 @@ cdef class CheckedSweeps:
     cdef readonly Watch watch
     cdef readonly AcceleratedSweeps over
     cdef readonly Judged now, best      # of the last check, and of all
-    cdef readonly double before         # relative residual before the last sweeps,
-    cdef readonly int last, done        # how many these were, and all of them
     cdef readonly int status            # of the watch
-    cdef readonly int restarts
+    cdef readonly int done, restarts
 
     def __init__(self, Data metric, Data data, bint exact, int split):
         cdef bint formed = (metric.factored or metric.is_general) and not (data.factored or data.is_general)
@@ -76,44 +73,30 @@ cdef class CheckedSweeps:
         self.done += last
         return last
 
-    cdef double check(self, lam, double before, int last, double tol) except *:
-        """The relative residual after `last` sweeps from `before`: by what is swept, and below tol by the judge."""
+    cdef double check(self, lam, double tol) except *:
+        """The relative residual: by what is swept, and below tol by the judge."""
         self.now = Judged(self.data, lam.copy())
         if self.now.relative <= tol and self.data is not self.metric:
             self.now = Judged(self.metric, self.now.impulse)
         if self.best is None or self.now.relative < self.best.relative:
             self.best = self.now
-        self.before, self.last = before, last
         return self.now.relative
 
-    def run(self, lam, double before, int n, double tol, int sweeps, int first, double least):
-        """From `lam` (m,) [N s] in place, at the relative residual `before`, at most `n`, `sweeps` before the first check.
-
-        `least`: sweeps left that they promise at most, to go on.
-        """
-        cdef int last
-        cdef int32_t end = self.done + n
-        cdef double now
+    def run(self, lam, int n, double tol):
+        """From `lam` (m,) [N s] in place, at most `n`, and a check."""
         if self.done:
             self.over.start(lam)
-        while True:
-            last = self.sweep(lam, sweeps, tol)
-            now = self.check(lam, before, last, tol)
-            if now <= tol or self.status != RUNNING or self.done >= end or sweeps_left(last, before, now, tol) > least:
-                return
-            before = now
-            sweeps = min(max(self.done // 2, first), end - self.done)
+        self.sweep(lam, n, tol)
+        self.check(lam, tol)
 
-    def within(self, lam, double before, int n, double tol, int first, left, most, double share, double chunk, bint checked):
-        """The same for as long as `left()` [s] says; returns what a sweep has taken [s].
+    def within(self, lam, int n, double tol, int first, left, double share, double chunk):
+        """For as long as `left()` [s] says, checked after `first` and whenever half as many more are done.
 
         One, as sweeps that solve blocks exactly are no steady work, then as many as fit into `share` of what is left, at
-        most `chunk` [s], at the pace of the last. `checked`: the last sweeps end with a check, and all end where one
-        promises far more than `most()` [s].
+        most `chunk` [s], at the pace of the last.
         """
-        cdef double time = left(), was, pace
-        cdef int32_t at = self.done, end = at + n, due = at + first, step
-        cdef double fit = 1.0
+        cdef double time = left(), was, pace, fit = 1.0
+        cdef int32_t end = self.done + n, due = self.done + first, step
         cdef bint is_due
         if self.done:
             self.over.start(lam)
@@ -122,18 +105,12 @@ cdef class CheckedSweeps:
             self.sweep(lam, step, 0.0)
             is_due = self.done == due
             if is_due:
-                before = self.check(lam, before, self.done - at, tol)
-                if before <= tol:
-                    break
-                at, due = self.done, self.done + max(self.done // 2, first)
+                if self.check(lam, tol) <= tol:
+                    return
+                due = self.done + max(self.done // 2, first)
             PyErr_CheckSignals()
             was, time = time, left()
             pace = max(was - time, 1e-9) / (step + is_due)
             if self.done >= end or 2.0 * time <= pace:
-                break
-            if is_due and checked and pace * sweeps_left(self.last, self.before, before, tol) > HOPELESS * most():
-                break
+                return
             fit = min(share * time, chunk) / pace
-        if checked and self.done > at:
-            self.check(lam, before, self.done - at, tol)
-        return pace

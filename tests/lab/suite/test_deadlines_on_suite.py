@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from calls import dense, over_velocities
+from random_problems import as_matrix
 
 import lavender as lv
 from benchmarks.made import fresh
@@ -82,7 +83,7 @@ def test_more_time_is_never_worse(name, pace, clock, monkeypatch):
 @pytest.mark.parametrize("limit", [1e-3, 1.5e-3])
 def test_sweeps_that_cost_more_than_they_are_counted_for_end_in_time(limit, clock, monkeypatch):
     """Contacts that roll, each solved exactly: half of the time was begun in one call by a count of a quarter."""
-    problem = suite.case("drawn_rolling(seed=97112)").problem
+    problem = as_matrix(suite.case("drawn_rolling(seed=97112)").problem)
     sweep, each = checked_sweeps.run, 4.5e-9 * sweep_cost(problem)
 
     def swept(*of):
