@@ -38,6 +38,7 @@ DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
 SHIFT = 1e-13
 TIKHONOV = 1e-7  # -, weight of the distance to the wanted impulse while its rows are found
 FALLS_BACK = 1e-10  # A_ii over the largest entry of its row, up to which d is that entry
+SHARED = 1e-3  # A_ii over a d that two rows share, up to which their units are unlike
 SOUND = 1e-8  # -, above 1, up to which |A_ij| / sqrt(A_ii A_jj) is that of a semidefinite A
 UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
 ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
@@ -251,18 +252,17 @@ def _unit(problem: Problem, scale: FloatArray) -> FloatArray:
     """Factors (m,) that make the diagonal of A one: those of d, but where d is another number than a sound A_ii.
 
     Beside rows of very much heavier bodies (1e20 and more) d falls back to what stands beside A_ii. Where no entry of
-    the row is above sqrt(A_ii A_jj), as in every semidefinite A, A_ii is no rounding, and the row is scaled by it.
+    the row is above sqrt(A_ii A_jj), as in every semidefinite A, A_ii is no rounding, and the row is scaled by it. So
+    is one of two rows that share a d, their mean, and have unlike units.
     """
-    if problem.matrix is None:
-        return scale
     a = problem.csr
     own = a.diagonal()
     beside = abs(a).max(axis=1).toarray().ravel() if problem.m else own
-    fallen = (own > 0.0) & (own <= FALLS_BACK * beside)
+    fallen = (own > 0.0) & ((own <= FALLS_BACK * beside) | (own * scale**2 <= SHARED))
     if not fallen.any():
         return scale
     with np.errstate(all="ignore"):
-        tried = np.where(fallen, 1.0 / np.sqrt(np.where(fallen, own, 1.0)), scale)
+        tried = np.where(own > 0.0, 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0)), scale)
         share = (
             abs(sp.csr_array(sp.diags_array(tried) @ a @ sp.diags_array(tried))).max(axis=1).toarray().ravel()
         )

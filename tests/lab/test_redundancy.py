@@ -265,6 +265,21 @@ def test_beside_a_diagonal_1e26_times_larger_a_row_is_still_a_row():
     assert lv.residual(problem, repeated.nearest_to(np.zeros(2))).relative <= 1e-9
 
 
+@pytest.mark.parametrize("form", ["matrix", "J, M and compliance"])
+def test_tangents_of_unlike_units_that_share_a_d_are_two_rows(form):
+    """A_tt = diag(s^2, 1): the mean of both hid the smaller one, at s^2 = 2^48, and its row counted as redundant."""
+    size = np.array([1.0, 2.0**24, 1.0])
+    jac = size[:, None] * np.array([[1.0, 0.0, 0.0], [0.5, 1.0, 0.0], [0.5, 0.5, 1.0]])
+    if form == "matrix":
+        problem = lv.Problem.contact(jac @ jac.T, np.ones(3), [0.5])
+    else:
+        problem = lv.Problem.from_jacobian(
+            jac, np.eye(3), np.ones(3), cones=lv.Cones.contacts([0.5]), compliance=2.0**-30
+        )
+    found = redundancy(problem)
+    assert found.rank == 3 and found.impulse_is_unique.all()
+
+
 def test_a_diagonal_that_is_rounding_is_not_scaled_by():
     # 1e-27 beside 1e-13: semidefinite to rounding alone, and so no size of the row.
     found = lv.redundancy(lv.Problem.linear([[1e-27, 1e-13], [1e-13, 1.0]], [0.0, 0.0]))
