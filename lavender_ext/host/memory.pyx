@@ -4,6 +4,7 @@ Such a host (WebAssembly, C) allocates every buffer itself. Where arrays lie tel
 `bind`: the length of an array is the distance to the next one of the same buffer.
 """
 from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.string cimport memcpy
 
 import numpy as np
 
@@ -42,24 +43,6 @@ cdef public void lav_engine_more_room(const int32_t* size, double* real, int32_t
         out[CAP_CONTACT] = quarter_more(e.head[H_NEED_CONTACTS])
 
 
-cdef inline void copy_reals(const double* source, double* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
-cdef inline void copy_ints(const int32_t* source, int32_t* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
-cdef inline void copy_keys(const uint64_t* source, uint64_t* goal, int64_t n) noexcept nogil:
-    cdef int64_t k
-    for k in range(n):
-        goal[k] = source[k]
-
-
 cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* index, uint64_t* keys,
                                  const int32_t* to_size, double* to_real, int32_t* to_index,
                                  uint64_t* to_keys) noexcept nogil:
@@ -70,16 +53,16 @@ cdef public void lav_engine_move(const int32_t* size, double* real, int32_t* ind
     bind(size, real, index, keys, &a, used)
     bind(to_size, to_real, to_index, to_keys, &b, used)
     # What lies side by side and does not depend on the room at once.
-    copy_reals(a.setting, b.setting, a.rot - a.setting)
-    copy_reals(a.fat, b.fat, a.joint_error - a.fat)
-    copy_reals(a.joint_impulse, b.joint_impulse, a.v_free - a.joint_impulse)
-    copy_reals(a.cache_impulse, b.cache_impulse, N_CACHE_IMPULSE * c)
-    copy_reals(a.cache_local, b.cache_local, 6 * c)
-    copy_reals(a.cache_roll, b.cache_roll, 3 * c if size[ROWS_PER_CONTACT] > 4 else 0)
-    copy_ints(a.head, b.head, a.pair - a.head)
-    copy_ints(a.joint_body, b.joint_body, 2 * kj)
-    copy_ints(a.ptr, b.ptr, kj + c + 1)
-    copy_keys(a.cache_key, b.cache_key, c)
+    memcpy(b.setting, a.setting, (a.rot - a.setting) * sizeof(double))
+    memcpy(b.fat, a.fat, (a.joint_error - a.fat) * sizeof(double))
+    memcpy(b.joint_impulse, a.joint_impulse, (a.v_free - a.joint_impulse) * sizeof(double))
+    memcpy(b.cache_impulse, a.cache_impulse, N_CACHE_IMPULSE * c * sizeof(double))
+    memcpy(b.cache_local, a.cache_local, 6 * c * sizeof(double))
+    memcpy(b.cache_roll, a.cache_roll, (3 * c if size[ROWS_PER_CONTACT] > 4 else 0) * sizeof(double))
+    memcpy(b.head, a.head, (a.pair - a.head) * sizeof(int32_t))
+    memcpy(b.joint_body, a.joint_body, 2 * kj * sizeof(int32_t))
+    memcpy(b.ptr, a.ptr, (kj + c + 1) * sizeof(int32_t))
+    memcpy(b.cache_key, a.cache_key, c * sizeof(uint64_t))
     b.head[H_PAIRS_VALID] = 0
 
 

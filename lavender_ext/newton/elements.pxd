@@ -89,7 +89,9 @@ cdef inline void invert_small(double* a, double* inv, int32_t n) noexcept nogil:
                         inv[i * n + j] -= x * inv[k * n + j]
 
 
-cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
+cdef inline void element_times(const elements_t* e, const double* w, const double* x, double* out,
+                               const bint turned) noexcept nogil:
+    """out = W x, or W^T x, of one small matrix for each element."""
     cdef int32_t i, j, r, c, nr
     cdef double t
     if e.n == e.m:
@@ -102,18 +104,5 @@ cdef inline void element_times(const elements_t* e, const double* w, const doubl
         for r in range(nr):
             t = 0.0
             for c in range(nr):
-                t += w[e.wptr[i] + r * nr + c] * x[j + c]
-            out[j + r] = t
-
-
-cdef inline void element_times_transposed(const elements_t* e, const double* w, const double* x, double* out) noexcept nogil:
-    cdef int32_t i, j, r, c, nr
-    cdef double t
-    for i in range(e.n):
-        j = e.ptr[i]
-        nr = e.ptr[i + 1] - j
-        for r in range(nr):
-            t = 0.0
-            for c in range(nr):
-                t += w[e.wptr[i] + c * nr + r] * x[j + c]
+                t += w[e.wptr[i] + (c * nr + r if turned else r * nr + c)] * x[j + c]
             out[j + r] = t

@@ -20,7 +20,7 @@ from lavender_ext.factor.cholesky cimport block_cholesky, block_solve
 from lavender_ext.factor.dense cimport PANEL, cholesky_room, dense_cholesky, dense_cholesky_solve, dense_lu, dense_lu_solve
 from lavender_ext.factor.lu cimport block_lu, block_lu_solve
 from lavender_ext.newton.cones cimport is_high, is_low
-from lavender_ext.newton.elements cimport element_times, element_times_transposed, elements_t, is_row
+from lavender_ext.newton.elements cimport element_times, elements_t, is_row
 from lavender_ext.newton.natural_map cimport natural
 from lavender_ext.newton.normal_matrix cimport normal_matrix
 from lavender_ext.newton.panel cimport to_bodies, to_rows
@@ -184,7 +184,7 @@ cdef inline void form_dense(system_t* s, int32_t what, double eps) noexcept nogi
     else:
         times_left(e, s.bt if what == OF_BARRIER else s.pair, s.h, s.lower)
         for j in range(m):
-            element_times(e, s.bt, s.lower + <int64_t>j * m, s.whole + <int64_t>j * m)
+            element_times(e, s.bt, s.lower + <int64_t>j * m, s.whole + <int64_t>j * m, False)
             s.whole[<int64_t>j * (m + 1)] += 1.0
 
 
@@ -282,22 +282,22 @@ cdef inline void system_solve(system_t* s, int32_t what, const double* r, double
     cdef int32_t j, m = s.e.m
     cdef const double* left = s.pair if what == OF_PAIR else s.bt
     if s.form == BODIES and not s.augmented:
-        element_times(s.e, s.v, r, s.t)
+        element_times(s.e, s.v, r, s.t, False)
         over_bodies(s, s.t, s.q)
         for j in range(m):
             s.q[j] = r[j] - s.q[j]
         if s.bt == NULL:
-            element_times(s.e, s.v, s.q, out)
+            element_times(s.e, s.v, s.q, out, False)
         else:
             # B (B^T ...): V itself has lost the small end of its scaling to the large one.
-            element_times(s.e, left, s.q, s.t)
-            element_times_transposed(s.e, s.bt, s.t, out)
+            element_times(s.e, left, s.q, s.t, False)
+            element_times(s.e, s.bt, s.t, out, True)
     elif s.bt != NULL:
-        element_times(s.e, left, r, s.t)
+        element_times(s.e, left, r, s.t, False)
         over_rows(s, s.t)
-        element_times_transposed(s.e, s.bt, s.t, out)
+        element_times(s.e, s.bt, s.t, out, True)
     elif s.augmented:
-        element_times(s.e, s.v, r, out)
+        element_times(s.e, s.v, r, out, False)
         over_rows(s, out)
     else:
         memcpy(out, r, m * sizeof(double))
@@ -315,12 +315,12 @@ cdef inline void solve_natural(system_t* s, const double* r, double* out) noexce
     """dz of (3); r is not out."""
     cdef int32_t j, m = s.e.m
     if s.form == BODIES and not s.augmented:
-        element_times(s.e, s.einv, r, s.t)
+        element_times(s.e, s.einv, r, s.t, False)
         over_bodies(s, s.t, s.q)
-        element_times(s.e, s.p, s.q, s.t)
+        element_times(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             s.t[j] = r[j] - s.t[j]
-        element_times(s.e, s.einv, s.t, out)
+        element_times(s.e, s.einv, s.t, out, False)
         return
     if s.augmented or (s.form == SPARSE and s.bt != NULL):
         memcpy(out, r, m * sizeof(double))
@@ -333,7 +333,7 @@ cdef inline void solve_natural(system_t* s, const double* r, double* out) noexce
             for j in range(m):
                 s.t[j] = r[j] - s.p[j] * r[j]
         system_times(s, s.t, s.q)
-        element_times(s.e, s.p, s.q, s.t)
+        element_times(s.e, s.p, s.q, s.t, False)
         for j in range(m):
             out[j] = r[j] - s.t[j]
     over_rows(s, out)
@@ -345,7 +345,7 @@ cdef inline void natural_times(system_t* s, const double* dz, double* out) noexc
     system_times(s, dz, s.q)
     for j in range(s.e.m):
         s.q[j] -= dz[j]
-    element_times(s.e, s.p, s.q, out)
+    element_times(s.e, s.p, s.q, out, False)
     for j in range(s.e.m):
         out[j] += dz[j]
 
