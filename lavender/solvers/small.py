@@ -174,9 +174,9 @@ class SmallCall:
     def _call(self, problem: Problem, impulse: FloatArray | None, tol: float) -> tuple[str, float, bytes]:
         return self.name, tol, (problem._start if impulse is None else impulse).tobytes()
 
-    def failed(self, problem: Problem, counts: tuple[int, ...]) -> list[tuple[str, Claim]]:
+    def failed(self, problem: Problem, counts: tuple[int, ...] | None) -> list[tuple[str, Claim]]:
         """Who did what in a call of these counts, which did not solve the problem."""
-        if not any(counts):
+        if counts is None or not any(counts):  # None: of a start that was judged and is the result
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]

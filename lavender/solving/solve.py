@@ -484,6 +484,8 @@ def solve_small(
         return None
     status = CONVERGED
     if judged.relative > tol:
+        if limit == math.inf or judged.relative == judged.floor:
+            return None  # not the limit: beside such impulses rounding hides b
         status, judged = TIME_LIMIT, best_of(problem, judged, given)
     kept = given if given is None or impulse is None else given.copy()  # the caller may write into his own
     judged.impulse.setflags(write=False)

@@ -149,6 +149,16 @@ def test_a_path_that_is_longer_than_the_budget_is_not_the_end(most):
     assert solution.success or most < 294
 
 
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_what_rounding_hides_is_no_matter_of_time(limit):
+    """A row that is held where 2^-53 A lambda is a thousandth of b: told as TIME_LIMIT, also where there was none."""
+    held = lv.Problem.lcp([[1e13]], [1.0], [1.5], [1.5])
+    solution = lv.solve(held, time_limit=limit)
+    assert solution.residual.relative == solution.residual.floor > 1e-3
+    assert solution.status is lv.Status.DIVERGED and "float64 loses b" in solution.message
+    assert lv.solve_many([held], time_limit=limit).status.tolist() == [lv.Status.DIVERGED]
+
+
 def test_a_late_solution_is_a_solution():
     problem = draw("general cone", 3)
     late = lv.solve(problem)
