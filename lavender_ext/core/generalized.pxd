@@ -10,6 +10,7 @@ Rows that stand together and reach the same columns share a panel: one list of c
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
 
+from lavender_ext.core.bits cimport highest, lowest
 from lavender_ext.core.tree cimport ldl_solve, take_from, take_two
 
 
@@ -119,7 +120,7 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
     cdef const int32_t* parent = g.parent
-    cdef uint64_t on = 0, held = 0
+    cdef uint64_t on = 0, held = 0, left
     cdef double values = 0.0
     prow[0] = 0
     pcol[0] = 0
@@ -138,12 +139,9 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
             odd |= jidx[q] ^ jidx[q - entries]
         if odd:
             on = 0
-            top = -1
             for q in range(jptr[first], end):
-                k = jidx[q]
-                on |= above[k]
-                if k > top:
-                    top = k
+                on |= above[jidx[q]]
+            top = highest(on) if on else -1
         before = entries
         if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                              # the panel grows
@@ -161,10 +159,11 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
                     cols[c] = k
                     k = parent[k]
             else:
-                for k in range(top + 1):
-                    if on >> k & 1:
-                        cols[at + count] = k
-                        count += 1
+                left = on
+                while left:
+                    cols[at + count] = lowest(left)
+                    count += 1
+                    left &= left - 1
             at += count
             held = on
             n += 1

@@ -39,7 +39,7 @@ cdef struct descent_t:          # Newton steps under one law
 cdef struct wait_t:             # an island whose steps may be used up, to go on with
     int32_t island              # -1: none waits
     int32_t worst               # end of the islands before it
-    int32_t cold                # the run began from nothing
+    int32_t cold                # the run began from nothing; asked for Coulomb's law alone
     int32_t at                  # of a round of Coulomb friction
     int32_t rounds              # of Coulomb friction before this one
     double kept                 # error of the island's best, which a cut may have found,

@@ -506,7 +506,7 @@ cdef inline int32_t descend_all(flow_t* f, double* impulse) noexcept nogil:
     cdef int32_t i, end, first = f.wait.island
     if first < 0:
         first = 0
-        f.wait.worst, f.wait.cold = REACHED, is_nothing(&f.p, impulse)
+        f.wait.worst, f.wait.cold = REACHED, f.law == COULOMB and is_nothing(&f.p, impulse)
     for i in range(first, f.n_islands):
         end = solve_island(f, i, impulse)
         if end == MORE:                                # N is of this one

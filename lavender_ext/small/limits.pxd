@@ -9,7 +9,6 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport COULOMB, blocks_t, has_friction, is_rows
-from lavender_ext.generalized.newton cimport is_soft
 
 
 cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
@@ -47,10 +46,10 @@ cdef inline bint is_linear(const blocks_t* p) noexcept nogil:
     return True
 
 
-cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:
-    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many."""
+cdef inline double cost_of(const blocks_t* p, const generalized_t* g, const limits_t* l, double work, bint soft) noexcept nogil:
+    """What Newton's method is counted to cost [ns]: the one gate, for one problem and for many. soft: as `is_soft`."""
     cdef double count = l.bounded
-    cdef bint linear = is_linear(p), rubs = has_friction(p), soft = is_soft(p, g)
+    cdef bint linear = is_linear(p), rubs = has_friction(p)
     if linear:
         count = 1.0
     elif rubs:
@@ -71,9 +70,10 @@ cdef inline bint are_short(const generalized_t* g, double columns) noexcept nogi
     return True
 
 
-cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands) noexcept nogil:
+cdef inline double allowed(const blocks_t* p, const generalized_t* g, const limits_t* l, int32_t islands,
+                           bint soft) noexcept nogil:
     """What it may cost [ns], 0 where it is not asked: with a rigid row as much as sweeps, which may do with less."""
-    cdef bint rubs = has_friction(p), soft = is_soft(p, g)
+    cdef bint rubs = has_friction(p)
     cdef double each = l.sweep_cone if p.law != COULOMB and rubs else l.entry
     cdef double sweep = l.sweep_row * p.n_rows + each * (2.0 * g.pval[g.n_panels] + 4.0 * p.n_rows)
     cdef double most = l.coulomb_rows if p.law == COULOMB else INFINITY if soft else l.cone_rows

@@ -22,6 +22,7 @@ from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.generalized.newton cimport is_soft
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
@@ -153,6 +154,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     cdef options_t o = options_t(NEWTON, MOST, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
     cdef room_t r
     cdef int32_t m = j.p.n_rows, code = ROOM
+    cdef bint soft
     j.counts[0] = j.counts[1] = j.counts[2] = j.counts[3] = 0
     if not has_numbers(j):
         return
@@ -167,7 +169,8 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
             return
         r.index = room.index
         code = lav_start(&v, &o, &r, j.lam)
-    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work) > allowed(&j.p, &j.g, limits, r.islands):
+    soft = is_soft(&j.p, &j.g)
+    if code != ROOM or cost_of(&j.p, &j.g, limits, r.work, soft) > allowed(&j.p, &j.g, limits, r.islands, soft):
         return
     if not has_room(room, 0, r.n_real):
         return
@@ -226,7 +229,9 @@ cdef class Limits:
 
     def cost(self, Data p, double work, int islands):
         """What Newton's method is counted to cost [ns], `work` multiply-adds of a factor of each island; and may cost."""
-        return cost_of(&p.blocks, &p.general, &self.at, work), allowed(&p.blocks, &p.general, &self.at, islands)
+        cdef bint soft = is_soft(&p.blocks, &p.general)
+        return (cost_of(&p.blocks, &p.general, &self.at, work, soft),
+                allowed(&p.blocks, &p.general, &self.at, islands, soft))
 
 
 def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):

@@ -4,7 +4,7 @@ The same numbers as `Generalized` makes of the same arrays: J and the lower tria
 zeros, M = L^T D L in the order given, b = target - J v*. What `Generalized` would put into another order is left to it.
 """
 from libc.math cimport fabs, sqrt
-from libc.stdint cimport int32_t, int64_t, uint64_t
+from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
 from lavender_ext.core.door cimport first_outside, first_unsized, is_number, is_size, largest, least
@@ -14,6 +14,7 @@ from lavender_ext.core.method cimport room_t
 from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
+from lavender_ext.small.thin cimport thin
 
 
 cdef enum:                      # what became of a world
@@ -43,6 +44,7 @@ cdef enum:                      # arrays that may be in float32
     N_ARRAYS = 6
 
 cdef enum:
+    BESIDE = 8                  # numbers behind its entries that `thin` may write
     MESH = 400                  # velocities from which on `Generalized` looks for another order
 
 
@@ -94,43 +96,44 @@ cdef inline const double* widened(const worlds_t* w, int32_t which, int64_t firs
 
 cdef inline bint has_outside(const double* x, int32_t n) noexcept nogil:
     """Does the door exclude any of these? Not where even their sum is a number, of which four are added at once."""
-    cdef int32_t i = 0
-    cdef double s0 = 0.0, s1 = 0.0, s2 = 0.0, s3 = 0.0
+    cdef int32_t i = 0, k
+    cdef double s[4]
+    s[0] = s[1] = s[2] = s[3] = 0.0
     while i + 4 <= n:
-        s0 += fabs(x[i])
-        s1 += fabs(x[i + 1])
-        s2 += fabs(x[i + 2])
-        s3 += fabs(x[i + 3])
+        for k in range(4):
+            s[k] += fabs(x[i + k])
         i += 4
     while i < n:
-        s0 += fabs(x[i])
+        s[0] += fabs(x[i])
         i += 1
-    return not is_number((s0 + s1) + (s2 + s3)) and first_outside(x, n) >= 0
-
-
-cdef inline bint put(const double* x, int32_t column, int32_t* idx, double* val) noexcept nogil:
-    """An entry where the next one goes if it is 0: a branch would be guessed. By its bits, of which the sign does not count."""
-    idx[0] = column
-    val[0] = x[0]
-    return (<const uint64_t*>x)[0] << 1 != 0
+    return not is_number((s[0] + s[1]) + (s[2] + s[3])) and first_outside(x, n) >= 0
 
 
 cdef inline int32_t rows_of(const double* a, int64_t row, int32_t m, int32_t n, int32_t* ptr, int32_t* idx,
                             double* val) noexcept nogil:
     """J in compressed rows; its entries."""
-    cdef int32_t i, j, q = 0
+    cdef int32_t i, q = 0
     ptr[0] = 0
     for i in range(m):
-        for j in range(n):
-            q += put(a + j, j, idx + q, val + q)
+        q += thin(n, a, NULL, idx + q, val + q)
         a += row
         ptr[i + 1] = q
     return q
 
 
+cdef inline bint is_symmetric(const double* a, int64_t row, int32_t n) noexcept nogil:
+    """To the last bit but the sign of 0? Without a branch."""
+    cdef int32_t i, j, odd = 0
+    for i in range(n):
+        for j in range(i):
+            odd |= a[i * row + j] != a[j * row + i]
+    return not odd
+
+
 cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, int32_t n, int32_t* ptr, int32_t* idx,
                                 double* val) noexcept nogil:
     """The lower triangle of M with its diagonal in compressed rows; its entries, -1 where M is not symmetric."""
+    cdef bint whole = is_symmetric(a, row, n)
     cdef const double* own = a
     cdef const double* other
     cdef int32_t i, j, q = 0
@@ -138,7 +141,9 @@ cdef inline int32_t triangle_of(const double* a, int64_t row, double allowed, in
     ptr[0] = 0
     for i in range(n):
         other = a + i
-        for j in range(i):
+        if whole:
+            q += thin(i, own, NULL, idx + q, val + q)
+        for j in range(0 if whole else i):
             if own[j] != 0.0 or other[0] != 0.0:
                 idx[q] = j
                 val[q] = own[j]
@@ -163,9 +168,10 @@ cdef inline int32_t thinned(const int32_t* given, const int32_t* col, const doub
     cdef int32_t i, k, q = 0
     ptr[0] = 0
     for i in range(n):
-        for k in range(given[i], given[i + 1] - 1):
-            q += put(x + k, col[k], idx + q, val + q)
-        put(x + given[i + 1] - 1, i, idx + q, val + q)
+        k = given[i]
+        q += thin(given[i + 1] - k - 1, x + k, col + k, idx + q, val + q)
+        idx[q] = i
+        val[q] = x[given[i + 1] - 1]
         q += 1
         ptr[i + 1] = q
     return q
@@ -275,13 +281,13 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
     cdef int32_t m = <int32_t>at[ROWS], n = <int32_t>at[VELOCITIES], k = <int32_t>at[BLOCKS], j, entries
     cdef bint whole = True
     cdef int64_t all = <int64_t>m * n, half = <int64_t>n * (n + 1) // 2, row = w.jac_row
-    cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1, wide = all if m > n else <int64_t>n * n
+    cdef int64_t numbers = all + 2 * half + 4 * n + 2 * m + k + 1 + BESIDE, wide = all if m > n else <int64_t>n * n
     cdef const double* a
     cdef int32_t* ptr
     cdef int32_t* idx
     cdef double* x
     cdef double* b
-    if n >= MESH or not has_room(&d.room, m + 1 + all + n + 1 + half + k + 1, numbers + wide):
+    if n >= MESH or not has_room(&d.room, m + 1 + all + n + 1 + half + k + 1 + BESIDE, numbers + wide):
         return LEFT
     ptr, x = d.room.index, d.room.real
     idx = ptr + m + 1
