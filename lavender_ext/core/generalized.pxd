@@ -10,7 +10,7 @@ Rows that stand together and reach the same columns share a panel: one list of c
 from libc.math cimport fabs
 from libc.stdint cimport int32_t, uint64_t
 
-from lavender_ext.core.bits cimport highest, lowest
+from lavender_ext.core.bits cimport lowest
 from lavender_ext.core.tree cimport ldl_solve, take_from, take_two
 
 
@@ -116,7 +116,7 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
                                int32_t* prow, int32_t* pcol, int32_t* pval, int32_t* cols, int32_t room,
                                int32_t* n_cols, double* n_values) noexcept nogil:
     """`panel_pattern` of at most 64 velocities, sets of columns as bits; above (n) is scratch."""
-    cdef int32_t i, q, k, c, first, last, count = 0, before = -1, at = 0, n = 0, top = -1, nv = g.n, end, entries, odd
+    cdef int32_t i, q, k, first, last, count = 0, before = -1, at = 0, n = 0, nv = g.n, end, entries, odd
     cdef const int32_t* jptr = g.jptr
     cdef const int32_t* jidx = g.jidx
     cdef const int32_t* parent = g.parent
@@ -141,7 +141,6 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
             on = 0
             for q in range(jptr[first], end):
                 on |= above[jidx[q]]
-            top = highest(on) if on else -1
         before = entries
         if n > 0 and on == held and last - prow[n - 1] <= PANEL_ROWS:
             prow[n] = last                              # the panel grows
@@ -149,21 +148,11 @@ cdef inline int32_t few_panels(const generalized_t* g, int32_t n_blocks, const i
             if at + nv > room:
                 return -1
             count = 0
-            if top >= 0 and on == above[top]:           # one chain
-                k = top
-                while k >= 0:
-                    count += 1
-                    k = parent[k]
-                k = top
-                for c in range(at + count - 1, at - 1, -1):
-                    cols[c] = k
-                    k = parent[k]
-            else:
-                left = on
-                while left:
-                    cols[at + count] = lowest(left)
-                    count += 1
-                    left &= left - 1
+            left = on
+            while left:
+                cols[at + count] = lowest(left)
+                count += 1
+                left &= left - 1
             at += count
             held = on
             n += 1
