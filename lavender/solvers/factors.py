@@ -1,8 +1,8 @@
 """Factorisations: which one a matrix gets under `direct`, and one interface over them, `factor` and `solve`.
 
     band     LDL^T by diagonals in compiled code (small matrices, and any of small bandwidth)
-    dense    Cholesky (LAPACK potrf)
-    sparse   Cholesky by dense panels of a permuted matrix, in compiled code (`lavender_ext/factor/sparse.pyx`)
+    dense    Cholesky of a full matrix
+    sparse   Cholesky by dense panels of a permuted matrix, in compiled code as well (`lavender_ext/factor/sparse.pyx`)
     general  LU where A is not symmetric definite: with pivoting (LAPACK getrf, or SuperLU; compiled for few rows), or
              first by such panels, rows exchanged inside each, where A has few entries and theirs a symmetric pattern
 
@@ -25,7 +25,7 @@ from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.setup_times import dense_work
 from lavender_ext.factor.narrow import narrow_order
-from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
+from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
 TINY = 1e-13  # -, of d
 SMALL_SIZE = 64  # rows up to which the compiled factorisation beats LAPACK behind SciPy
@@ -120,15 +120,11 @@ class DenseFactor:
         d = self.d[free]
         if shift > 0.0:
             a.flat[:: n_free + 1] += shift * d
-        # Row-major input read as column-major is the transpose: the same matrix, and no copy.
-        self.c, info = lapack.dpotrf(a.T, lower=1, overwrite_a=1, clean=0)
-        if info != 0:
-            return n_free - info + 1
-        pivot = np.diagonal(self.c)
-        return int(np.count_nonzero(pivot * pivot <= TINY * d))
+        self.full = FullCholesky(a, TINY * d, WIDE)
+        return self.full.lost
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        return lapack.dpotrs(self.c, rhs, lower=1)[0]
+        return self.full.solve(rhs)
 
 
 class Panels:

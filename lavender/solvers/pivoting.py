@@ -6,7 +6,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline, Stopwatch
-from lavender.base.later import lapack, load
+from lavender.base.later import load
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 from lavender.solvers.factors import (
@@ -127,13 +127,9 @@ class PivotState:
     def rank(self) -> int:
         """Rank of a positive semidefinite A with all rows free, pivots of 1e-13 d counting as zero.
 
-        Band and sparse: the pivots just found (a zero pivot of a semidefinite matrix has a zero column, so
-        leaving it out is exact). Dense: Cholesky with pivoting.
+        A zero pivot of a semidefinite matrix has a zero column, so leaving it out is exact.
         """
-        if self.form != "dense":
-            return int(self.rows.rank)
-        scale = 1.0 / np.sqrt(self.problem.csr_data.d)
-        return int(lapack.dpstrf(scale[:, None] * self.problem.dense() * scale, tol=TINY)[2])
+        return int(self.rows.rank)
 
 
 def _filled(problem: Problem) -> float:

@@ -29,9 +29,12 @@ cdef inline int64_t cholesky_room(int32_t n) noexcept nogil:
     return panel_at(n, k) + <int64_t>(n - k) * (n - k)
 
 
-cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, double* l) noexcept nogil:
-    """(1) of a symmetric a (n, n) into l (`cholesky_room`), 1 / L_jj on its diagonal; 0 where a pivot is not positive."""
-    cdef int32_t k, p, j, t, w
+cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, const double* least, double* l) noexcept nogil:
+    """(1) of a symmetric a (n, n) into l (`cholesky_room`), 1 / L_jj on its diagonal; how many pivots are lost.
+
+    These are not above least (n) and leave a column of zeros; where that is NULL, not positive, and the first is the last.
+    """
+    cdef int32_t k, p, j, t, w, lost = 0
     cdef double zero[PANEL]
     cdef double* to
     for j in range(PANEL):
@@ -49,10 +52,11 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, dou
         while p < k:
             less_lower(wide, n - k, w, PANEL, l + panel_at(n, p) + (k - p), n - p, to, n - k)
             p += PANEL
-        if dense_panel(wide, w, n - k, to, zero):
-            return 0
+        lost += dense_panel(wide, w, n - k, to, &zero[0] if least == NULL else least + k)
+        if lost and least == NULL:
+            return lost
         k += PANEL
-    return 1
+    return lost
 
 
 cdef inline void dense_cholesky_solve(int32_t n, const double* l, double* x) noexcept nogil:

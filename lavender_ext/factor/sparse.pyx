@@ -1,4 +1,5 @@
-"""A sparse matrix of any pattern and its factor by dense panels: L L^T, or L U with rows exchanged inside a panel.
+"""A sparse matrix of any pattern and its factor by dense panels: L L^T, or L U with rows exchanged inside a panel; a full
+one and its L L^T.
 
     A_JJ' = A_JJ - sum over K below J of L_K U_K,   P A_JJ' = L_JJ U_JJ                                    (1)
     L_J = (A_J - sum L_K U_KJ) U_JJ^-1 below,   U_J = L_JJ^-1 P (A_J - sum L_JK U_K) beside                (2)
@@ -18,6 +19,7 @@ from lavender_ext.factor.symbolic import analysed
 
 from lavender_ext.core.csr cimport by_columns, csr_t, scan_entries
 from lavender_ext.factor.blocks cimport sparse_t
+from lavender_ext.factor.dense cimport cholesky_room, dense_cholesky, dense_cholesky_solve
 from lavender_ext.factor.supernodal cimport begin_panels, dense_panel, hand_on, place_rows, sparse_solve, take_panels
 from lavender_ext.factor.tiles cimport has_wide, less, take
 
@@ -347,3 +349,39 @@ cdef class SparsePanels:
     def order(self):
         """(n,) row eliminated first, second, ..."""
         return self.keep[0][:self.f.n]
+
+
+cdef class FullCholesky:
+    """L L^T of a full symmetric matrix (`dense.pxd`).
+
+    Parameters
+    ----------
+    a : (n, n) float64
+        Of which the entries at and after the diagonal are read.
+    least : (n,) float64
+        What each pivot must be above.
+    wide : bool
+        Four lanes where the machine has them: the same bits.
+    """
+
+    cdef double[::1] lower
+    cdef int32_t n
+    cdef readonly int lost      # pivots that were not
+
+    def __init__(self, const double[:, ::1] a, const double[::1] least, bint wide=True):
+        cdef int32_t n = <int32_t>a.shape[0]
+        if n < 1 or a.shape[1] != n or least.shape[0] != n:
+            raise ValueError("a square matrix of one row or more, and what each of its pivots must be above")
+        self.n, self.lower = n, np.empty(cholesky_room(n))
+        with nogil:
+            self.lost = dense_cholesky(wide and has_wide(), n, &a[0, 0], &least[0], &self.lower[0])
+
+    def solve(self, const double[::1] b):
+        """(n,); a new array."""
+        out = np.array(b)
+        cdef double[::1] x = out
+        if b.shape[0] != self.n:
+            raise ValueError("of another size")
+        with nogil:
+            dense_cholesky_solve(self.n, &self.lower[0], &x[0])
+        return out

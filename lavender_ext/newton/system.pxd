@@ -194,7 +194,7 @@ cdef inline int32_t factor_dense(system_t* s, int32_t what, double eps) noexcept
     if s.n_free >= 0:
         n = s.n_free
     s.by = BY_NONE
-    if symmetric and dense_cholesky(s.wide, n, s.whole, s.lower):
+    if symmetric and dense_cholesky(s.wide, n, s.whole, NULL, s.lower) == 0:
         s.by = BY_CHOLESKY
     elif dense_lu(s.wide, n, s.whole, s.swap, s.lower):
         s.by = BY_LU

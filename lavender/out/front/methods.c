@@ -247,7 +247,7 @@ static int32_t factor_shifted(lav_solver *s) {
       row[s->a.indices[q]] = s->a.data[q] / (root[i] * root[s->a.indices[q]]);
     row[i] += s->splitting.rho;
   }
-  return factor_dense_dense_cholesky(LAVENDER_HAS_WIDE(), m, s->table, s->table + (int64_t)m * m);
+  return !factor_dense_dense_cholesky(LAVENDER_HAS_WIDE(), m, s->table, NULL, s->table + (int64_t)m * m);
 }
 
 static void admm_step(void *context, double *lam, int32_t first, int32_t n) {
