@@ -36,6 +36,7 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, con
     """
     cdef int32_t k, p, j, t, w, lost = 0
     cdef double zero[PANEL]
+    cdef const double* bar = zero
     cdef double* to
     for j in range(PANEL):
         zero[j] = 0.0
@@ -52,7 +53,9 @@ cdef inline int32_t dense_cholesky(int32_t wide, int32_t n, const double* a, con
         while p < k:
             less_lower(wide, n - k, w, PANEL, l + panel_at(n, p) + (k - p), n - p, to, n - k)
             p += PANEL
-        lost += dense_panel(wide, w, n - k, to, &zero[0] if least == NULL else least + k)
+        if least != NULL:
+            bar = least + k
+        lost += dense_panel(wide, w, n - k, to, bar)
         if lost and least == NULL:
             return lost
         k += PANEL

@@ -6,7 +6,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lavender_ext.factor.sparse import SparsePanels, free_part, is_mirrored
+from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
 
 def mirrored(rng, n, block, density):
@@ -30,6 +30,23 @@ def definite(a):
     a = sp.csr_array(a + sp.diags_array(abs(a).sum(axis=1) + 0.1))
     a.sort_indices()
     return a
+
+
+@pytest.mark.parametrize("n", [1, 47, 48, 49, 200])
+def test_a_full_factor_solves_and_counts_what_is_lost(n):
+    """Of rank n / 2 the pivots after it are roundings: a right side in the range is solved all the same."""
+    rng = np.random.default_rng(n)
+    half, b = rng.normal(size=(n, n)), rng.normal(size=n)
+    a = half @ half.T + np.eye(n)
+    wide, narrow = (FullCholesky(a, 1e-13 * a.diagonal(), lanes) for lanes in (True, False))
+    assert wide.lost == narrow.lost == 0
+    np.testing.assert_array_equal(wide.solve(b), narrow.solve(b))
+    np.testing.assert_allclose(a @ wide.solve(b), b, atol=1e-10 * np.linalg.cond(a))
+    rank = -(-n // 2)
+    a = half[:, :rank] @ half[:, :rank].T
+    found = FullCholesky(a, 1e-13 * a.diagonal())
+    assert found.lost == n - rank
+    np.testing.assert_allclose(a @ found.solve(a @ b), a @ b, atol=1e-6 * abs(a).max())
 
 
 def test_trees_and_stars_fill_nothing():
