@@ -17,8 +17,8 @@
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
                                 SURE times that cost, at once of bounded rows that failed in the compiled call
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
-                                at up to MOST times the cost or LITTLE), `admm` or, of J and M, `nncg`, and sweeps as
-                                long as these gain; all together LAST times Newton's cost, and no longer than LONG
+                                at up to MOST times the cost or LITTLE), `admm`, `nncg`, and sweeps as long as these
+                                gain; all together LAST times Newton's cost, and no longer than LONG
     at last                     a certificate of others, by a linear program (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -56,7 +56,7 @@ ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, th
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
 LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
-LITTLE = 1e6  # ns of Newton's method over rows, which are worth a trial in any case
+LITTLE = 5e6  # ns of Newton's method over rows, which are worth a trial in any case
 FEW = 32.0  # sweeps before a factor that may fill
 MANY = 150.0  # sweeps before Newton's method on linear rows and cones: only where these cost less
 SPARSE, DENSE = 0.05, 0.5  # shares of entries, below which A is sparse, and above which it is dense
@@ -293,7 +293,8 @@ class Tree:
         cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         why = f"in turn, {times * MOST:g} times newton's cost"
         yield from self.factorisations(times * MOST)
-        yield self.iterations("admm" if self.problem.generalized is None else "nncg", cost, why)
+        yield self.iterations("admm", cost, why)
+        yield self.iterations("nncg", cost, why)
         if not self.swept and not self.problem.cones.has_round:
             before = self.best
             yield self.sweeps(cost, why)

@@ -53,15 +53,15 @@ FIRST = {
     "bounded rows of a dense matrix": (lambda: random_lcp(0, m=80), ["anderson", "anderson", "direct", "newton"]),
     "the cone law": (
         lambda: suite.granular(n=6, friction="coulomb").problem.relaxed("cone"),
-        ["anderson", "newton", "newton", "admm", "anderson"],
+        ["anderson", "newton", "newton", "admm", "nncg", "anderson"],
     ),
     "the cone law, 150 sweeps cost more than newton": (
         lambda: suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone"),
-        ["newton", "newton", "admm", "anderson"],
+        ["newton", "newton", "admm", "nncg", "anderson"],
     ),
     "the cone law, a matrix": (
         lambda: as_matrix(suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone")),
-        ["anderson", "anderson", "newton", "newton", "admm", "anderson"],
+        ["anderson", "anderson", "newton", "newton", "admm", "nncg"],
     ),
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
     "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
@@ -97,10 +97,10 @@ def test_the_tail_doubles(name):
         if stage.solver in last:
             assert stage.iterations == pytest.approx(2.0 * last[stage.solver])
         last[stage.solver] = stage.iterations
-    other = "admm" if tree.problem.generalized is None else "nncg"
-    assert {"anderson", "newton", other} <= set(last)
+    everybody = {"anderson", "newton", "admm", "nncg"}
+    assert everybody <= set(last)
     told = lv.explain(FIRST[name][0]())
-    assert {"anderson", "newton", other} <= set(told.in_turn) and other in str(told).splitlines()[-1]
+    assert everybody <= set(told.in_turn) and "admm, nncg" in str(told).splitlines()[-1]
 
 
 def test_sweeps_first_have_the_counted_cost():
@@ -118,7 +118,7 @@ def test_turns_end_where_nobody_gains():
     tree = Tree(problem)
     tree.best = 0.5
     turns = [stage.solver for stage in tree if stage.why.startswith("in turn")]
-    assert turns == ["admm", "anderson", "admm"], "twice, sweeps once"
+    assert turns == ["admm", "nncg", "anderson", "admm", "nncg"], "twice, sweeps once"
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -206,7 +206,7 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
         "lavender.solvers.auto.make", lambda name, log, tree: made.setdefault(name, Made(name, log))
     )
     solve(log, tree)
-    assert not Made.found and set(made) == {"anderson", "newton", "admm"}, (
+    assert not Made.found and set(made) == {"anderson", "newton", "admm", "nncg"}, (
         "one of each, asked again and again"
     )
     np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
@@ -381,9 +381,9 @@ def test_where_contacts_roll_the_tree_has_no_step_that_cannot_roll(form):
 
 def test_cones_that_sweeps_do_not_take_have_steps_that_do():
     general = random_general(0, "cone", n=8, compliance=False, contacts=4, tangents=5)
-    assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "nncg", "certificate"}
+    assert {stage.solver for stage in lv.explain(general).stages} <= {"newton", "admm", "nncg", "certificate"}
     matrix = lv.Problem(general.b, general.cones, general.csr, friction="cone")
-    assert {stage.solver for stage in lv.explain(matrix).stages} == {"admm"}
+    assert {stage.solver for stage in lv.explain(matrix).stages} == {"admm", "nncg"}
     assert lv.solve(matrix, tol=1e-4).solver.name == "auto"
 
 
