@@ -43,13 +43,13 @@ from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
 from lavender.solvers.certify import certify, least_violation
+from lavender.solvers.islands import pairs
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
 from lavender.solvers.steps import METHODS, PROBE, Direct, Iterations, Newton, Step, Sweeps, setup_time
-from lavender_ext.factor import graph
 
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
@@ -201,18 +201,7 @@ class Tree:
         p = self.problem
         if self.law != "coulomb" or p.cones.has_more_parts or np.count_nonzero(p.cones.is_contact) < PILE:
             return False
-        if p.matrix is not None:  # blocks between the same two bodies share the columns of A
-            indptr, indices, _ = p._compressed
-            summed = np.concatenate([[0], np.cumsum(indices, dtype=np.int64)])
-            rows = p.cones.ptr[:-1]
-            columns = np.stack(
-                [indptr[rows + 1] - indptr[rows], summed[indptr[rows + 1]] - summed[indptr[rows]]]
-            )
-            return 4 * np.unique(columns, axis=1).shape[1] > 3 * p.n_blocks
-        if p.rows is None:
-            return 4 * graph.tree_pairs(p.derived.view) > 3 * p.n_blocks
-        pairs = graph.body_pairs(p.rows.block_bodies, p.rows.n_bodies, True) if p.rows.n_bodies else 0
-        return 4 * pairs > 3 * p.n_blocks
+        return 4 * pairs(p) > 3 * p.n_blocks
 
     def __iter__(self) -> Iterator[Stage]:
         """The lines."""
@@ -270,8 +259,9 @@ class Tree:
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for."""
         cost = newton - self.begun
-        # Newton's method then takes what it is counted for.
+        # Newton's method then takes what it is counted for, if that is there.
         sure = self.law == "linear" or (self.law == "cone" and self.problem.matrix is None)
+        sure = sure and not self.deadline.passed(1e-9 * SURE * newton)
         pays = not sure or MANY * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost

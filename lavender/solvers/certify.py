@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import Proof, fighting, prove
-from lavender.judge.residuals import residual
+from lavender.judge.residuals import quick, reference, residual
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.problem.ordering import blocks_of_each
-from lavender.solvers.islands import restrict, rows_of
+from lavender.solvers.islands import islands, restrict, rows_of
 from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
@@ -200,13 +200,31 @@ def _linear_programs(log: SolveLog) -> None:
 def _parts(log: SolveLog) -> Any:
     """Unsolved islands and their rows, the smallest first; the whole problem if there is only one."""
     problem = log.problem
-    if log.islands[0] <= 1:
+    count, label = islands(problem)
+    if count <= 1:
         yield problem, slice(None)
         return
-    blocks = blocks_of_each(*log.islands)
-    for i in sorted(log.wrong_islands(), key=lambda i: len(blocks[i])):
+    blocks = blocks_of_each(count, label)
+    for i in sorted(_wrong(log, count, label), key=lambda i: len(blocks[i])):
         rows = rows_of(problem, blocks[i])
         yield restrict(problem, blocks[i], rows), rows
+
+
+def _wrong(log: SolveLog, count: int, label: IntArray) -> IntArray:
+    """The islands that miss an equal share of the tolerance in energy, or the tolerance in velocity.
+
+    A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
+    """
+    problem = log.problem
+    energy, velocity = reference(problem)
+    gap, error = np.empty(problem.m), np.empty(problem.m)
+    quick(problem, log.impulse, gap, error)
+    of_row = np.repeat(label, np.diff(problem.cones.ptr))
+    own = np.bincount(of_row, problem.d * error**2, minlength=count)
+    fast = np.zeros(count)
+    np.maximum.at(fast, of_row, problem.metric.weight * np.abs(error))
+    wrong = ~(own <= (log.tol * energy) ** 2 / count) | ~(np.sqrt(2.0) * fast <= log.tol * velocity)
+    return np.flatnonzero(wrong).astype(np.int32)
 
 
 def _is_open(problem: Problem) -> bool:

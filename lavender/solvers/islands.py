@@ -27,6 +27,22 @@ def islands(problem: Problem) -> tuple[int, IntArray]:
     return graph.matrix_components(cones.ptr, block, indptr, indices)
 
 
+def pairs(problem: Problem) -> int:
+    """How many pairs of bodies, or of trees of M, have a block between them.
+
+    Of a matrix, how many blocks have columns of their own: those between the same two bodies share them.
+    """
+    if problem.rows is not None:
+        return graph.body_pairs(problem.rows.block_bodies, problem.rows.n_bodies)
+    if problem.generalized is not None:
+        return graph.tree_pairs(problem.derived.view)
+    indptr, indices, _ = problem._compressed
+    summed = np.concatenate([[0], np.cumsum(indices, dtype=np.int64)])
+    first = problem.cones.ptr[:-1]
+    columns = [indptr[first + 1] - indptr[first], summed[indptr[first + 1]] - summed[indptr[first]]]
+    return int(np.unique(np.stack(columns), axis=1).shape[1])
+
+
 def rows_of(problem: Problem, blocks: IntArray) -> IntArray:
     """Row numbers of these blocks, in order."""
     ptr = problem.cones.ptr

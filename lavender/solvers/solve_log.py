@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, IntArray
+from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import FLOOR_MOST, at_floor, known, quick, reference, remember, remembered
+from lavender.judge.residuals import FLOOR_MOST, at_floor, known, quick, remember, remembered
 from lavender.judge.solution import Claim, Status, Turn
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
-from lavender.solvers.islands import islands
 from lavender.solvers.small import NO_TIME, NOTHING, told
 from lavender_ext.core.problem import Data
 from lavender_ext.judge.measure import Judged
@@ -178,27 +177,3 @@ class SolveLog:
             [] if self.certificate is not None else ["of the convex relaxation, " + self.conflict.proof.words]
         )
         return [*told, self.conflict.advice]
-
-    # -- islands ---------------------------------------------------------------------------------
-
-    @cached_property
-    def islands(self) -> tuple[int, IntArray]:
-        """The number of islands, and the island of each block."""
-        return islands(self.problem)
-
-    def wrong_islands(self) -> IntArray:
-        """The islands that miss an equal share of the tolerance in energy, or the tolerance in velocity.
-
-        A pair of tangents counts by its norm, at most sqrt(2) times its larger entry.
-        """
-        count, label = self.islands
-        problem = self.problem
-        energy, velocity = reference(problem)
-        _, error = room = self._room
-        quick(problem, self.impulse, *room)
-        of_row = np.repeat(label, np.diff(problem.cones.ptr))
-        own = np.bincount(of_row, problem.d * error**2, minlength=count)
-        fast = np.zeros(count)
-        np.maximum.at(fast, of_row, problem.metric.weight * np.abs(error))
-        wrong = ~(own <= (self.tol * energy) ** 2 / count) | ~(np.sqrt(2.0) * fast <= self.tol * velocity)
-        return np.flatnonzero(wrong).astype(np.int32)

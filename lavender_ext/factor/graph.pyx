@@ -147,8 +147,8 @@ def tree_components(Data p):
     return count, label_array
 
 
-def body_pairs(const int32_t[:, ::1] body, int n_bodies, bint still):
-    """Pairs of bodies with a block between them, of blocks between bodies (k, 2); with a static one where `still`."""
+def body_pairs(const int32_t[:, ::1] body, int n_bodies):
+    """Pairs of bodies with a block between them, of blocks between bodies (k, 2), static ones too."""
     cdef int32_t k = <int32_t>body.shape[0], i, b, low, high, count = 0
     cdef int32_t[::1] first = np.full(n_bodies + 1, -1, np.int32), mark = np.full(n_bodies + 1, -1, np.int32)
     cdef int32_t[::1] following = np.empty(k, np.int32)
@@ -157,7 +157,7 @@ def body_pairs(const int32_t[:, ::1] body, int n_bodies, bint still):
             low = min(body[i, 0], body[i, 1])
             following[i] = first[low + 1]               # a list of the blocks of each lower body
             first[low + 1] = i
-        for b in range(0 if still else 1, n_bodies + 1):
+        for b in range(n_bodies + 1):
             i = first[b]
             while i >= 0:
                 high = max(body[i, 0], body[i, 1])
@@ -185,7 +185,7 @@ def tree_pairs(Data p):
                         body[i, 0] = t
                     if t > body[i, 1]:
                         body[i, 1] = t
-    return body_pairs(body, g.n, True)
+    return body_pairs(body, g.n)
 
 
 cdef enum:
