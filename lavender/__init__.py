@@ -204,6 +204,6 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
-for _name in ("auto", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
+for _name in ("auto", "admm", "anderson", "direct", "newton", "nncg"):  # and whom `auto` asks
     get(_name)  # with the package: the first solve may have a time limit
 lavender.base.starting.end()
