@@ -6,7 +6,7 @@ of the sweeps done so far, no further than as many again. A residual that does n
 that eighth. The relative residual r decides:
 
     r <= tol                                        CONVERGED
-    r not finite, or > 1e6 max(1, r at the start)   DIVERGED
+    r not finite, or > 1e6 max(1, r of the first 8) DIVERGED
     no better than the best so far, and
         best <= 1e-6 and best <= 2 floor            AT_FLOOR
         sweeps > 32 * sweeps of the best + patience, and nothing
@@ -31,6 +31,10 @@ cpdef enum:
     AT_FLOOR = 4
 
 
+cdef enum:
+    EARLY = 8                   # sweeps
+
+
 cdef struct watch_t:
     int32_t total               # sweeps done
     int32_t check_at            # sweeps at the next check
@@ -38,7 +42,7 @@ cdef struct watch_t:
     int32_t best_at             # sweeps at the best check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
     int32_t again_at            # best_at of the iterate that was begun anew from, 0 before any
-    double start                # relative residual at the first check
+    double start                # largest relative residual of the first EARLY sweeps: where nothing is nearly right, they rise
     double last                 # at the last one
     double best_relative        # of the best check
     double start_energy         # sqrt J, of doing nothing
@@ -105,7 +109,7 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     if now <= tol:                                      # once more, beside what rounding hides
         judge_view(v, lam, s.w, s.e, s.v, True, &x)
         now = relative_of(&x, s.w, p.n_rows, s.start_energy, s.start_velocity)
-    if s.total == 0:
+    if s.total <= EARLY and s.start < now < inf:
         s.start = now
     see(&s.progress, s.total, now)
     s.check_at = s.total + until_next(s, now, tol)
