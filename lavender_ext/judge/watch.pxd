@@ -32,7 +32,7 @@ cpdef enum:
 
 
 cdef enum:
-    EARLY = 8                   # sweeps
+    EARLY = 8                   # sweeps, whose residuals rise where doing nothing is nearly right
 
 
 cdef struct watch_t:
@@ -42,7 +42,7 @@ cdef struct watch_t:
     int32_t best_at             # sweeps at the best check, -1 before any
     int32_t patience            # sweeps that may always pass without a better check
     int32_t again_at            # best_at of the iterate that was begun anew from, 0 before any
-    double start                # largest relative residual of the first EARLY sweeps: where nothing is nearly right, they rise
+    double start                # largest relative residual of the first EARLY sweeps
     double last                 # at the last one
     double best_relative        # of the best check
     double start_energy         # sqrt J, of doing nothing

@@ -200,7 +200,7 @@ def test_work_is_told_once_however_a_run_is_cut(m):
 
 @pytest.mark.parametrize("slide", [0.6, 6.0])
 def test_first_solves_that_rise_are_no_divergence(slide):
-    """A contact that hardly presses and slides: beside doing nothing, which is nearly right, the first residuals are large."""
+    """A contact that hardly presses, and slides: residuals are large beside that of doing nothing."""
     problem = lv.Problem.contact(np.diag([2.4, 4.4, 0.9]), [3.7e-7, 0.2 * slide, -slide], [1.0])
     solution = lv.solve(problem, "admm", tol=1e-8)
     assert solution.success and solution.iterations > 8
