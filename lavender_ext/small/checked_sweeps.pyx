@@ -14,7 +14,7 @@ import numpy as np
 from lavender_ext.accelerate.accelerated cimport AcceleratedSweeps
 from lavender_ext.core.problem cimport Data
 from lavender_ext.judge.measure cimport Judged
-from lavender_ext.judge.watch cimport RUNNING, Watch
+from lavender_ext.judge.watch cimport Watch
 
 run = AcceleratedSweeps.run
 
