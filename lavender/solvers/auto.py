@@ -390,7 +390,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
                 return
             if isinstance(step, Newton | Direct):
                 cost = step.state.cost if isinstance(step, Newton) else stage.cost
-                step.over = not tree.has_time(METHODS[stage.solver][0], cost)
+                step.over = step.late = not tree.has_time(METHODS[stage.solver][0], cost)
             elif step.state is None and isinstance(step, Iterations):
                 step.over = log.deadline.passed(SURE * setup_time(stage.solver, log.problem))
         if step.over:
@@ -404,10 +404,12 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
 
 
 def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
-    """Whether after work of this cost [ns] anybody who factors would still have a result in time."""
+    """Whether after work of this cost [ns] anybody who factors would still have a result in time, or all have ended."""
     if "states" not in vars(tree):
         return tree.has_time("newton", tree.least, cost)
     able = [name for name in tree.states if name not in steps or not steps[name].over]
+    if tree.states and not able and not any(steps[name].late for name in tree.states):
+        return True
     return bool(able) and tree.has_time("newton", tree.newton, cost)
 
 

@@ -63,7 +63,7 @@ def setup_time(name: str, problem: Problem) -> float:
 class Step:
     """A solver on the problem of a log."""
 
-    over = False  # it has nothing more to do
+    over = late = False  # it has nothing more to do, or no time for it
     least = np.inf  # iterations that may be predicted to be left, and it goes on
     state: Any = None
     impulse: FloatArray  # (m,) N s
@@ -81,6 +81,7 @@ class Step:
             log.failure, self.over = last_words(error), True
             claim = Claim(Status.NUMERICAL_ERROR, 0)
         self.over = self.over or claim.status is not Status.MAX_ITERATIONS
+        self.late = claim.status is Status.TIME_LIMIT
         log.note(self.name, claim, before)
 
     def turn(self, n: int) -> Claim:

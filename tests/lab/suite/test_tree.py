@@ -15,7 +15,7 @@ from lavender.judge.residuals import reference
 from lavender.lab.suite.build import Bodies, Contacts, contact_problem
 from lavender.problem import OPERATORS
 from lavender.solvers import costs
-from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve
+from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve, tree_goes_on
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
 from lavender.solvers.steps import METHODS, NEAR, Iterations, Newton, Step, Sweeps
@@ -110,6 +110,20 @@ def test_sweeps_first_have_the_counted_cost():
     one, two, newton = islice(tree, 3)
     assert (one.cost + two.cost) == pytest.approx(tree.newton)
     assert tree.least <= tree.newton and newton.cost == pytest.approx(MOST * tree.newton)
+
+
+def test_sweeps_use_up_a_limit_where_who_factors_had_no_time_and_not_where_they_ended():
+    problem = suite.pyramid(k=4, friction="coulomb").problem
+    reference(problem)
+    tree = Tree(problem, Deadline(60.0))
+    steps = {name: Newton(name, SolveLog(problem, 1e-6, 10)) for name in tree.states}
+    assert steps and tree_goes_on(tree, steps, 1.0)
+    for step in steps.values():
+        step.over = True
+    assert tree_goes_on(tree, steps, 1.0)
+    for step in steps.values():
+        step.late = True
+    assert not tree_goes_on(tree, steps, 1.0)
 
 
 def test_turns_end_where_nobody_gains():
