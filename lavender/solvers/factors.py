@@ -28,14 +28,14 @@ from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
 TINY = 1e-13  # -, of d
-SMALL_SIZE = 64  # rows up to which the compiled factorisation beats LAPACK behind SciPy
+SMALL_SIZE = 64  # rows up to which factors stay in the compiled loop, and beat those that Python hands it
 SMALL_BAND = 40  # half bandwidth up to which it beats the others
 DENSE_SHARE = 0.1  # of nonzeros, from which dense Cholesky beats sparse
 PANELS_SHARE = 0.25  # of nonzeros, up to which panels are looked at for a linear system
-# ns: of a compiled band for each row and square of its width; of LAPACK's Cholesky a call, and for each multiply-add
-# and entry; of panels, their analysis included, a call, and for each nonzero of A, as many times more as it has some
-# thousand rows.
-BAND, LAPACK, DENSE, DENSE_ENTRY = 0.4, 20e3, 0.03, 3.0
+# ns: of a compiled band for each row and square of its width; of a full Cholesky a call, and for each multiply-add and
+# entry (LAPACK's on one thread, 0.7 to 1 of ours); of panels, their analysis included, a call, and for each nonzero of
+# A, as many times more as it has some thousand rows.
+BAND, FULL, DENSE, DENSE_ENTRY = 0.4, 20e3, 0.03, 3.0
 PANELS, PANELS_ENTRY, PANELS_ROWS = 20e3, 17.0, 8000.0
 PANELS_WORK = 0.2  # ns a multiply-add of panels, once these are counted
 DENSE_LIMIT = 6000  # rows, 288 MB
@@ -60,7 +60,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
     if problem.law == "linear" and nnz <= PANELS_SHARE * m * m:
         # One factor: by what it costs.
         narrow = BAND * m * float(band + 1) ** 2
-        full = LAPACK + dense_cost(m)
+        full = FULL + dense_cost(m)
         if panels_cost(nnz, m) < min(narrow, full if m <= DENSE_LIMIT else np.inf):
             return "sparse", m - 1, None
         return ("band", band, None) if narrow <= full else ("dense", m - 1, None)
@@ -77,7 +77,7 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
 
 
 def dense_cost(m: int) -> float:
-    """Of one Cholesky factor of m rows by LAPACK [ns], without the call."""
+    """Of one full Cholesky factor of m rows [ns], without the call."""
     return DENSE * dense_work(m) + DENSE_ENTRY * float(m) ** 2
 
 
