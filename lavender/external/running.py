@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -201,23 +202,78 @@ def _once(
 
 @contextlib.contextmanager
 def quiet(noisy: bool) -> Iterator[list[str]]:
-    """Collect the warnings of a backend and swallow what it writes to sys.stdout and sys.stderr.
+    """Collect the warnings of a backend and swallow what it writes to sys.stdout and sys.stderr, in this thread alone.
 
     With `noisy` also what compiled code prints: that needs the file descriptors of the whole process,
     so only backends known to print pay for it.
     """
     said: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with _by_thread, _nowhere if noisy else contextlib.nullcontext():
+        outer, _here.said, _here.printed = (_here.said, _here.printed), said, io.StringIO()
         try:
-            with (
-                contextlib.redirect_stdout(io.StringIO()),
-                contextlib.redirect_stderr(io.StringIO()),
-                _descriptors_to_null() if noisy else contextlib.nullcontext(),
-            ):
-                yield said
+            yield said
         finally:
-            said += [str(w.message).strip() for w in caught if not issubclass(w.category, DeprecationWarning)]
+            _here.said, _here.printed = outer
+
+
+class _Here(threading.local):
+    """Where words of this thread go while it runs a backend; None while it runs none."""
+
+    said: list[str] | None = None
+    printed: io.StringIO | None = None
+
+
+_here = _Here()
+
+
+class _Stream:
+    """Stands for sys.stdout or sys.stderr: the stream itself for threads that run no backend."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream if _here.printed is None else _here.printed, name)
+
+
+class _Shared:
+    """A context of the whole process: the first thread enters it, the last one leaves it."""
+
+    def __init__(self, make: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
+        self._make, self._lock, self._inside = make, threading.Lock(), 0
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._context = self._make()
+                self._context.__enter__()
+            self._inside += 1
+
+    def __exit__(self, *error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._context.__exit__(None, None, None)
+
+
+@contextlib.contextmanager
+def _words_by_thread() -> Iterator[None]:
+    with (
+        warnings.catch_warnings(),
+        contextlib.redirect_stdout(_Stream(sys.stdout)),
+        contextlib.redirect_stderr(_Stream(sys.stderr)),
+    ):
+        show = warnings.showwarning
+
+        def hear(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if _here.said is None:
+                show(message, category, *where)
+            elif not issubclass(category, DeprecationWarning):
+                _here.said.append(str(message).strip())
+
+        warnings.showwarning = hear  # type: ignore[assignment]
+        warnings.simplefilter("always")
+        yield
 
 
 @contextlib.contextmanager
@@ -236,3 +292,6 @@ def _descriptors_to_null() -> Iterator[None]:
             os.dup2(copy, fd)
             os.close(copy)
         os.close(null)
+
+
+_by_thread, _nowhere = _Shared(_words_by_thread), _Shared(_descriptors_to_null)

@@ -13,7 +13,6 @@ A pivot of at most 1e-13 d_i counts as zero: some hundred roundings of A_ii, and
 from __future__ import annotations
 
 import os
-import warnings
 from typing import Any, Protocol
 
 import numpy as np
@@ -195,9 +194,7 @@ def _scaled(problem: Problem) -> tuple[FloatArray, sp.csr_array]:
 def _superlu(a: sp.csc_array) -> tuple[Any, FloatArray]:
     """LU with pivoting and the sizes of its pivots; one of 0 alone where it is exactly singular."""
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            lu = sparse_lu(a)
+        lu = sparse_lu(a)
         return lu, np.abs(lu.U.diagonal())
     except RuntimeError:
         return None, np.zeros(1)

@@ -1,6 +1,11 @@
 """What every QP backend owes its user: its own name, its own words, silence, and never an exception."""
 
 import itertools
+import os
+import sys
+import threading
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,7 +15,7 @@ from random_problems import random_contact_problem, spd, touching
 import lavender as lv
 from lavender import registry
 from lavender.external import backends, qp_solver
-from lavender.external.running import Answer
+from lavender.external.running import Answer, quiet
 from lavender.judge.certificates import check_certificate
 from lavender.judge.measures import qp_residual
 
@@ -49,6 +54,51 @@ def test_nothing_is_printed(name, capfd):
         if registry.get(name).refuses(problem) is None:
             lv.solve(problem, name)
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_several(capfd):
+    """The second enters while the first is inside, and leaves last: each hears itself, and a third is not silenced."""
+    before = sys.stdout, sys.stderr, warnings.filters.copy(), warnings.showwarning
+    gate = threading.Barrier(3, timeout=600)
+
+    def run(mine, first):
+        if not first:
+            gate.wait()
+        with quiet(noisy=True) as said:
+            if first:
+                gate.wait()
+            gate.wait()  # both are inside
+            print("a backend's word")
+            warnings.warn(mine, stacklevel=1)
+            if not first:
+                gate.wait()  # the first has left
+        if first:
+            gate.wait()
+        return said
+
+    with ThreadPoolExecutor(2) as pool:
+        heard = [pool.submit(run, mine, mine == "one") for mine in ("one", "two")]
+        gate.wait()
+        gate.wait()
+        sys.stdout.write("this thread's word")
+        gate.wait()
+        assert [future.result() for future in heard] == [["one"], ["two"]]
+    assert (sys.stdout, sys.stderr, warnings.filters, warnings.showwarning) == before
+    os.write(1, b", and the process's")
+    assert capfd.readouterr() == ("this thread's word, and the process's", "")
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_threads_run_a_backend_each(name):
+    problem = lv.Problem.lcp(*spd(4))
+    if registry.get(name).refuses(problem) is None:
+        alone = lv.solve(problem, name)
+        before = sys.stdout, warnings.filters.copy()
+        with ThreadPoolExecutor(4) as pool:
+            for found in pool.map(lambda _: lv.solve(problem, name), range(16)):
+                assert found.impulse.tobytes() == alone.impulse.tobytes()
+                assert found.status is alone.status
+        assert (sys.stdout, warnings.filters) == before
 
 
 # -- what a problem may be ----------------------------------------------------------------------------
