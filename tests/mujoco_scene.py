@@ -1,5 +1,6 @@
 """A scene of MuJoCo with every kind of constraint, and a state of it at which boxes slide and stick."""
 
+import numpy as np
 import pytest
 
 mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
@@ -33,3 +34,10 @@ def state(cone="elliptic", solver="Newton", condim=3, jacobian="dense", steps=25
     data.qvel[12:16] = 0.3, 1.0, -1.0, 0.5
     mj.mj_forward(model, data)
     return model, data
+
+
+def whole_mass(model, data):
+    """M (nv, nv)."""
+    whole = np.zeros((model.nv, model.nv))
+    mj.mj_fullM(model, whole, data.qM) if hasattr(data, "qM") else mj.mj_fullM(model, data, whole)
+    return whole

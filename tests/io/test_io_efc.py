@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mujoco_scene import mj, scene
+from mujoco_scene import mj, scene, whole_mass
 
 import lavender as lv
 from lavender.io import mujoco as single
@@ -99,7 +99,7 @@ def stacked(model, states, dtype):
         jac[i, : d.nefc], of[i, : d.nefc] = d.efc_J.reshape(-1, nv), d.efc_type
         for name, x in rows.items():
             x[i, : d.nefc] = getattr(d, name)
-        mj.mj_fullM(model, d, mass[i])
+        mass[i] = whole_mass(model, d)
         for c in range(d.ncon):
             parts = (i, d.contact.efc_address[c], d.contact.dim[c], d.contact.friction[c])
             for held, x in zip(contacts, parts, strict=True):

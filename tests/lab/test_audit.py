@@ -3,14 +3,13 @@
 import numpy as np
 import pytest
 from calls import EARLY_BOXES as EARLY
+from mujoco_scene import mj, whole_mass
 
 import lavender as lv
 from lavender.io.efc import from_efc
 from lavender.lab import audit as module
 from lavender.lab.audit import VERDICTS, audit
 from lavender.lab.worlds import Frame, Runs
-
-mj = pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[mujoco]'")
 
 
 def own_errors(path, world, steps, seed=0, spread=0.1):
@@ -77,8 +76,7 @@ def frames_in_float32(planted):
         data = mj.MjData(made)
         for step in range(runs.steps):
             mj.mj_forward(made, data)
-            whole = np.zeros((made.nv, made.nv))
-            mj.mj_fullM(made, whole, data.qM) if hasattr(data, "qM") else mj.mj_fullM(made, data, whole)
+            whole = whole_mass(made, data)
             force = data.efc_force * (0.99 if step in planted else 1.0)
             efc = {
                 "J": data.efc_J.reshape(1, -1, made.nv),
