@@ -18,8 +18,6 @@ NAMES = (
     "film",
     "float32",
     "gallery",
-    "imports",
-    "islands",
     "kernels",
     "limits",
     "motions",

@@ -4,18 +4,8 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Callable
-from time import perf_counter, perf_counter_ns, process_time, process_time_ns
+from time import perf_counter, perf_counter_ns, process_time_ns
 from typing import Any
-
-
-def cpu(call: Callable[[], object], repeats: int) -> float:
-    """Least CPU time of a call [s]."""
-    times = []
-    for _ in range(repeats):
-        start = process_time()
-        call()
-        times.append(process_time() - start)
-    return min(times)
 
 
 wall = perf_counter_ns  # for `least`, where several threads run
