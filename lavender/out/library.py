@@ -20,7 +20,7 @@ __all__ = ["HEADER", "source", "write"]
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 HEADER = HERE / "c" / "lavender.h"
-TEXTS = (".h", ".hpp", ".c", ".cpp", ".txt", ".in", ".mjs", ".mts", ".json")
+TEXTS = (".h", ".c", ".txt", ".in", ".mjs", ".mts", ".json")
 #: Folders of what can be written, by name.
 KINDS = {"c": "c", "npm": "js"}
 
