@@ -7,7 +7,6 @@ from collections.abc import Callable
 from time import perf_counter, perf_counter_ns, process_time_ns
 from typing import Any
 
-
 wall = perf_counter_ns  # for `least`, where several threads run
 
 

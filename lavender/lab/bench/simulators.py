@@ -7,9 +7,7 @@ by both sides to the same judged residual:
     ours     `lavender.solve(problem)`: prepare, solve and judge; and the same in `solve_many`
 
 Construction of the problem, with M's factor, is apart, as `mj_factorM` is not counted either. Times are the least of
-several repetitions, taken in turns. Of one call are told apart: what is worked out of the data (d, Y, the norms of
-doing nothing), the kernel, the judge; the rest is Python's. And what matters to the simulation: the momentum and the
-kinetic energy of the next step under either answer, against those of a solution to STRICT.
+several repetitions, taken in turns.
 
 `measure_warm` goes through consecutive steps: MuJoCo starts from its last accelerations, ours from the impulses of the
 last step, by key; MuJoCo at its own tolerance.
@@ -29,10 +27,9 @@ import numpy as np
 
 from lavender.io import mujoco as adapter
 from lavender.io.recording import drive_of
-from lavender.judge.residuals import judged, reference, residual
+from lavender.judge.residuals import reference, residual
 from lavender.lab.bench.running.runner import carry
 from lavender.problem import Problem
-from lavender.solvers.newton_systems import general
 from lavender.solving.many import solve_many
 from lavender.solving.solve import solve
 
@@ -64,15 +61,8 @@ class Step(WarmStep):
     law: str
     tolerance: float  # of MuJoCo, the loosest accepted; 0 where none was
     many: float  # s, each in solve_many
-    kernel: float  # s, of one call, its solver alone
-    prepare: float  # s, of one call
-    judge: float  # s
     strict: float  # residual of ours when asked for STRICT
     coulomb: float | None  # the same under Coulomb's law; None where a contact has more than two tangents
-    momentum: float  # -, |M (v+ - v)| / |M v| of ours against a solution v
-    engine_momentum: float
-    energy: float  # -, of the kinetic energy
-    engine_energy: float
 
 
 def fresh(problem: Problem) -> Problem:
@@ -129,39 +119,6 @@ def our_times(problem: Problem) -> tuple[float, float, float]:
     return float(one), float(many), float(found)
 
 
-def parts(problem: Problem) -> tuple[float, float, float]:
-    """(prepare, kernel, judge) of one call [s]; the kernel is newton over velocities, with room for it made."""
-    prepare, kernel, judge = np.inf, np.inf, np.inf
-    start = problem.start()
-    for _ in range(REPEATS):
-        made = fresh(problem)
-        begin = perf_counter()
-        reference(made)
-        prepare = min(prepare, perf_counter() - begin)
-        impulse = start.copy()
-        begin = perf_counter()
-        newton = general.prepare(made)
-        if newton is not None:
-            newton.start(impulse, TARGET, general.CLOCK)
-            newton.step(general.CLOCK, impulse)
-        kernel = min(kernel, perf_counter() - begin)
-        judge = min(judge, least(lambda p=made, x=impulse: judged(p, x), 2))  # type: ignore[misc]
-    return float(prepare), float(kernel), float(judge)
-
-
-def next_step(problem: Problem, impulse: Any, reference_impulse: Any) -> tuple[float, float]:
-    """Relative error of the momentum M v and of the kinetic energy of the next step, against another impulse's."""
-    assert problem.generalized is not None
-    mass = problem.generalized.mass
-    v, exact = problem.velocity(impulse), problem.velocity(reference_impulse)
-    p, q = mass @ v, mass @ exact
-    size, energy = float(np.linalg.norm(q)), float(exact @ q)
-    return (
-        float(np.linalg.norm(p - q)) / size if size > 0.0 else 0.0,
-        abs(float(v @ p) - energy) / energy if energy > 0.0 else 0.0,
-    )
-
-
 def _problems(mj: Any, path: Path, model: Any, steps: int, every: int) -> Iterator[Any]:
     """Number, data and problem of each `every`-th step under random controls; None for a problem without a row."""
     data, drive = mj.MjData(model), drive_of(model, "random", 0)
@@ -182,14 +139,8 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
         if problem is None or reference(problem)[1] < 1e-9:
             continue
         tolerance, engine, engine_residual = engine_time(mj, model, data, problem)
-        engine_impulse = adapter.impulse(model, data)
         ours, many, found = our_times(problem)
-        prepare, kernel, judge = parts(problem)
-        exact = solve(fresh(problem), tol=STRICT)
-        strict = exact.residual
-        own = solve(fresh(problem), tol=TARGET).impulse
-        momentum, energy = next_step(problem, own, exact.impulse)
-        engine_momentum, engine_energy = next_step(problem, engine_impulse, exact.impulse)
+        strict = solve(fresh(problem), tol=STRICT).residual
         coulomb = None
         if not problem.cones.has_round:
             under = solve(
@@ -207,17 +158,10 @@ def measure(mj: Any, path: Path, steps: int, every: int) -> list[Step]:
                 engine=engine,
                 ours=ours,
                 many=many,
-                kernel=kernel,
                 engine_residual=engine_residual,
                 residual=found,
                 strict=0.0 if strict.at_floor else strict.relative,
                 coulomb=coulomb,
-                prepare=prepare,
-                judge=judge,
-                momentum=momentum,
-                engine_momentum=engine_momentum,
-                energy=energy,
-                engine_energy=engine_energy,
             )
         )
         if len(out) == steps:
