@@ -7,7 +7,7 @@ relative residual, which kind of row its energy belongs to, and the worst row by
 
     python examples/all_rows.py [FIGURE.png]
 
-A file named after a panel holds it alone: relative.png, normals.png, bridge.png, pile.png.
+A file named after a panel holds it alone: relative.png, normals.png.
 """
 
 import sys
@@ -64,26 +64,7 @@ def draw_normals(axes, found):
     beside(axes)
 
 
-def shares(axes, name, by):
-    """Whose the error of one run is."""
-    steps = np.arange(1, STEPS + 1)
-    axes.stackplot(steps, by["shares"].T, labels=KINDS, colors=("C0", "C1", "C2", "C3"))
-    title = f"{name}: worst row at the end is {by['worst'][-1]}"
-    axes.set(title=title, xlabel="step", ylabel="share of the error [-]", ylim=(0, 1))
-    beside(axes)
-
-
-def draw_bridge(axes, found):
-    """Of the bridge."""
-    shares(axes, "bridge", found["bridge"])
-
-
-def draw_pile(axes, found):
-    """Of the pile."""
-    shares(axes, "pile", found["pile"])
-
-
-PANELS = {"relative": draw_relative, "normals": draw_normals, "bridge": draw_bridge, "pile": draw_pile}
+PANELS = {"relative": draw_relative, "normals": draw_normals}
 
 
 def main(path="all_rows.png"):

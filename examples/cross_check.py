@@ -14,7 +14,7 @@ residual is computed wrongly. A solver that fails says so: `quadprog` factors A,
 
     python examples/cross_check.py [FIGURE.png]
 
-A file named after a panel holds it alone: lcp.png, boxed.png.
+The chapter shows it as boxed.png.
 """
 
 import sys
@@ -43,8 +43,9 @@ def numbers():
     return out
 
 
-def apart(axes, table):
-    """Distance of each solver, and how far its residual lets it be."""
+def draw_boxed(axes, found):
+    """Of the boxed LCP the distance of each solver, and how far its residual lets it be."""
+    table = found["boxed"]
     said = {table.reference: " (the reference)"}
     names = [
         (f"{row.solver} → {row.ran}" if row.ran else row.solver)
@@ -60,17 +61,7 @@ def apart(axes, table):
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
-def draw_lcp(axes, found):
-    """The LCP."""
-    apart(axes, found["lcp"])
-
-
-def draw_boxed(axes, found):
-    """The boxed LCP."""
-    apart(axes, found["boxed"])
-
-
-PANELS = {"lcp": draw_lcp, "boxed": draw_boxed}
+PANELS = {"boxed": draw_boxed}
 
 
 def main(path="cross_check.png"):

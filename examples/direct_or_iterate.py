@@ -18,7 +18,7 @@ neighbours, multiplications are counted:
 
     python examples/direct_or_iterate.py [FIGURE.png]
 
-A file named after a panel holds it alone: sweeps.png, rows.png, cost.png.
+A file named after a panel holds it alone: sweeps.png, cost.png.
 """
 
 import sys
@@ -109,16 +109,6 @@ def draw_sweeps(axes, found):
     beside(axes)
 
 
-def draw_rows(axes, found):
-    """Each row after some sweeps."""
-    exact = found["systems"][SHOWN]["direct"].impulse
-    axes.plot(exact, "k_", markersize=10, label="direct")
-    for n, marker in zip(SWEEPS, "^so", strict=True):
-        axes.plot(found["after"][n], marker, markersize=4, fillstyle="none", label=f"{n} sweeps")
-    axes.set(title=f"each row, condition number near {SHOWN:.0f}", xlabel="row", ylabel="impulse [N s]")
-    beside(axes)
-
-
 def draw_cost(axes, found):
     """Multiplications against rows."""
     n = list(found["cost"])
@@ -133,7 +123,7 @@ def draw_cost(axes, found):
     beside(axes)
 
 
-PANELS = {"sweeps": draw_sweeps, "rows": draw_rows, "cost": draw_cost}
+PANELS = {"sweeps": draw_sweeps, "cost": draw_cost}
 
 
 def main(path="direct_or_iterate.png"):

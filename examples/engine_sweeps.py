@@ -26,8 +26,7 @@ the run the stack on 4 sweeps leans.
 
     python examples/engine_sweeps.py [FIGURE.png]
 
-A file named after a panel holds it alone: published.png, judged.png, residual.png, violation.png, by_budget.png,
-depth.png, stand.png, tail.png.
+A file named after a panel holds it alone: by_budget.png, stand.png.
 """
 
 import functools
@@ -156,59 +155,16 @@ def against_budget(axes):
     axes.set_xticks([], minor=True)
 
 
-def first(axes, found, at, **looks):
-    """A column of the first solve by order."""
-    for i, (order, by) in enumerate(found["first"].items()):
-        size = 9 if order == "alternating" else 4  # the same curve as bottom up: seen around it
-        axes.plot(BUDGETS, by[:, at], "P^vsxD"[i] + "-", markersize=size, label=order.replace("_", " "))
-    against_budget(axes)
-    axes.set(xlabel="sweeps", **looks)
-    beside(axes)
-
-
-def draw_published(axes, found):
-    """First solve, as published."""
-    first(
-        axes, found, 0, title="first solve: a velocity at the ground counts twice", ylabel="max $|e_n|$ [N s]"
-    )
-
-
-def draw_judged(axes, found):
-    """First solve, as judged."""
-    first(axes, found, 1, title="first solve, all rows, by the judge", ylabel="relative residual [-]")
-
-
-def in_the_run(axes, found, at, scale=1.0, **looks):
-    """A column of the runs by order."""
+def draw_by_budget(axes, found):
+    """The run: what the judge says."""
     curves = {f"cold,\n{order.replace('_', ' ')}": by for order, by in found["cold"].items()}
     curves["warm,\nalternating"] = found["warm"]
     for i, (name, by) in enumerate(curves.items()):
         style = "o^vs"[i] + ("-" if name.startswith("warm") else "--")
-        axes.plot(BUDGETS, scale * by[:, at], style, markersize=4, label=name)
+        axes.plot(BUDGETS, by[:, 2], style, markersize=4, label=name)
     against_budget(axes)
-    axes.set(xlabel="sweeps", **looks)
+    axes.set(title="the run: all rows, by the judge", xlabel="sweeps", ylabel="relative residual [-]")
     beside(axes)
-
-
-def draw_residual(axes, found):
-    """The run: what is published."""
-    title = f"the run, steps {FIRST} to {LAST}: the normals alone"
-    in_the_run(axes, found, 0, title=title, ylabel="max $|e_n|$ [N s]")
-
-
-def draw_violation(axes, found):
-    """The run: approach velocity."""
-    in_the_run(axes, found, 1, title="the run: approach velocity that is left", ylabel="[m/s]")
-
-
-def draw_by_budget(axes, found):
-    """The run: what the judge says."""
-    in_the_run(axes, found, 2, title="the run: all rows, by the judge", ylabel="relative residual [-]")
-
-
-def draw_depth(axes, found):
-    """The run: penetration."""
-    in_the_run(axes, found, 3, 1e3, title="the run: largest depth", ylabel="[mm]")
 
 
 def draw_stand(axes, found):
@@ -222,26 +178,7 @@ def draw_stand(axes, found):
     beside(axes)
 
 
-def draw_tail(axes, found):
-    """The cold run step by step."""
-    for order, color in (("bottom_up", "C1"), ("alternating", "C0")):
-        for n, style in zip(ENDS, ("--", "-"), strict=True):
-            label = f"{order.replace('_', ' ')},\n{n} sweeps"
-            axes.semilogy(np.arange(1, TRAIL + 1), run(n, order)[:, 1], style, color=color, label=label)
-    axes.set(title="the cold run, step by step", xlabel="step", ylabel="max $|e_n|$ [N s]")
-    beside(axes)
-
-
-PANELS = {
-    "published": draw_published,
-    "judged": draw_judged,
-    "residual": draw_residual,
-    "violation": draw_violation,
-    "by_budget": draw_by_budget,
-    "depth": draw_depth,
-    "stand": draw_stand,
-    "tail": draw_tail,
-}
+PANELS = {"by_budget": draw_by_budget, "stand": draw_stand}
 
 
 def main(path="engine_sweeps.png"):

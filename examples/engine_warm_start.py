@@ -9,13 +9,13 @@ Beside the eight solver values stands the judge over all rows.
 
     python examples/engine_warm_start.py [FIGURE.png]
 
-A file named after a panel holds it alone: start.png, matches.png, judged.png.
+The chapter shows it as start.png.
 """
 
 import sys
 
 import numpy as np
-from panels import save
+from panels import beside, save
 
 import lavender as lv
 
@@ -55,43 +55,20 @@ def column(solver, name):
     return solver[:, lv.SOLVER_FIELDS.index(name)]
 
 
-def against_steps(axes, found, series, **looks):
-    """One quantity of every run over the steps."""
+def draw_start(axes, found):
+    """Where the solve begins; nothing is drawn where it is 0, in the first steps."""
     # "switched off" runs on "warm" until the switch: the wider line below stays to be seen
     styles = {"warm": ("C0", 4.0), "cold": ("k", 1.0), "switched off": ("C1", 1.5)}
     for name, (color, width) in styles.items():
-        axes.plot(np.arange(1, STEPS + 1), series(*found[name]), color=color, linewidth=width, label=name)
+        begins = column(found[name][0], "residual_initial")
+        shown = np.where(begins > 0.0, begins, np.nan)
+        axes.plot(np.arange(1, STEPS + 1), shown, color=color, linewidth=width, label=name)
     axes.axvline(SWITCH + 0.5, color="0.7", linewidth=0.8, linestyle="--")
-    axes.set(xlabel="step", **looks)
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
+    axes.set(title="where the solve begins", xlabel="step", ylabel="max $|e_n|$ [N s]", yscale="log")
+    beside(axes)
 
 
-def draw_start(axes, found):
-    """Where the solve begins; nothing is drawn where it is 0, in the first steps."""
-
-    def initial(solver, *_):
-        values = column(solver, "residual_initial")
-        return np.where(values > 0.0, values, np.nan)
-
-    against_steps(
-        axes, found, initial, title="where the solve begins", ylabel="max $|e_n|$ [N s]", yscale="log"
-    )
-
-
-def draw_matches(axes, found):
-    """Contacts found in the cache."""
-    against_steps(
-        axes, found, lambda solver, *_: column(solver, "cache_matches"), title="contacts found in the cache"
-    )
-
-
-def draw_judged(axes, found):
-    """The judge over all rows."""
-    looks = {"title": "all rows, after the last sweep", "ylabel": "relative residual [-]", "yscale": "log"}
-    against_steps(axes, found, lambda _, relative, __: relative, **looks)
-
-
-PANELS = {"start": draw_start, "matches": draw_matches, "judged": draw_judged}
+PANELS = {"start": draw_start}
 
 
 def main(path="engine_warm_start.png"):

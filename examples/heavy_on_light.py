@@ -11,7 +11,7 @@ allows, and slower in the end, when friction is what is left. So the formula is 
 
     python examples/heavy_on_light.py [FIGURE.png]
 
-A file named after a panel holds it alone: left.png, rate.png.
+The chapter shows it as left.png.
 """
 
 import sys
@@ -60,17 +60,7 @@ def draw_left(axes, found):
     beside(axes)
 
 
-def draw_rate(axes, found):
-    """What each sweep leaves of the one before."""
-    for name, left in found.items():
-        axes.plot(np.arange(1, SWEEPS + 1), left[1:] / left[:-1], label=name.replace(" and", "\nand"))
-    axes.axhline(RATIO / (1.0 + RATIO), color="k", linestyle=":", label="$R/(1+R)$")
-    axes.set(title="what a sweep leaves of the error", xlabel="sweeps", ylabel="factor [-]", xscale="log")
-    axes.set_ylim(0.98, 1.01)
-    beside(axes)
-
-
-PANELS = {"left": draw_left, "rate": draw_rate}
+PANELS = {"left": draw_left}
 
 
 def main(path="heavy_on_light.png"):

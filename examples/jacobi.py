@@ -17,7 +17,7 @@ Rows done one after the other, with T threads: sweeps x the sum over the colours
 
     python examples/jacobi.py [FIGURE.png]
 
-A file named after a panel holds it alone: sweeps.png, threads.png.
+The chapter shows it as threads.png.
 """
 
 import sys
@@ -77,15 +77,6 @@ def numbers():
     }
 
 
-def draw_sweeps(axes, found):
-    """Residual against sweeps."""
-    for i, (name, solution) in enumerate(found["stack"].items()):
-        h = solution.history
-        axes.loglog(h.iterations[1:], h.relative[1:], ("-", "--", "-.", ":")[i], color=f"C{i}", label=name)
-    axes.set(title=f"a stack of {N} boxes", xlabel="sweeps", ylabel="relative residual [-]")
-    beside(axes)
-
-
 def draw_threads(axes, found):
     """Rows one after the other against threads."""
     for i, (name, waiting) in enumerate(found["waiting"].items()):
@@ -97,7 +88,7 @@ def draw_threads(axes, found):
     beside(axes)
 
 
-PANELS = {"sweeps": draw_sweeps, "threads": draw_threads}
+PANELS = {"threads": draw_threads}
 
 
 def main(path="jacobi.png"):

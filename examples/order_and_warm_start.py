@@ -18,7 +18,7 @@ step that is ten times shorter, they begin as far off, all of it of the slow par
 
     python examples/order_and_warm_start.py [FIGURE.png]
 
-A file named after a panel holds it alone: lighter.png, equal.png, orders.png, starts.png.
+A file named after a panel holds it alone: lighter.png, starts.png.
 """
 
 import sys
@@ -94,7 +94,7 @@ def histories(problem):
 
 
 def numbers():
-    """Residuals by order for three stacks, histories of two of them, and warm, stale and cold over sweeps."""
+    """Residuals by order for three stacks, histories of one of them, and warm, stale and cold over sweeps."""
     orders = {}
     for name, problem in cases().items():
         orders[name] = {
@@ -113,9 +113,7 @@ def numbers():
     }
     return {
         "orders": orders,
-        "histories": {
-            name: histories(cases()[name]) for name in ("falling, lighter above", "falling, equal")
-        },
+        "lighter above": histories(cases()["falling, lighter above"]),
         "starts": {
             name: np.array([error(changed, start, n) for n in SWEEPS]) for name, start in starts.items()
         },
@@ -136,8 +134,9 @@ def against_sweeps(axes):
     beside(axes)
 
 
-def by_order(axes, name, by):
-    """Histories of one stack."""
+def draw_lighter(axes, found):
+    """Each box stands on one that is three times as heavy."""
+    by = found["lighter above"]
     low, high = by["random"].min(axis=0), by["random"].max(axis=0)
     axes.fill_between(SWEEPS, low, high, color="0.85", label=f"random, {len(SEEDS)} seeds")
     for (key, style), color in zip(
@@ -146,30 +145,8 @@ def by_order(axes, name, by):
         strict=True,
     ):
         axes.plot(SWEEPS, by[key], style, color=color, markersize=4, label=key)
-    axes.set_title(f"eight boxes {name}")
+    axes.set_title("eight boxes falling, lighter above")
     against_sweeps(axes)
-
-
-def draw_lighter(axes, found):
-    """Each box stands on one that is three times as heavy."""
-    by_order(axes, "falling, lighter above", found["histories"]["falling, lighter above"])
-
-
-def draw_equal(axes, found):
-    """All boxes weigh the same."""
-    by_order(axes, "falling, equal", found["histories"]["falling, equal"])
-
-
-def draw_orders(axes, found):
-    """Three stacks at one budget."""
-    for x, by in enumerate(found["orders"].values()):
-        first = x == 0
-        axes.plot([x] * len(by["random"]), by["random"], "o", color="0.7", label="random" if first else None)
-        axes.plot(x, by["bottom up"], "^", color="C0", label="bottom up" if first else None)
-        axes.plot(x, by["top down"], "v", color="C1", label="top down" if first else None)
-    axes.set(yscale="log", title=f"after {BUDGET} sweeps", ylabel="relative residual [-]", xlim=(-0.5, 2.5))
-    axes.set_xticks(range(3), list(found["orders"]))
-    beside(axes)
 
 
 def draw_starts(axes, found):
@@ -181,7 +158,7 @@ def draw_starts(axes, found):
     against_sweeps(axes)
 
 
-PANELS = {"lighter": draw_lighter, "equal": draw_equal, "orders": draw_orders, "starts": draw_starts}
+PANELS = {"lighter": draw_lighter, "starts": draw_starts}
 
 
 def main(path="order_and_warm_start.png"):

@@ -25,8 +25,7 @@ deep and does not approach is a solution. Depth is removed by the position proje
 
     python examples/toy_stack.py [FIGURE.png]
 
-A file named after a panel holds it alone: impulses.png, slacks.png, sweeps.png, sweeps_slack.png, r_p.png,
-ordinary.png, projected.png, deep.png.
+A file named after a panel holds it alone: impulses.png, slacks.png.
 """
 
 import sys
@@ -87,7 +86,7 @@ def deep_box():
 
 
 def numbers():
-    """Impulse and slack of every contact after each sweep, both residuals, the wrong way, and the deep box."""
+    """Impulse of every contact after each sweep, both residuals, the wrong way, and the deep box."""
     toy = problem()
     impulse = np.zeros((SWEEPS + 1, N))
     for sweep in range(SWEEPS):
@@ -109,7 +108,6 @@ def numbers():
         "immovable": immovable(toy),
         "zero": lv.solve(immovable(toy), "pgs"),
         "impulse": impulse,  # (SWEEPS + 1, N) N s
-        "slack": np.array([toy.slack(x) for x in impulse]),  # (SWEEPS + 1, N) m/s
         "r_p": np.array([natural_map(toy, x) for x in impulse]),
         "exact": exact,
         "exact_slack": toy.slack(exact),
@@ -153,68 +151,7 @@ def draw_slacks(axes, found):
     axes.set(title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None))
 
 
-def draw_sweeps(axes, found):
-    """Impulse of each contact against sweeps."""
-    for i in range(N):
-        axes.plot(np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
-        axes.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
-    axes.set(title="crosses: solved, then clamped", xlabel="sweeps", ylabel="impulse [N s]", xscale="symlog")
-    beside(axes)
-
-
-def draw_sweeps_slack(axes, found):
-    """Slack of each contact against sweeps."""
-    for i in range(N):
-        axes.plot(np.arange(SWEEPS + 1), found["slack"][:, i], color=f"C{i}", label=f"contact {i + 1}")
-    axes.set(title="slack, sweep by sweep", xlabel="sweeps", ylabel="slack w [m/s]", xscale="symlog")
-    beside(axes)
-
-
-def draw_r_p(axes, found):
-    """r_p against sweeps."""
-    axes.semilogy(np.maximum(found["r_p"], 1e-17), label="projected\nGauss-Seidel")
-    axes.axhline(found["clamped_r_p"], color="k", linestyle="--", label="solved, then\nclamped once")
-    axes.set(title="$r_p$ over all contacts", xlabel="sweeps", ylabel="$r_p$ [N s]")
-    beside(axes)
-
-
-def points(axes, found, key):
-    """One residual at three points, where contact 5 opens."""
-    names = ["$A^{-1}b$, which pulls" if k == "A^-1 b" else k for k in found["points"]]
-    axes.bar_label(axes.barh(names, list(found[key].values()), 0.5), fmt=" %.4f")  # a bar of 0 is not seen
-    axes.margins(x=0.12)
-    axes.invert_yaxis()
-
-
-def draw_ordinary(axes, found):
-    """The ordinary residual."""
-    points(axes, found, "ordinary")
-    axes.set(title="contact 5, the ordinary residual: 0 at the wrong point", xlabel="|w| [m/s]")
-
-
-def draw_projected(axes, found):
-    """The residual of the projection."""
-    points(axes, found, "projected")
-    axes.set(title="contact 5, the projected one: 0 where it opens", xlabel="$r_p$ [N s]")
-
-
-def draw_deep(axes, found):
-    """The deep box."""
-    axes.plot(1e3 * found["deep"][:, 1])
-    title = f"a box in the ground: relative residual at most {found['deep'][:, 0].max():.0e}"
-    axes.set(title=title, xlabel="step", ylabel="depth [mm]", ylim=(0, None))
-
-
-PANELS = {
-    "impulses": draw_impulses,
-    "slacks": draw_slacks,
-    "sweeps": draw_sweeps,
-    "sweeps_slack": draw_sweeps_slack,
-    "r_p": draw_r_p,
-    "ordinary": draw_ordinary,
-    "projected": draw_projected,
-    "deep": draw_deep,
-}
+PANELS = {"impulses": draw_impulses, "slacks": draw_slacks}
 
 
 def main(path="toy_stack.png"):

@@ -6,7 +6,7 @@ differs is what was declared.
 
     python examples/what_a_row_costs.py [FIGURE.png]
 
-A file named after a panel holds it alone: step.png, row.png. One of these stacks by itself:
+The chapter shows it as step.png. One of these stacks by itself:
 
     lavender run stack --set n=20 --iterations 64 --set friction=0
 """
@@ -62,16 +62,7 @@ def draw_step(axes, found):
     axes.invert_yaxis()
 
 
-def draw_row(axes, found):
-    """The same for each row and sweep."""
-    sweeps = SWEEPS * lv.Scene("stack").parameters.substeps
-    times = {name: 1e9 * t / (found[name]["rows"] * sweeps) for name, t in least(found).items()}
-    axes.barh(list(times), list(times.values()), color="C2")
-    axes.set(title="the same for each row and sweep", xlabel="time [ns]")
-    axes.invert_yaxis()
-
-
-PANELS = {"step": draw_step, "row": draw_row}
+PANELS = {"step": draw_step}
 
 
 def main(path="what_a_row_costs.png"):
