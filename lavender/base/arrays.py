@@ -81,10 +81,7 @@ def as_array(
         raise InputError(f"{what} is not an array of numbers ({error})") from None
     if given.dtype.kind not in "buif":
         raise InputError(f"{what} has dtype {given.dtype}; real numbers are needed")
-    if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy loads its module when it is first named
-        masked = np.argwhere(np.ma.getmaskarray(value))
-        where = ", ".join(map(str, masked[0]))
-        raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")
+    check_unmasked(what, value)
     if (
         dtype is np.int32
         and given.dtype.kind == "f"
@@ -109,6 +106,14 @@ def as_array(
     if finite and array.dtype.kind == "f":
         check_inside(what, array, unit)
     return read_only(array)
+
+
+def check_unmasked(what: str, value: Any) -> None:
+    """Raise InputError at the first masked entry of `what`: as a plain array it has the number under the mask."""
+    if hasattr(value, "mask") and np.ma.is_masked(value):  # NumPy loads its module when it is first named
+        masked = np.argwhere(np.ma.getmaskarray(value))
+        where = ", ".join(map(str, masked[0]))
+        raise InputError(f"{what} has no value at [{where}], {len(masked)} masked in all: fill them")
 
 
 def shape_of(what: str, value: Any) -> tuple[int, ...]:

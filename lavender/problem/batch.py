@@ -12,7 +12,16 @@ from typing import Any, overload
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array, check_sizes, places, precision_of, shape_of
+from lavender.base.arrays import (
+    ArrayLike,
+    FloatArray,
+    as_array,
+    check_sizes,
+    check_unmasked,
+    places,
+    precision_of,
+    shape_of,
+)
 from lavender.base.errors import InputError
 from lavender.problem import FRICTION, Problem
 from lavender.problem.cones import Cones
@@ -197,6 +206,9 @@ class Batch(Sequence[Problem]):
         unknown = set(fields) - set(known)
         if unknown:
             raise InputError(f"fields has {sorted(unknown)}; the arrays of Rows are {', '.join(known)}")
+        for name, x in (*fields.items(), *bounds.items()):
+            shape_of(name, x)
+            check_unmasked(name, x)
         parts = {name: np.asarray(x) for name, x in fields.items()}
         more = {name: np.asarray(x) if np.ndim(x) else x for name, x in bounds.items() if x is not None}
         lengths = {len(x) for name, x in parts.items() if x.ndim == known[name] + 1}
@@ -376,6 +388,7 @@ def check_errors(errors: str) -> None:
 def _numbers(name: str, x: Any) -> np.ndarray:
     """As float32 or float64, where it stands if it is one of them."""
     shape_of(name, x)
+    check_unmasked(name, x)
     given = np.asarray(x)
     if given.dtype not in MADE:
         given = as_array(name, given, (None,) * given.ndim, finite=False)

@@ -14,6 +14,7 @@ LCP = lv.Problem.lcp(A, [1.0, -1.0])
 CONTACT = random_contact_problem(3)
 ROWS = random_rows(np.random.default_rng(0))
 GENERAL = lv.Problem.from_jacobian(np.eye(2), A, [1.0, -1.0], cones=lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]))
+PARTS = {f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"}
 DISKS, NINE = np.eye(6), {"A": np.eye(8), "b": np.ones(8)}
 FINDEX = {
     "A": np.eye(3),
@@ -22,6 +23,19 @@ FINDEX = {
     "upper": [np.inf, 1.0, 1.0],
     "findex": [-1, 0, 0],
 }
+BATCH = {
+    "J": np.array([np.eye(2)] * 2),
+    "M": np.array([A] * 2),
+    "v_free": np.ones((2, 2)),
+    "target": np.ones((2, 2)),
+    "compliance": np.ones((2, 2)),
+    "mu": np.full((2, 1), 0.5),
+}
+SLIDING = lv.Cones.contacts(0.5, tangents=1)
+
+
+def batch_with(x, field):
+    return lv.solve_many(lv.Batch(**BATCH | {field: x}, cones=SLIDING))
 
 
 def wrong_arrays(x, free):
@@ -64,8 +78,7 @@ def scene(name, **more):
 
 
 def rows_with(x, field):
-    values = {f.name: getattr(ROWS, f.name) for f in fields(ROWS) if f.name != "copy"}
-    return lv.Rows(**{**values, field: x})
+    return lv.Rows(**{**PARTS, field: x})
 
 
 #: Name of the argument, after what it belongs to: call with a value, a good value, and whether its length is free.
@@ -110,6 +123,11 @@ ARRAYS = {
         "velocity": GENERAL.velocity,
         "carry": lambda x: LCP.carry((LCP, x)),
     }.items()},
+    **{f"batch: {name}": (lambda x, name=name: batch_with(x, name), good, name == "J") for name, good in BATCH.items()},
+    "batch: A": (lambda x: lv.solve_many(lv.Batch.of_matrices(x, np.ones((2, 2)), cones=SLIDING)), [A, A], False),
+    "batch: b": (lambda x: lv.solve_many(lv.Batch.of_matrices([A, A], x, cones=SLIDING)), np.ones((2, 2)), False),
+    **{f"batch: {name}": (lambda x, name=name: lv.Batch.of_bodies({**PARTS, "v_free": [ROWS.v_free] * 2, name: x})[0],
+                          [PARTS[name]] * 2, True) for name in ("inv_mass", "normal")},
     "motion_error: reference": (lambda x: lv.motion_error(LCP, [0.0, 0.0], reference=x), [0.5, 0.0], False),
     **{f"scene: {field}": (lambda x, field=field, call=call: call(x, field), good, False) for field, good, call in (
         ("position", [0.0, 0.0, 3.0], scene("add_body")),
