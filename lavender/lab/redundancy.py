@@ -179,7 +179,8 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         scale = 1.0 / np.sqrt(problem.csr_data.d)
         unit = _unit(problem, scale)
         scaled = sp.csr_array(sp.diags_array(unit) @ problem.csr @ sp.diags_array(unit))
-        roots = _roots(problem) if m and problem.matrix is None and not np.any(problem.compliance) else ()
+        moves = m and problem.matrix is None and problem.jacobian.shape[1]  # where J has no column A is zero
+        roots = _roots(problem) if moves and not np.any(problem.compliance) else ()
     if not all(np.isfinite(part.data).all() for part in (scaled, *roots)):
         raise CapabilityError(
             "the rank cannot be told: rows of unit size are beyond float64 (give the problem in other units)"

@@ -81,7 +81,7 @@ class Builders(Operators):
         turns = (patch_radius is not None) + 2 * (rolling is not None)
         if np.ndim(mu) == 0:
             each = 3 + turns
-            mu = np.full(max(1, len(b) // each) if len(b) % each == 0 else 1, mu)
+            mu = np.full(len(b) // each if len(b) % each == 0 else 1, mu)
         mu = as_array("mu", mu, (None,))
         if (len(mu) == 0) != (len(b) == 0) or (len(mu) and len(b) % len(mu)):
             raise InputError(

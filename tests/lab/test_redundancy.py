@@ -215,6 +215,11 @@ def test_no_rows():
     assert redundancy(lv.Problem.linear(np.zeros((0, 0)), [])).rank == 0
 
 
+def test_no_velocities():
+    nothing_moves = lv.Problem.from_jacobian(np.zeros((2, 0)), np.zeros((0, 0)), [], cones=lv.Cones.free(2))
+    assert redundancy(nothing_moves).rows == (0, 1)
+
+
 # -- rows and bodies of very different size -------------------------------------------------------------
 
 

@@ -354,6 +354,15 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
         assert not kept.flags.writeable
 
 
+@pytest.mark.parametrize("parts", [{}, {"patch_radius": 0.1}, {"rolling": 0.1}])
+def test_one_mu_stands_for_all_contacts_also_where_there_are_none(parts):
+    """A step in which nothing touches, as the others."""
+    for count in (0, 1, 2):
+        m = count * (3 + ("patch_radius" in parts) + 2 * ("rolling" in parts))
+        problem = lv.Problem.contact(np.eye(m), np.ones(m), 0.5, **parts)
+        assert (problem.n_blocks, lv.solve(problem).success) == (count, True)
+
+
 def test_impulses_of_another_kind_of_contact_are_not_carried():
     disk, box = (CONTACTS[kind](1) for kind in ("disks", "boxes"))
     disk, box = (replace(problem, key=None) for problem in (disk, box))
