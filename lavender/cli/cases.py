@@ -11,12 +11,7 @@ __all__ = ["cases"]
 
 @click.command()
 @click.argument("pattern", default="")
-@click.option(
-    "--size",
-    is_flag=True,
-    help="Build each with its defaults and print its number of rows and the seconds that this took.",
-)
-def cases(pattern: str, size: bool) -> None:
+def cases(pattern: str) -> None:
     """List the families of the built-in suite: parameters, defaults, purpose.
 
     PATTERN selects families whose name or description contains it. A case is a family with parameters:
@@ -38,8 +33,4 @@ def cases(pattern: str, size: bool) -> None:
         words = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
                           zip(given.items(), f.signature.parameters.values(), strict=True))  # fmt: skip
         out.print(f"{name}({words})", style="bold", highlight=False, markup=False, soft_wrap=True)
-        rows = ""
-        if size:
-            problem = f.case().problem
-            rows = f"{problem.m} rows, {problem.law}. "
-        out.print(f"    {rows}{f.summary}", highlight=False, markup=False, soft_wrap=True)
+        out.print(f"    {f.summary}", highlight=False, markup=False, soft_wrap=True)

@@ -30,7 +30,6 @@ __all__ = ["solve"]
 @click.option("--time-limit", type=float, default=None, metavar="S", help="Limit of the solve time.")
 @click.option("--order", default=None, help="Sweep order, for solvers that take one.")
 @click.option("--seed", type=int, default=None, help="Seed of a random order.")
-@click.option("--history", is_flag=True, help="Print the residual after fixed numbers of iterations.")
 @click.option(
     "--output",
     type=click.Path(path_type=Path),
@@ -45,7 +44,6 @@ def solve(
     time_limit: float | None,
     order: str | None,
     seed: int | None,
-    history: bool,
     output: Path | None,
 ) -> None:
     """Solve one problem (a file, or a case of the suite) and print its error.
@@ -56,7 +54,6 @@ def solve(
     from lavender.base.later import load
     from lavender.judge.residuals import WRONG
     from lavender.lab import bench
-    from lavender.lab.report.text import residual, seconds
     from lavender.solvers import registry
     from lavender.solving.solve import solve as solve_problem
 
@@ -71,7 +68,7 @@ def solve(
     options: dict[str, Any] = {k: v for k, v in (("order", order), ("seed", seed)) if v is not None}
     load(*registry.get(solver).requires)  # else the printed time would hold it
     solution = solve_problem(
-        item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, history=history, **options
+        item.problem, solver, tol=tol, max_iter=max_iter, time_limit=time_limit, **options
     )
     if output is not None:
         import numpy as np
@@ -96,11 +93,6 @@ def solve(
 
         write_atomically(output, write)
     click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    if solution.history is not None:
-        click.echo(f"{'iterations':>10}  {'time':>9}  {'relative':>9}  {'energy':>9}  {'velocity':>9}")
-        h = solution.history
-        for n, t, r, e, v in zip(h.iterations, h.time, h.relative, h.energy, h.velocity, strict=True):
-            click.echo(f"{n:>10}  {seconds(t):>9}  {residual(r):>9}  {residual(e):>9}  {residual(v):>9}")
     click.echo(str(solution))
     if output is not None:
         click.echo(f"written: {output}")

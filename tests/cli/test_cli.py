@@ -41,10 +41,9 @@ def test_a_full_disk_behind_stdout_is_one_line():
 
 def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
     target = tmp_path / "answer.npz"
-    code, out, _ = lavender("solve", path, "--solver", "pgs", "--tol", 1e-10, "--history", "--output", target)
+    code, out, _ = lavender("solve", path, "--solver", "pgs", "--tol", 1e-10, "--output", target)
     assert code == 0
     assert "pgs: CONVERGED" in out
-    assert "iterations" in out
     with np.load(target, allow_pickle=False) as answer:
         exact = lv.solve(stack(8), "pgs", tol=1e-10)
         np.testing.assert_array_equal(answer["impulse"], exact.impulse)
@@ -217,7 +216,6 @@ def test_cases_lists_families_with_parameters_and_reasons(lavender):
     code, out, _ = lavender("cases", "hang")
     assert "hang(n=" in out
     assert "pyramid(" not in out
-    assert "8 rows" in lavender("cases", "toy_stack", "--size")[1]
     assert lavender("cases", "nosuchthing")[0] == 2
 
 
