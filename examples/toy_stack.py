@@ -25,7 +25,7 @@ deep and does not approach is a solution. Depth is removed by the position proje
 
     python examples/toy_stack.py [FIGURE.png]
 
-A file named after a panel holds it alone: impulses.png, slacks.png.
+A file named after a panel holds it alone: impulses.png, slacks.png, sweeps.png.
 """
 
 import sys
@@ -151,7 +151,16 @@ def draw_slacks(axes, found):
     axes.set(title=title, xlabel="contact, from the ground", ylabel="slack w [m/s]", ylim=(-0.02, None))
 
 
-PANELS = {"impulses": draw_impulses, "slacks": draw_slacks}
+def draw_sweeps(axes, found):
+    """Impulse of each contact against sweeps."""
+    for i in range(N):
+        axes.plot(np.arange(SWEEPS + 1), found["impulse"][:, i], color=f"C{i}", label=f"contact {i + 1}")
+        axes.plot(SWEEPS, found["clamped"][i], "x", color=f"C{i}")
+    axes.set(title="crosses: solved, then clamped", xlabel="sweeps", ylabel="impulse [N s]", xscale="symlog")
+    beside(axes)
+
+
+PANELS = {"impulses": draw_impulses, "slacks": draw_slacks, "sweeps": draw_sweeps}
 
 
 def main(path="toy_stack.png"):

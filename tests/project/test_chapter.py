@@ -127,6 +127,9 @@ def test_every_panel_is_one_of_its_example_with_the_order_that_draws_it():
         assert (pictures / f"{file}.png").stat().st_size <= 150_000
     for name, panel in re.findall(r"`python examples/(\w+)\.py (\w+)\.png`", PAGE):
         assert panel in example(name).PANELS
+    other = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
+    for name, panel in re.findall(r"generated/figures/(\w+)/(\w+)\.svg", other):
+        assert panel in example(name).PANELS
     named = {re.match(r"python examples/(\w+)\.py", command) for command in CLAIMS}
     for module in (example(found[1]) for found in named if found):
         assert all(f"{panel}.png" in module.__doc__ for panel in module.PANELS)
