@@ -8,8 +8,8 @@
                                 factorisations that `newton` is counted for; as long, but after sweeps, bounded rows
                                 whose factor is dense
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
-                                and, but for a matrix, cones where 150 cost less than it; of a matrix each contact is
-                                solved exactly
+                                and, but for a matrix, bounded ones and cones only where 200 cost less than it; of a
+                                matrix each contact is solved exactly
     a loose pile                PILE contacts or more under Coulomb's law that do not roll, nearly each of another pair:
                                 for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from math import inf, nan
 
 import numpy as np
@@ -59,7 +60,9 @@ LAST = 200.0  # times Newton's counted cost, that all have together
 LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
 LITTLE = 5e6  # ns of Newton's method over rows, which are worth a trial in any case
 FEW = 32.0  # sweeps before a factor that may fill
-MANY = 150.0  # sweeps before Newton's method on linear rows and cones: only where these cost less
+MANY = (
+    200.0  # sweeps that cost less come before Newton's method; of a matrix, and under Coulomb's law, all do
+)
 SPARSE, DENSE = 0.05, 0.5  # shares of entries, below which A is sparse, and above which it is dense
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
 PILE = 130  # contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
@@ -220,7 +223,7 @@ class Tree:
             yield self.rounds(self.newton, "a dense factor, of the rows that are free")
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
             if not (self.tried and self.law == "lcp"):
-                yield from self.factorisations(SURE)
+                yield from islice(self.factorisations(SURE), 1)
             yield Stage(
                 "certificate", 1.0, self.newton, "whether the least violation proves that there is none"
             )
@@ -261,7 +264,7 @@ class Tree:
         """For Newton's cost: first what that is at least, then what it is counted for."""
         cost = newton - self.begun
         # Newton's method then takes what it is counted for, if that is there.
-        sure = self.law == "linear" or (self.law == "cone" and self.problem.matrix is None)
+        sure = self.law == "linear" or (self.law != "coulomb" and self.problem.matrix is None)
         sure = sure and not self.deadline.passed(1e-9 * SURE * newton)
         pays = not sure or MANY * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:

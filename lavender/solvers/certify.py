@@ -34,7 +34,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.registry import get
 from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
-from lavender_ext.core.checks import LEAST
+from lavender_ext.core.checks import LEAST, MOST
 
 __all__ = ["Conflict", "certify", "conflict_of", "least_violation"]
 
@@ -130,7 +130,7 @@ def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
     """
     problem, of = log.problem, log.problem.generalized
     assert of is not None
-    v, cones = of.change(log.impulse) if v is None else v, problem.cones
+    v, cones = np.clip(of.change(log.impulse) if v is None else v, -MOST, MOST), problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = of.jac.multiply(of.jac).tocsr()

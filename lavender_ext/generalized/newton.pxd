@@ -232,6 +232,17 @@ cdef inline bint is_rigid(const flow_t* f, int32_t island) noexcept nogil:
     return False
 
 
+cdef inline double pull(const flow_t* f, int32_t island) noexcept nogil:
+    """Energy error that the proximal terms leave, rho (lambda - c); that of G grows with the rows of a velocity."""
+    cdef int32_t a, k
+    cdef double x, out = 0.0
+    for a in range(f.iptr[island], f.iptr[island + 1]):
+        for k in range(row_from(f, a), row_end(f, a)):
+            x = f.rho[k] * (f.lam[k] - f.center[k])
+            out += x * x / f.p.d[k]
+    return sqrt(out)
+
+
 cdef inline double excess(const flow_t* f, double energy, double velocity) noexcept nogil:
     """How many times over its limits an error is; at most 1 where the test is met, NaN where it is lost."""
     cdef double x = 0.0, v = 0.0
@@ -304,7 +315,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
                 f.grad[c] = f.y[c] - f.u[c]
                 size += f.grad[c] * f.grad[c]
         size = sqrt(size) if size > 0.0 else size * 0.0     # of h, rounding may leave less than 0; NaN stays
-        if rigid and (size <= 0.1 * energy or size == 0.0):
+        if rigid and (size <= 0.1 * energy and size <= 0.1 * pull(f, island) or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
             follow(f, island)
             x.moved = 1

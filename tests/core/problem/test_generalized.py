@@ -216,6 +216,17 @@ def test_bounded_rows_and_equations_need_few_steps(kind):
     assert again.iterations == 0
 
 
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("nv", [2, 3])
+def test_centres_stay_until_velocities_are_found_however_many_rows_these_have(nv, seed):
+    """Errors of velocities are errors of every row: measured by the rows' they were small before the first step."""
+    rng = np.random.default_rng(seed)
+    jac, v, cones = rng.normal(size=(1800, nv)), rng.normal(size=nv), lv.Cones.contacts(np.full(600, 0.5))
+    problem = lv.Problem.from_jacobian(jac, np.eye(nv), v, cones=cones, friction="cone")
+    solution = lv.solve(problem, "newton", form="velocity", tol=1e-6, max_iter=10)  # measured: 4 at most
+    assert solution.success, str(solution)
+
+
 @pytest.mark.parametrize("compliance", [0.0, 1e-9, 0.05])
 @pytest.mark.parametrize("rows", [1, 3, 8, 19])
 def test_rows_fewer_than_velocities_have_the_answer_of_their_matrix(rows, compliance):

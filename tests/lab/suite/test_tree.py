@@ -49,13 +49,16 @@ FIRST = {
     "linear, J and M": (lambda: over_velocities(None), ["newton"]),
     "J and M": (lambda: over_velocities("coulomb"), ["anderson", "newton"]),
     "bounded rows of a matrix": (lambda: as_matrix(suite.stack(n=200).problem), ["direct"]),
-    "bounded rows of bodies": (lambda: suite.stack(n=200).problem, ["anderson", "anderson", "newton"]),
+    "bounded rows of bodies": (
+        lambda: suite.stack(n=200).problem,
+        ["newton", "newton", "admm", "nncg", "anderson"],
+    ),
     "bounded rows of a dense matrix": (lambda: random_lcp(0, m=80), ["anderson", "anderson", "direct", "newton"]),
     "the cone law": (
         lambda: suite.granular(n=6, friction="coulomb").problem.relaxed("cone"),
         ["anderson", "newton", "newton", "admm", "nncg", "anderson"],
     ),
-    "the cone law, 150 sweeps cost more than newton": (
+    "the cone law, 200 sweeps cost more than newton": (
         lambda: suite.pyramid(k=6, friction="coulomb").problem.relaxed("cone"),
         ["newton", "newton", "admm", "nncg", "anderson"],
     ),
@@ -104,7 +107,7 @@ def test_the_tail_doubles(name):
 
 
 def test_sweeps_first_have_the_counted_cost():
-    problem = suite.stack(n=200).problem
+    problem = suite.pyramid(k=6, friction="coulomb").problem
     tree = Tree(problem)
     reference(problem)
     one, two, newton = islice(tree, 3)
@@ -320,7 +323,7 @@ def test_what_only_late_turns_solve_is_solved(name):
 
 
 def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(8)
     half, jac, moved = (
         rng.standard_normal((150, 150)),
         rng.standard_normal((400, 150)),
