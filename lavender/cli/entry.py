@@ -60,6 +60,10 @@ def cli() -> None:
 def main(args: Sequence[str] | None = None) -> None:
     """Entry point: what lavender raises on purpose becomes one line and status 2."""
     _starting.end()
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:  # it was closed: a file that is opened next would stand in its place
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            setattr(sys, name, open(nowhere, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - to the end
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be of bytes that are no text

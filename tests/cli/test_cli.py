@@ -39,6 +39,12 @@ def test_a_full_disk_behind_stdout_is_one_line():
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.skipif(os.name != "posix", reason="a call in the child is of POSIX")
+@pytest.mark.parametrize("command", [("solvers",), ("run", "stack", "--steps", "2")])
+def test_a_stdout_that_was_closed_is_no_error(command):
+    assert python("-m", "lavender", *command, preexec_fn=lambda: os.close(1), **TOLD).stderr == ""
+
+
 def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
     target = tmp_path / "answer.npz"
     code, out, _ = lavender("solve", path, "--solver", "pgs", "--tol", 1e-10, "--output", target)
