@@ -301,7 +301,7 @@ def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
     y = y * rng.choice([1.0, 1.0, 1.0, -1.0])
     m, g = len(y), rng.normal(size=(len(y), len(y)))
     off = rng.random() < 0.8
-    for _ in range(2):  # once leaves rounding of what was there, more than that of a row y takes nearly all of
+    for _ in range(2):  # once leaves rounding of what was there, much of a row that y takes nearly all of
         g -= np.outer(y, y @ g) / max(y @ y, 1e-9) * off
     b = rng.normal(size=m)
     b += y * (rng.choice([0.5, 0.5, -0.5]) - b @ y) / max(y @ y, 1e-9)
