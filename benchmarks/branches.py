@@ -11,12 +11,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender import motion
 from lavender.base.arrays import FloatArray
 from lavender.lab.motion.error import SAME
@@ -194,8 +193,7 @@ def table(found: Sequence[Crossing]) -> str:
     "--every", type=click.IntRange(1), default=3, show_default=True, help="Search one step of these."
 )
 @click.option("--sweeps", type=click.IntRange(4, 64), default=16, show_default=True, help="Of the engine.")
-@out_option("JSON of the steps.")
-def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
+def command(steps: int, every: int, sweeps: int) -> None:
     """Whether a warm-started engine stays on one branch where a step has several motions.
 
     Six scenes whose bodies are pushed in directions of their own.
@@ -206,5 +204,3 @@ def command(steps: int, every: int, sweeps: int, out: Path | None) -> None:
         found += own
         click.echo(f"{own[0].run if own else name}: {len(own)} steps", err=True)
     click.echo(table(found))
-    if out is not None:
-        write_json(out, found)

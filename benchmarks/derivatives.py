@@ -1,6 +1,6 @@
 """Derivatives of solutions: whether they agree with differences, whether the others are flagged, what they cost.
 
-    python -m benchmarks derivatives [--draws 300] [--steps 125] [--models MODEL.xml]... [--out FILE]
+    python -m benchmarks derivatives [--draws 300] [--steps 125] [--models MODEL.xml]...
 
 A direction of v* (of b, where only a matrix is known) is drawn for each problem. The change of the slack along it is
 compared with central differences of solutions whose residual is at most 1e-12 or at its floor. Their step h is the one
@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import click
 import numpy as np
 
 import lavender as lv
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender import suite
 
 STEPS = 10.0 ** -np.arange(3.0, 10.5, 0.5)
@@ -368,8 +368,7 @@ def jacobians(path: str, steps: int = 200) -> tuple[Any, ...]:
 @click.option("--steps", default=125, show_default=True, help="Steps of each model, under each of its cones.")
 @click.option("--models", multiple=True, type=click.Path(exists=True, dir_okay=False), help="A MuJoCo model.")
 @click.option("--only", type=click.Choice(("agreement", "costs")), help="One part alone.")
-@out_option("Every problem as JSON.")
-def command(draws: int, steps: int, models: tuple[str, ...], only: str | None, out: Path | None) -> None:
+def command(draws: int, steps: int, models: tuple[str, ...], only: str | None) -> None:
     """Derivatives beside differences of solves: agreement, what is flagged, times."""
     lines: list[Any] = []
     given = list(sources(draws, steps, models))
@@ -395,8 +394,6 @@ def command(draws: int, steps: int, models: tuple[str, ...], only: str | None, o
                 "off [-]",
             )
             click.echo("\n" + markdown(head, [jacobians(path) for path in models]))
-    if out is not None:
-        write_json(out, [asdict(x) for x in lines])
 
 
 def _chunks(problems: list[lv.Problem], size: int) -> Iterator[list[lv.Problem]]:

@@ -22,7 +22,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender.base.errors import InputError
 from lavender.judge.residuals import AT_FLOOR, Residual, nothing_to_do, residual
 from lavender.problem import Problem
@@ -200,8 +200,7 @@ def table(stops: Sequence[Stop]) -> str:
 @click.option("--steps", default=100, show_default=True, help="Problems of each model.")
 @click.option("--every", default=5, show_default=True, help="Steps of the simulation between two.")
 @click.option("--seed", default=0, show_default=True)
-@out_option("Every answer, as JSON.")
-def command(models: tuple[Path, ...], steps: int, every: int, seed: int, out: Path | None) -> None:
+def command(models: tuple[Path, ...], steps: int, every: int, seed: int) -> None:
     """Early stops planted in a float32 Newton over steps of MuJoCo models, and what the judge says of them."""
     rng, stops = np.random.default_rng(seed), []
     for model in models:
@@ -210,5 +209,3 @@ def command(models: tuple[Path, ...], steps: int, every: int, seed: int, out: Pa
     if not stops:
         raise InputError("no step had a constraint: more steps, or other models")
     click.echo(table(stops))
-    if out is not None:
-        write_json(out, stops, models=[m.name for m in models], steps=steps, every=every, seed=seed)

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from time import process_time
 from typing import Any
 
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.sim.engine import Simulation
@@ -154,8 +153,7 @@ def table(found: Iterable[Stay]) -> str:
     show_default=True,
     help="Solvers of the substeps, commas between them.",
 )
-@out_option("Also write the numbers as JSON.")
-def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: Path | None) -> None:
+def command(scenes: tuple[str, ...], seconds: float, solvers: str) -> None:
     """Run scenes of the gallery for ten minutes, at 60 and at 120 steps a second: energies, drifts, times.
 
     SCENES: names; without any, the whole gallery.
@@ -169,5 +167,3 @@ def command(scenes: tuple[str, ...], seconds: float, solvers: str, out: Path | N
                 found.append(stay(name, 1.0 / rate, seconds, solver=solver))
                 lines = table(found[-1:]).splitlines()
                 click.echo("\n".join(lines if len(found) == 1 else lines[2:]))
-    if out is not None:
-        write_json(out, found)

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender import motion
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io.stored import write_figure
@@ -337,13 +337,11 @@ def figure(found: Sequence[Sample], path: str | Path) -> None:
 @click.option(
     "--figure", "picture", type=click.Path(path_type=Path), help="Residual against motion error, drawn."
 )
-@out_option("JSON of the searches, and of the iterates as `samples`.")
 def command(
     files: tuple[str, ...],
     runs: int,
     rows: int,
     picture: Path | None,
-    out: Path | None,
 ) -> None:
     """What a residual tells of the motion, and how many motions a problem has.
 
@@ -370,5 +368,3 @@ def command(
         click.echo(f"\n{left} problems left out: empty, above {rows} rows, or without a solver here.")
     if picture is not None:
         figure(seen, picture)
-    if out is not None:
-        write_json(out, found, samples=[asdict(sample) for sample in seen])

@@ -1,7 +1,7 @@
 """What every form, start, phase and factorisation of `newton` is worth: each taken out alone.
 
     python -m benchmarks newton [--sets hard,default,wild,scenes] [--seeds 9000:9060] [--rows 1000]
-                                [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME] [--out FILE]
+                                [--files 'robots/*.npz'] [--tol 1e-6] [--limit 2] [--only NAME]
 
 A part is taken out by putting something in its place while a problem is solved (with it, itself), a phase by leaving it
 out. A line for each part and class (law, operator, size) on which its absence changes the result's bits or work: those
@@ -28,7 +28,7 @@ import numpy as np
 
 import lavender as lv
 from benchmarks.made import forms
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender import suite
 from lavender.judge.residuals import nothing_to_do
 from lavender.lab.suite import lots
@@ -246,7 +246,6 @@ def table(records: list[dict[str, Any]]) -> str:
 @click.option("--tol", default=1e-6, show_default=True)
 @click.option("--limit", default=2.0, show_default=True, help="Of one solve [s].")
 @click.option("--only", multiple=True, type=click.Choice(list(PARTS)), help="Parts; default: all.")
-@out_option("JSON of the lines.")
 def command(
     sets: str,
     seeds: str,
@@ -255,7 +254,6 @@ def command(
     tol: float,
     limit: float,
     only: tuple[str, ...],
-    out: Path | None,
 ) -> None:
     """What every form, start, phase and factorisation of newton is worth: each taken out alone."""
     args = Asked(sets.replace(",", " ").split(), seeds, rows, files, tol, limit)
@@ -264,5 +262,3 @@ def command(
         if problem.m and not nothing_to_do(problem):
             records += [{"name": name} | record for record in compare(problem, parts, args)]
     click.echo(table(records))
-    if out is not None:
-        write_json(out, records)

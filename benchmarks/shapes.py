@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from pathlib import Path
 from time import process_time
 from typing import Any
 
@@ -22,7 +21,7 @@ import click
 import numpy as np
 import scipy.sparse as sp
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender import solve
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.engines import engine
@@ -235,8 +234,7 @@ def _dart(gravity: tuple[float, float, float], steps: int) -> Iterator[tuple[str
 @click.command()
 @click.argument("names", nargs=-1)
 @click.option("--engines", is_flag=True, help="Drag a slab down a slope in every engine here instead.")
-@out_option("Write every figure as JSON.")
-def command(names: tuple[str, ...], engines: bool, out: Path | None) -> None:
+def command(names: tuple[str, ...], engines: bool) -> None:
     """Friction in a disk, a box and the edges of a pyramid."""
     if engines:
         g = 9.81 * (np.sin(np.arctan(STEEP * MU)) - MU * np.cos(np.arctan(STEEP * MU)))
@@ -246,13 +244,9 @@ def command(names: tuple[str, ...], engines: bool, out: Path | None) -> None:
         along, across = dict(drag(0.0)), dict(drag(np.pi / 4))
         click.echo(markdown(("engine", "along [m/s]", "diagonal [m/s]"),
                             [(e, f"{along[e]:.3f}", f"{across[e]:.3f}") for e in along]))  # fmt: skip
-        if out is not None:
-            write_json(out, [{"engine": e, "along": along[e], "diagonal": across[e]} for e in along])
         return
     known = scenes()
     found: list[Law] = []
     for name in names or known:
         found += laws(name, known[name]())
     click.echo(table(found))
-    if out is not None:
-        write_json(out, found)

@@ -22,7 +22,7 @@ from typing import Any
 import click
 import numpy as np
 
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown, out_option
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.io.stored import write_figure
@@ -227,9 +227,8 @@ def _figure(scene: str, points: Sequence[Point]) -> Figure:
 
 @click.command("steppers")
 @click.option("--steppers", default=",".join(STEPPERS), show_default=True, help="Names with commas.")
-@out_option("Every run, JSON.")
 @out_option("Figure (.svg, .png).", "--plot")
-def command(steppers: str, out: Path | None, plot: Path | None) -> None:
+def command(steppers: str, plot: Path | None) -> None:
     """Steppers' distance from a reference on six scenes, against CPU time."""
 
     def show(point: Point) -> None:
@@ -237,8 +236,6 @@ def command(steppers: str, out: Path | None, plot: Path | None) -> None:
         click.echo(f"{point.scene}, {point.stepper} {point.substeps} x {point.sweeps}: {words}", err=True)
 
     found = measure(steppers=steppers.replace(",", " ").split(), show=show)
-    if out is not None:
-        write_json(out, found)
     if plot is not None:
         draw(found, plot)
     click.echo(table(found))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from time import perf_counter, process_time_ns
 from typing import Any
@@ -21,7 +21,6 @@ from lavender.problem import Problem
 from lavender.sim.engine.simulation import Simulation
 from lavender.sim.scene.scene import Scene
 from lavender.solving.solve import prepare, solve
-from lavender_ext.judge import measure
 
 __all__ = ["CASES", "Job", "Row", "job", "run"]
 
@@ -135,24 +134,21 @@ def _threads(contacts: int, threads: int = 2) -> Job:
     )
 
 
-def _matrix(problem: Problem, name: str) -> Job:
-    nnz = problem.csr.nnz
-    n = _count(nnz)
-    call, lam = sweeps(problem, name, n)
-    a, bare = problem.csr, None
-    if name == "pgs":
-        arrays = (a.indptr, a.indices, a.data, problem.b, np.ascontiguousarray(problem.csr_data.step))
-        other = problem.start()
-        microbenchmarks.csr(*arrays, other, _ADD)
-        bare = partial(microbenchmarks.csr, *arrays, other, n)
+def _matrix(problem: Problem) -> Job:
+    a = problem.csr
+    n = _count(a.nnz)
+    call, lam = sweeps(problem, "pgs", n)
+    arrays = (a.indptr, a.indices, a.data, problem.b, np.ascontiguousarray(problem.csr_data.step))
+    other = problem.start()
+    microbenchmarks.csr(*arrays, other, _ADD)
     return Job(
-        case=name,
-        size=f"{problem.m:,} rows, {nnz / problem.m:.0f} entries each",
+        case="pgs",
+        size=f"{problem.m:,} rows, {a.nnz / problem.m:.0f} entries each",
         unit="entry of A",
-        work=n * nnz,
+        work=n * a.nnz,
         call=call,
-        beside="bare" if bare else "",
-        limit=bare,
+        beside="bare",
+        limit=partial(microbenchmarks.csr, *arrays, other, n),
         relative=lambda: residual(problem, lam).relative,
     )
 
@@ -176,32 +172,12 @@ def _block_sweep(contacts: int) -> Job:
     )  # fmt: skip
 
 
-def _judge(contacts: int) -> Job:
-    problem = lattice_pile(contacts)
-    lam = solve(problem, "sequential_impulses", tol=0.0, max_iter=8).impulse
-    w, e = np.empty(problem.m), np.empty(problem.m)
-    return Job(
-        "residual", f"{problem.n_blocks} contacts", "contact", problem.n_blocks,
-        lambda: measure.judge(problem.data, lam, w, e, False), relative=lambda: residual(problem, lam).relative,
-    )  # fmt: skip
-
-
-def _build(contacts: int) -> Job:
-    rows = lattice_pile(contacts).rows
-    assert rows is not None
-
-    def build() -> None:
-        _ = Problem.from_rows(replace(rows, copy=False), mu=0.5, tangents=2).data
-
-    return Job("Problem.from_rows", f"{rows.n_contacts} contacts", "contact", rows.n_contacts, build)
-
-
-def _small(m: int) -> Job:
-    j = np.random.default_rng(m).normal(size=(m, m + 2))
-    problem = Problem.lcp(j @ j.T, np.ones(m))
+def _small() -> Job:
+    j = np.random.default_rng(8).normal(size=(8, 10))
+    problem = Problem.lcp(j @ j.T, np.ones(8))
     return Job(
         case="lv.solve, 8 sweeps of pgs",
-        size=f"{m} rows",
+        size="8 rows",
         unit="call",
         work=1,
         call=lambda: solve(problem, "pgs", tol=0.0, max_iter=8),
@@ -221,18 +197,11 @@ _JOBS: dict[str, Callable[[], Job]] = {
     "impulses-colored": partial(_impulses, 100_000, order="colored"),
     "threads-10k": partial(_threads, 10_000),
     "threads-100k": partial(_threads, 100_000),
-    "pgs": lambda: _matrix(frictionless(1_000), "pgs"),
-    "pgs-100k": lambda: _matrix(frictionless(100_000), "pgs"),
-    "pgs-tridiagonal": lambda: _matrix(tridiagonal(2_000), "pgs"),
-    "pgs-tridiagonal-1m": lambda: _matrix(tridiagonal(1_000_000), "pgs"),
-    "jacobi": lambda: _matrix(frictionless(1_000), "jacobi"),
+    "pgs": lambda: _matrix(frictionless(1_000)),
+    "pgs-100k": lambda: _matrix(frictionless(100_000)),
+    "pgs-tridiagonal": lambda: _matrix(tridiagonal(2_000)),
     "block": partial(_block_sweep, 1_000),
-    "judge": partial(_judge, 10_000),
-    "build": partial(_build, 10_000),
-    "build-1m": partial(_build, 1_000_000),
-    "solve-1": partial(_small, 1),
-    "solve-8": partial(_small, 8),
-    "solve-64": partial(_small, 64),
+    "solve-8": _small,
 }
 
 

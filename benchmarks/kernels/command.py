@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import replace
 
 import click
 
 from benchmarks.kernels.cases import CASES, Row, run
 from benchmarks.kernels.instructions import COUNTED, instructions
-from benchmarks.output import markdown, out_option, write_json
+from benchmarks.output import markdown
 from lavender.lab.bench import machine
 
 __all__ = ["command", "table"]
@@ -43,8 +42,7 @@ def table(rows: Sequence[Row]) -> str:
 @click.option(
     "--instructions", "count", is_flag=True, help="Count instructions by valgrind's callgrind, minutes."
 )
-@out_option("Write every row here too, JSON.")
-def command(cases: tuple[str, ...], seconds: float, count: bool, out: Path | None) -> None:
+def command(cases: tuple[str, ...], seconds: float, count: bool) -> None:
     """Kernels and small calls beside bare loops of the same mathematics, measured in turns.
 
     CASES are names; without them all of them.
@@ -59,5 +57,3 @@ def command(cases: tuple[str, ...], seconds: float, count: bool, out: Path | Non
             rows = [replace(r, instructions=instructions(name)) for r in rows]
         found += rows
     click.echo(table(found))
-    if out is not None:
-        write_json(out, [asdict(r) | {"ns_per_unit": r.per_unit, "share": r.share} for r in found])

@@ -24,7 +24,7 @@ call()
 for _ in range(int(sys.argv[2])):
     call()
 """
-COUNTED = ("impulses", "pgs", "pgs-tridiagonal", "jacobi", "block", "judge", "solve-8")
+COUNTED = ("impulses", "pgs", "pgs-tridiagonal", "block", "solve-8")
 
 
 def instructions(name: str, calls: int = 10) -> float:

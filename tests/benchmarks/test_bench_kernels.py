@@ -1,6 +1,5 @@
 """Kernels and steps timed: bare loops do the same work, figures are consistent, commands print and write them."""
 
-import json
 import shutil
 import time
 
@@ -58,7 +57,7 @@ def test_least_is_the_least_of_many():
     assert found == [pytest.approx(3e-6)]
 
 
-@pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "jacobi", "block", "solve-1", "engine-box"])
+@pytest.mark.parametrize("case", ["impulses", "pgs-tridiagonal", "block", "solve-8", "engine-box"])
 def test_cases_give_time_work_and_residual(case):
     rows = list(run([case], seconds=0.01))
     for row in rows:
@@ -74,19 +73,17 @@ def test_a_wrong_case_is_named():
         list(run(["nosuch"]))
 
 
-def test_command_prints_and_writes(tmp_path):
-    out = tmp_path / "kernels.json"
-    done = CliRunner().invoke(command, ["solve-1", "--seconds", "0.01", "--out", str(out)])
+def test_command_prints():
+    done = CliRunner().invoke(command, ["solve-8", "--seconds", "0.01"])
     assert done.exit_code == 0, done.output
     assert "lv.solve" in done.output and "kernel alone" in done.output
-    record = json.loads(out.read_text())
-    assert record["lines"][0]["ns_per_unit"] > 0.0
-    assert record["lines"][0]["share"] < 1.0  # a whole call takes longer than its kernel
+    (row,) = run(["solve-8"], seconds=0.01)
+    assert row.share < 1.0  # a whole call takes longer than its kernel
 
 
 def test_counting_says_what_is_missing(monkeypatch):
     with pytest.raises(lv.InputError, match="not counted"):
-        instructions("build")
+        instructions("impulses-1m")
     monkeypatch.setattr(shutil, "which", lambda name: None)
     with pytest.raises(lv.SolverUnavailable, match="valgrind"):
         instructions("pgs")

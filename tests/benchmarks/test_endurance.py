@@ -3,8 +3,6 @@
 The short form of `python -m benchmarks gallery`, which runs ten minutes.
 """
 
-import json
-
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -59,19 +57,13 @@ def test_energy_is_that_of_the_textbook():
     assert gallery.energy(scene, observation) == pytest.approx(expected, rel=1e-14)
 
 
-def test_a_lost_scene_says_so_and_the_command_writes_its_table(tmp_path):
-    words = ["spinner", "ramp", "--seconds", "0.5", "--out", str(tmp_path / "found.json")]
+def test_a_lost_scene_says_so_and_the_command_writes_its_table():
+    words = ["spinner", "ramp", "--seconds", "0.5"]
     done = CliRunner().invoke(gallery.command, words, catch_exceptions=False)
     assert done.exit_code == 0
     printed = done.output.splitlines()
-    assert len(printed) == 6 and printed[0].startswith("| scene") and printed[-1].startswith("| ramp")
-    found = json.loads((tmp_path / "found.json").read_text())["lines"]
-    assert [(f["scene"], round(1 / f["dt"])) for f in found] == [
-        ("spinner", 60),
-        ("spinner", 120),
-        ("ramp", 60),
-        ("ramp", 120),
-    ]
+    assert len(printed) == 6 and printed[0].startswith("| scene")
+    assert [line.split(" | ")[0] for line in printed[2:]] == ["| spinner"] * 2 + ["| ramp"] * 2
     fast = gallery.stay("ramp", 1 / 60, 1.0, gravity=1e60)
     assert fast.lost == "box 1" and "| box 1 |" in table([fast])
     for words in (["--seconds", "0"], ["no_such_scene"], ["--solvers", "nwton", "ramp"]):
