@@ -112,15 +112,8 @@ class Tree:
     @cached_property
     def states(self) -> dict[str, NewtonState]:
         """Newton's method after its analysis, the cheaper form first; none where it takes no form or has no time."""
-        found: dict[str, NewtonState] = {}
-        if get("newton").refuses(self.problem) is None and not self.is_late:
-            found |= self.prepared("newton")
-            if self._rows_may_pay(found.get("newton"), MOST if self.tried else 1.0):
-                found |= self.prepared("newton over rows")
-        # Last what has failed.
-        return dict(
-            sorted(found.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
-        )
+        able = get("newton").refuses(self.problem) is None and not self.is_late
+        return self.prepared("newton") if able else {}
 
     def prepared(self, name: str) -> dict[str, NewtonState]:
         """Newton's method in this form after its analysis, by name; nothing where that breaks down."""
@@ -129,20 +122,29 @@ class Tree:
         except BREAKDOWN:
             return {}
 
-    def _rows_may_pay(self, over: NewtonState | None, left: float, least: float = 0.0) -> bool:
-        """Whether rows of an A that is formed of J and M are counted to cost less than `left` times what velocities do,
-        or `least` [ns], and are there in time, with what of SciPy reads them.
+    @cached_property
+    def formed(self) -> float:
+        """Newton's method over rows of an A that is yet to be formed of J and M, at least; inf where that cannot be."""
+        p, state = self.problem, self.states.get("newton")
+        if state is None or state.general is None or p.cones.has_round:
+            return inf
+        return costs.newton_cost(costs.formed(p), self.law)
+
+    def add_rows(self, most: float) -> None:
+        """Analyse A of J and M as well, if that is counted to cost less and is there in time, with what of SciPy reads
+        it; last what has failed.
         """
-        problem = self.problem
-        if over is None or over.general is None or problem.cones.has_round or self.is_late:
-            return False
-        if costs.newton_cost(costs.formed(problem), self.law) >= max(left * over.cost, least):
-            return False
-        return not (
-            self.deadline.is_set and self.deadline.passed(over_rows(problem) + 3.0 * forming(problem))
+        p, states = self.problem, self.states
+        if "newton over rows" in states or self.formed >= most or self.is_late:
+            return
+        if self.deadline.is_set and self.deadline.passed(over_rows(p) + 3.0 * forming(p)):
+            return
+        states |= self.prepared("newton over rows")
+        self.states = dict(
+            sorted(states.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
         )
 
-    @cached_property
+    @property
     def newton(self) -> float:
         """Newton's method, inf where there is none."""
         return min((state.cost for state in self.states.values()), default=inf)
@@ -218,6 +220,8 @@ class Tree:
         # Fill is most of what J and M cost, and only an analysis tells it: they are swept as long as is usual before.
         usual = self.problem.generalized is not None and self.law == "coulomb"
         yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep if usual else 0.0))
+        yield from self.sweeps_first(min(self.newton, self.formed))
+        self.add_rows((MOST if self.tried else 1.0) * self.newton)
         yield from self.sweeps_first(self.newton)
         if self.is_dense:
             yield self.rounds(self.newton, "a dense factor, of the rows that are free")
@@ -231,11 +235,9 @@ class Tree:
         if self.is_program:
             return
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
-        if "newton over rows" not in self.states and self._rows_may_pay(
-            self.states.get("newton"), MOST, LITTLE
-        ):
-            self.states |= self.prepared("newton over rows")
-            unit = min(max(state.cost for state in self.states.values()), max(unit, LITTLE))
+        if "newton over rows" not in self.states:
+            self.add_rows(max(MOST * self.newton, LITTLE))
+            unit = min(max((state.cost for state in self.states.values()), default=unit), max(unit, LITTLE))
         self.left = min((LAST - MOST) * unit, LONG) - self.begun
         for k in range(TURNS):
             before = self.best
@@ -261,7 +263,7 @@ class Tree:
         return Stage("direct", ROUNDS * costs.factorisations(self.law), cost, why)
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
-        """For Newton's cost: first what that is at least, then what it is counted for."""
+        """For Newton's cost: first what that is at least, then what it is counted for, of J and M once A is formed."""
         cost = newton - self.begun
         # Newton's method then takes what it is counted for, if that is there.
         sure = self.law == "linear" or (self.law != "coulomb" and self.problem.matrix is None)
