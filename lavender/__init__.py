@@ -17,10 +17,10 @@ Submodules and the engine are imported at their first use.
 
 import lavender.base.starting  # noqa: I001 - first: Ctrl-C from here on
 
-from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import lavender.base.built
+from lavender.base.later import imported
 from lavender._version import __version__
 from lavender.problem.cones import (
     CONTACT,
@@ -191,9 +191,9 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        value = import_module(_MODULES[name])
+        value = imported(_MODULES[name])
     elif name in _LATER:
-        value = getattr(import_module(_LATER[name]), name)
+        value = getattr(imported(_LATER[name]), name)
     else:
         raise AttributeError(f"module 'lavender' has no attribute {name!r}")
     globals()[name] = value

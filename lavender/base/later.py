@@ -8,10 +8,38 @@ to be used while the clock of a solve runs is loaded before, by `load`.
 
 from __future__ import annotations
 
+import os
 from importlib import import_module
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
-__all__ = ["above", "issparse", "lapack", "load", "sparse"]
+__all__ = ["above", "imported", "issparse", "lapack", "load", "loading", "sparse"]
+
+_lock = RLock()
+
+
+def loading() -> RLock:
+    """The lock under which one thread at a time imports modules and fills tables from them."""
+    return _lock
+
+
+def imported(name: str) -> Any:
+    """A module, imported now if it was not before.
+
+    Python locks each module by itself, a file before its package: of two threads that enter a package by different
+    files, one would get half a module.
+    """
+    with loading():
+        return import_module(name)
+
+
+def _forked() -> None:
+    global _lock
+    _lock = RLock()  # no thread is left in a fork's child to give the other one back
+
+
+if hasattr(os, "register_at_fork"):  # not on Windows
+    os.register_at_fork(after_in_child=_forked)
 
 
 class _Later:
@@ -23,7 +51,7 @@ class _Later:
     def __getattr__(self, name: str) -> Any:
         if name == "_name" or name.startswith("__"):  # of a copy that is being made
             raise AttributeError(name)
-        value = getattr(import_module(self._name), name)
+        value = getattr(imported(self._name), name)
         setattr(self, name, value)
         return value
 
@@ -46,7 +74,7 @@ def above(name: str) -> Any:
 def load(*more: str) -> None:
     """Load sparse arrays, LAPACK and further modules, if they are not."""
     for name in ("scipy.sparse", "scipy.linalg.lapack", *more):
-        import_module(name)
+        imported(name)
 
 
 def issparse(value: object) -> bool:

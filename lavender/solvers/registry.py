@@ -7,7 +7,6 @@ or a function that returns one) or with `register`.
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import warnings
 from collections.abc import Callable, Mapping
@@ -18,6 +17,7 @@ from typing import Any, Protocol
 from lavender.base.arrays import FloatArray
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, last_words
+from lavender.base.later import imported, loading
 from lavender.judge.solution import Claim, Status
 from lavender.problem import LAWS, OPERATORS, Problem, check_problem
 from lavender.problem.derived import cached_property
@@ -271,7 +271,7 @@ class SolverSpec:
             return self.factory
         module, _, attribute = self.factory.partition(":")
         try:
-            return getattr(importlib.import_module(module), attribute)
+            return getattr(imported(module), attribute)
         except Exception as error:
             raise SolverUnavailable(
                 f"solver {self.name!r} cannot be imported from {self.factory!r}: {last_words(error)}"
@@ -301,7 +301,7 @@ registered: dict[str, SolverSpec] = {}
 
 def load_table(table: str) -> None:
     """Fill `registered` with the SPECS of a module."""
-    for spec in importlib.import_module(table).SPECS:
+    for spec in imported(table).SPECS:
         registered.pop(spec.name, None)  # those that were asked for by name go to their places, too
         _add_own(spec)
 
@@ -311,8 +311,14 @@ def _add_own(spec: SolverSpec) -> None:
     registered[spec.name] = spec
 
 
-@cache
 def load() -> None:
+    """Have `registered` filled, by one thread while the others wait."""
+    with loading():
+        fill()
+
+
+@cache
+def fill() -> None:
     """Fill `registered` once, with the built-in solvers and those of plug-ins."""
     from importlib.metadata import entry_points  # a tenth of `import lavender`, needed only here
 
@@ -380,7 +386,7 @@ def get(name: str) -> SolverSpec:
 
 def _found(name: str) -> SolverSpec | None:
     """One that is not registered yet: of ours its file alone is imported, for which a time limit has room."""
-    own: SolverSpec | None = importlib.import_module(TABLES[0]).spec_of(name)
+    own: SolverSpec | None = imported(TABLES[0]).spec_of(name)
     if own is not None:
         _add_own(own)
         return own

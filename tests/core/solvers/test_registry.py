@@ -187,7 +187,7 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
     entries = [Entry("broken", load), Entry("good", lambda: named("good_one"))]
     monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: entries)
     monkeypatch.setattr(registry, "registered", {})
-    registry.load.cache_clear()
+    registry.fill.cache_clear()
     try:
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")
@@ -197,6 +197,6 @@ def test_a_broken_plug_in_warns_by_name_and_breaks_nothing(load, sign, monkeypat
         assert "'broken'" in str(warning.message)
         assert sign in str(warning.message)
     finally:
-        registry.load.cache_clear()
+        registry.fill.cache_clear()
         monkeypatch.undo()
         registry.specs()

@@ -99,9 +99,9 @@ def hostile(tmp_path, monkeypatch):
     monkeypatch.setattr(registry, "registered", dict(registry.specs()))
     monkeypatch.syspath_prepend(str(folder))
     monkeypatch.setenv("FAKE_NOTE", str(tmp_path / "note"))
-    registry.load.cache_clear()
+    registry.fill.cache_clear()
     yield tmp_path / "note"
-    registry.load.cache_clear()
+    registry.fill.cache_clear()
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from calls import free
+from worked import python
 
 import lavender as lv
 from lavender.lab.motion.unique import uniqueness
@@ -128,3 +129,27 @@ def test_under_friction_a_step_is_near_one_of_its_motions():
     assert 0.0 < motion["relative"] < 0.5
     assert motion["bound"] is None
     assert motion["open"] >= 0.0
+
+
+def test_threads_that_enter_a_package_by_different_files_all_get_it():
+    """The first is in `motion/__init__.py` when the second asks for another file of that package."""
+    code = """if True:
+        import importlib.abc, sys, threading, time
+        import lavender as lv
+
+        inside, found = threading.Event(), []
+
+        class Slow(importlib.abc.MetaPathFinder):
+            def find_spec(self, name, path, target=None):
+                if name == "lavender.lab.motion.bound":
+                    inside.set()
+                    time.sleep(0.5)  # for the second to get there
+
+        sys.meta_path.insert(0, Slow())
+        first = threading.Thread(target=lambda: found.append(lv.motion_error))
+        first.start()
+        assert inside.wait(600)
+        found.append(lv.prove)
+        first.join()
+        assert len(found) == 2"""
+    assert python("-W", "error", "-c", code).stderr == ""
