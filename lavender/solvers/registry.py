@@ -331,7 +331,7 @@ def fill() -> None:
             _add(spec, replace=False)
         except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
             warnings.warn(
-                f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=3
+                f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4
             )
 
 
