@@ -24,6 +24,9 @@ from lavender.lab.phenomena.running import Apart
 from lavender.sim.scene.steppers import STEPPERS
 
 NAMES = tuple(PHENOMENA)
+QUICK = (
+    "stick", "slide", "stop", "lift", "roll", "roll_to_rest", "spin_down", "free_rotation", "chain_load", "tipping",
+)  # fmt: skip
 OTHERS = [w for w in WAYS.values() if w.module != "own"]
 
 
@@ -82,7 +85,30 @@ def test_parameters_out_of_their_range_are_refused(name):
         p.scene({"nonsense": 1.0})
 
 
-@pytest.mark.parametrize("name", [n for n in NAMES if n != "pendulum"])
+def cells(text):
+    """Worst value with its unit, and cases that passed, by engine and phenomenon, of the tables in a text."""
+    found, heads = {}, []
+    for line in text.splitlines():
+        name, *row = (cell.strip(" *") for cell in line.removeprefix("|").rstrip(" |").split("|"))
+        heads = heads if name else row
+        found |= {(name, head): cell.split(", ") for head, cell in zip(heads, row, strict=False)}
+    return found
+
+
+@pytest.mark.parametrize("stepper", STEPPERS)
+def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
+    page = cells((Path(__file__).resolve().parents[3] / "docs" / "phenomena.md").read_text(encoding="utf-8"))
+    found = cells(tables.table(run(QUICK, steppers=[stepper])))
+    for way in ways([stepper], []):
+        for key in ((way.name, name) for name in QUICK):
+            (value, *passed), (told, *counted) = found[key], page[key]
+            assert passed == counted, key
+            if passed:
+                (x, *unit), (y, *other) = value.split(), told.split()
+                assert (float(x), unit) == (pytest.approx(float(y), rel=0.05, abs=1e-10), other), key
+
+
+@pytest.mark.parametrize("name", sorted({*NAMES} - {*QUICK, "pendulum"}))
 def test_the_exact_solver_keeps_every_bound_of_the_first_case(name):
     # it dissipates what swings, at first order in the step: a pendulum it does not keep
     (record,) = run([name], steppers=["impulses newton"], parameters=dict(PHENOMENA[name].cases[0]))

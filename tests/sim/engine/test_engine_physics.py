@@ -30,16 +30,6 @@ def test_a_projectile_follows_the_integrator_exactly_and_physics_to_first_order(
     assert errors[0] / errors[1] == pytest.approx(2.0, rel=1e-9)
 
 
-def test_a_spinning_ball_decelerates_with_mu_r_n():
-    sim = lv.Simulation(lv.Scene("spinner", friction=0.4, patch_radius=0.07, spin=10.0))
-    spin = [run(sim, 1)["velocities"][1, 5] for _ in range(30)]
-    rate = 0.4 * 0.07 * G / (0.4 * 0.5**2)  # mu r m g / I
-    np.testing.assert_allclose(-np.diff(spin), rate / 120.0, rtol=1e-12)
-    rest = run(sim, 600)
-    assert rest["velocities"][1, 5] == pytest.approx(0.0, abs=1e-15)
-    assert abs(rest["contacts"]["impulses"][0, 3]) <= 0.4 * 0.07 * rest["contacts"]["impulses"][0, 0]
-
-
 def test_two_spheres_bounce_elastically():
     scene = lv.Scene(gravity=0.0, restitution=1.0, friction=0.0)
     scene.add_sphere(0.5, 1.0, position=(-1, 0.1, 0), velocity=(2, 0, 0))
