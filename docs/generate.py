@@ -527,8 +527,6 @@ def part_pages(site):
     text = inspect.getdoc(sys.modules["lavender.problem.ordering"])
     assert all(order in text for order in ORDERS)
     site.write("parts/orders.md", docstrings.markdown(text.partition("\n")[2]))
-    fields = ", ".join(f"`{name}`" for name in lv.SOLVER_FIELDS)
-    site.write("parts/solver_fields.md", fields + ".")
 
 
 def calibration_part(site):

@@ -68,14 +68,3 @@ def test_the_command_prints_the_map_and_writes_the_lines(tmp_path):
 def test_what_makes_no_sense_is_refused_before_anything_is_measured(words, error):
     result = CliRunner().invoke(command, words)
     assert isinstance(result.exception, lv.LavenderError) and error in str(result.exception)
-
-
-@pytest.mark.parametrize("name", ENGINES)
-def test_centres_before_the_first_step_are_where_the_boxes_were_put(name):
-    if missing(name):
-        pytest.skip(missing(name))
-    engine = ENGINES[name].make(Tower(3, 1 / 60))
-    np.testing.assert_allclose(
-        engine.centres()[:, 2], [0.5, 1.5, 2.5], atol=1e-6
-    )  # some are single precision
-    engine.engine.close()

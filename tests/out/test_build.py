@@ -142,24 +142,6 @@ def test_sanitizers_have_nothing_to_say(folder, tmp_path, name, what):
         run(tmp_path / source.stem, cwd=tmp_path, env={"ASAN_OPTIONS": "detect_leaks=0"})
 
 
-@pytest.mark.slow
-def test_the_binary_interface_of_the_last_release_is_kept(folder, tmp_path):
-    release = os.environ.get("LAVENDER_RELEASE", "")
-    if not release or shutil.which("abidiff") is None or shutil.which("gcc") is None:
-        pytest.skip(
-            "needs gcc, abidiff (Debian: abigail-tools), and LAVENDER_RELEASE that names what a release exported"
-        )
-    for at, out in ((Path(release), "old.so"), (folder, "new.so")):
-        flags = ["-std=c11", "-O0", "-g", "-fPIC", "-shared", "-DLAV_SHARED", "-fvisibility=hidden"]
-        run("gcc", *flags, at / "lavender.c", "-lm", "-o", tmp_path / out)
-    done = subprocess.run(
-        ["abidiff", "--headers-dir1", release, "--headers-dir2", folder, "old.so", "new.so"],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    said = re.search(r"Functions changes summary: (\d+) Removed, (\d+) Changed", done.stdout)
-    assert done.returncode & 0b1011 == 0 and (said is None or said[1] == "0"), done.stdout + done.stderr
-
-
 def write_vectors(out):
     given = [
         (self_test_problem(), "sequential_impulses", {}), (self_test_problem(), "anderson", {"memory": 3}),

@@ -15,7 +15,7 @@ from lavender.sim.engine.layout import HEAD
 @pytest.mark.parametrize(
     "name",
     [
-        "residual_or_motion", "two_motions", "turns_of_auto", "what_a_row_costs", "recorded_slide", "planned_push",
+        "residual_or_motion", "two_motions", "what_a_row_costs", "recorded_slide", "planned_push",
         "which_contact",
     ],
 )  # fmt: skip

@@ -39,13 +39,6 @@ def test_a_ball_rolls_to_rest_where_the_moment_stops_it(patch):
     assert abs(seen["positions"][1, 0] / truth - 1.0) < 0.01
 
 
-def test_without_it_the_ball_rolls_on():
-    sim = ball(rolling=0.0)
-    for _ in range(240):
-        seen = sim.step()[0]
-    assert abs(seen["velocities"][1, 0] - 2.0) < 1e-6
-
-
 def test_the_cache_gives_the_moments_back():
     """A resting pile warm-started solves better than a cold one at the same sweeps."""
     warm, cold = pile(warm_start=True), pile(warm_start=False)
