@@ -221,11 +221,11 @@ def _ages(path: Path, controls: str) -> list[float]:
         found = [path.stat().st_mtime]
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    with contextlib.suppress(
-        ImportError, AttributeError, ValueError, RuntimeError
-    ):  # an earlier MuJoCo, no model
-        import mujoco
-
-        others = (*sorted(mujoco.mju_getXMLDependencies(str(path))), controls)
+    try:
+        from mujoco import FatalError, mju_getXMLDependencies
+    except ImportError:  # none, or an earlier one
+        return found
+    with contextlib.suppress(ValueError, RuntimeError, FatalError):  # no model: said where it is read
+        others = (*sorted(mju_getXMLDependencies(str(path))), controls)
         found += [p.stat().st_mtime for p in map(Path, others) if p.is_file()]
     return found

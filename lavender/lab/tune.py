@@ -156,7 +156,8 @@ class Stage:
         starts, controls = [], []
         for world in worlds:
             drive = runs.drive(model, world)
-            ctrl = np.array([drive(None, step) for step in range(runs.steps)]).reshape(-1, ahead, model.nu)
+            each = np.array([drive(None, step) for step in range(runs.steps)])
+            ctrl = each.reshape(runs.steps // ahead, ahead, model.nu)
             starts.append(states_of(mj, model, runs, world)[::ahead])
             controls.append(ctrl)
         made = cls(mj, model, np.concatenate(starts), np.concatenate(controls))

@@ -58,6 +58,10 @@ def test_record_then_report_from_the_command_line(lavender, tmp_path):
     assert len(list(out.glob("*.npz"))) == 2
     assert lavender("record", model, "--controls", "no.npy", "--out", tmp_path / "o")[0] == EXIT_BAD_INPUT
     assert lavender("report", tmp_path / "none.xml", "--out", page)[0] == EXIT_BAD_INPUT
+    for text in ("<mujoco><worldbody>", '<mujoco><include file="none.xml"/></mujoco>', "no XML"):
+        (tmp_path / "torn.xml").write_text(text)
+        code, _, said = lavender("report", tmp_path / "torn.xml", "--out", page)
+        assert code == EXIT_BAD_INPUT and "torn.xml: " in said
     words = ("report", model, "--steps", 30, "--every", 10, "--controls", "zero", "--solvers", "auto,newton")
     for again in range(2):  # the second time nothing is recorded anew
         code, told, _ = lavender(*words, "--no-figures", "--tables", "--out", page)

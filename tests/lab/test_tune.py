@@ -33,6 +33,13 @@ def test_the_own_setting_is_measured_as_it_ran_and_worlds_are_held_back(boxes, m
     assert all(m.time > 0.0 for m in found.measured)
 
 
+def test_a_model_without_actuators_has_settings_too(tmp_path, monkeypatch):
+    fewer(monkeypatch)
+    path = tmp_path / "passive.xml"
+    path.write_text(BOXES.format(options="").partition("<actuator>")[0] + "</mujoco>")
+    assert len(tune(path, worlds=2, steps=20, rounds=1).measured) > 1
+
+
 def test_the_converged_run_does_not_move_away_from_itself(boxes):
     runs = Runs(str(boxes()), 1, 20)
     handle, made = runs.load()
