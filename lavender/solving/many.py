@@ -146,9 +146,10 @@ class Solutions(Many, Sequence[Solution]):
         self._unread.append(i)
 
     def _read(self) -> None:
-        while self._unread:
-            i = self._unread.pop()
+        # A thread that comes meanwhile works out the same numbers.
+        for i in self._unread:
             self.keep(i, self._kept[i])
+        self._unread = []
 
     def keep(self, i: int, found: Solution) -> None:
         """The solution of a world that the loop left."""

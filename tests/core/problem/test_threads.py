@@ -116,6 +116,17 @@ def test_what_is_derived_is_one_object_for_all_threads(often):
             assert len({id(x) for x in at_once(lambda p=problem, n=name: getattr(p, n))}) == 1
 
 
+def test_threads_read_worlds_whose_turn_came_too_late(often):
+    """Their starts are judged when numbers are first read, by whichever threads come: all see all of them."""
+    problems = [random_lcp(seed) for seed in range(100)]
+    starts = [np.ones(p.m) for p in problems]
+    alone = lv.residual_many(problems, starts).relative
+    late = lv.solve_many(problems, impulses=starts, time_limit=1e-9)
+    assert all(status is lv.Status.TIME_LIMIT for status in late.status)
+    for found in at_once(lambda: late.relative.copy()):
+        assert found.tobytes() == alone.tobytes()
+
+
 def test_threads_prepare_each_their_own(often):
     problem = random_contact_problem(5)
     alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
