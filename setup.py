@@ -53,7 +53,6 @@ COLD = (
     "core/checks",
     "core/order",
     "factor/graph",
-    "factor/narrow",
 )
 
 LINK_ARGS, INLINE, LIMITS = [], [], []

@@ -23,7 +23,6 @@ from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender.solvers.setup_times import dense_work
-from lavender_ext.factor.narrow import narrow_order
 from lavender_ext.factor.sparse import FullCholesky, SparsePanels, free_part, is_mirrored
 
 TINY = 1e-13  # -, of d
@@ -67,9 +66,10 @@ def _choose(problem: Problem) -> tuple[str, int, IntArray | None]:
         return "band", band, None
     if nnz >= DENSE_SHARE * m * m and m <= DENSE_LIMIT:
         return "dense", m - 1, None
-    # A band needs 2 band + 1 places a row: a mean row of more nonzeros than that has none so narrow.
-    if nnz <= (2 * SMALL_BAND + 1) * m:
-        order, band = narrow_order(*problem._compressed[:2])
+    # A band has at most 2 band + 1 nonzeros a row: a row of more is in none so narrow.
+    if np.diff(problem._compressed[0]).max() <= 2 * SMALL_BAND + 1:
+        order = narrow_order(problem)
+        band = permuted_band(problem, order)
         if band <= SMALL_BAND:
             return "band", band, order
     return "sparse", m - 1, None
@@ -83,6 +83,14 @@ def dense_cost(m: int) -> float:
 def panels_cost(nnz: int, m: int) -> float:
     """Of one factor by panels [ns], of a symmetric matrix of m rows and nnz entries."""
     return PANELS + PANELS_ENTRY * nnz * (1.0 + m / PANELS_ROWS)
+
+
+def narrow_order(problem: Problem) -> IntArray:
+    """Rows of A in an order of small bandwidth: reverse Cuthill-McKee."""
+    from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+    order = reverse_cuthill_mckee(problem.csr, symmetric_mode=problem.is_symmetric)
+    return np.ascontiguousarray(order, np.int32)
 
 
 def permuted_band(problem: Problem, order: IntArray) -> int:

@@ -19,6 +19,7 @@ from lavender.solvers.factors import (
     SparseFactor,
     choose,
     dense_cost,
+    narrow_order,
     permuted_band,
 )
 from lavender.solvers.setup_times import DENSE, dense_work, first_factor, sparse_work
@@ -134,11 +135,7 @@ class PivotState:
 
 def _filled(problem: Problem) -> float:
     """Of LU [s] as wide as an order of small bandwidth leaves it: what entries alone do not tell, fill is."""
-    from scipy.sparse.csgraph import reverse_cuthill_mckee
-
-    a = problem.csr
-    order = reverse_cuthill_mckee(a, symmetric_mode=False).astype(np.int32)
-    width = float(permuted_band(problem, order) + 1)
+    width = float(permuted_band(problem, narrow_order(problem)) + 1)
     return DENSE * problem.m * min(width * width, dense_work(problem.m) / problem.m)
 
 

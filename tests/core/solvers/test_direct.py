@@ -77,6 +77,12 @@ def test_every_factorisation_reaches_rounding(case):
     assert solution.work["factorisations"] >= 1
 
 
+@pytest.mark.parametrize("a", [tridiagonal(400), sp.csr_array(tridiagonal(400) @ tridiagonal(400))])
+def test_bounded_rows_of_a_strip_are_a_band_whatever_they_are_called(a):
+    problem = lv.Problem.lcp(shuffled(np.random.default_rng(2), a), np.ones(400))
+    assert lv.solve(problem, "direct").solver.form == "band"
+
+
 @example(seed=0, m=6, band=0, bound=63)  # at a bound every row: its zeros would be pivots at rounding
 @example(seed=0, m=6, band=1, bound=63)
 @given(seed=seeds, m=st.integers(1, 9), band=st.integers(0, 3), bound=st.integers(0, 511))
