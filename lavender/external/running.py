@@ -241,6 +241,16 @@ class _Shared:
 
     def __init__(self, make: Callable[[], contextlib.AbstractContextManager[None]]) -> None:
         self._make, self._lock, self._inside = make, threading.Lock(), 0
+        if hasattr(os, "register_at_fork"):  # not on Windows
+            os.register_at_fork(
+                before=self._lock.acquire, after_in_parent=self._lock.release, after_in_child=self._forked
+            )
+
+    def _forked(self) -> None:
+        if self._inside and _here.printed is None:  # of threads that the child does not have
+            self._inside = 0
+            self._context.__exit__(None, None, None)
+        self._lock.release()
 
     def __enter__(self) -> None:
         with self._lock:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from calls import BACKENDS, DEFINITE, installed
 from random_problems import random_contact_problem, spd, touching
+from worked import python
 
 import lavender as lv
 from lavender import registry
@@ -86,6 +87,36 @@ def test_what_threads_print_and_warn_of_is_as_before_after_backends_ran_in_sever
     assert (sys.stdout, sys.stderr, warnings.filters, warnings.showwarning) == before
     os.write(1, b", and the process's")
     assert capfd.readouterr() == ("this thread's word, and the process's", "")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")
+def test_a_process_forked_while_a_thread_runs_a_backend_is_not_silent():
+    script = """if True:
+        import os, sys, threading
+        from lavender.external.running import quiet
+
+        inside, leave = threading.Event(), threading.Event()
+
+        def run():
+            with quiet(noisy=True):
+                inside.set()
+                leave.wait(600)
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        inside.wait(600)
+        child = os.fork()
+        if not child:
+            with quiet(noisy=True):
+                print("not heard", flush=True)
+            print("the child", flush=True)
+            os._exit(0)
+        os.waitpid(child, 0)
+        leave.set()
+        thread.join()
+        print("the parent")"""
+    said = python("-W", "ignore::DeprecationWarning", "-c", script)
+    assert said.stdout.split("\n") == ["the child", "the parent", ""]
 
 
 @pytest.mark.parametrize("name", BACKENDS)
