@@ -56,7 +56,7 @@ def test_restitution_gives_the_wanted_speed_and_slow_contacts_do_not_bounce(step
         assert v == pytest.approx(2.0 * expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["collisions", "joints", "tumbling"])
+@pytest.mark.parametrize("kind", ["collisions", "joints"])
 def test_a_closed_system_keeps_its_momentum(kind):
     scene = lv.Scene(gravity=0.0, friction=0.5, position_iterations=0)
     rng = np.random.default_rng(4)
@@ -68,12 +68,10 @@ def test_a_closed_system_keeps_its_momentum(kind):
                 velocity=(3 - i, 0.1 * i, 0),
                 quaternion=rng.normal(size=4),
             )
-    elif kind == "joints":
+    else:
         a = scene.add_box((1, 0.2, 0.3), position=(0, 0, 0), angular_velocity=(1, 2, 3))
         b = scene.add_box((0.5, 0.6, 0.3), 2.0, position=(1, 0, 0), velocity=(0, 1, 0))
         scene.add_joint("distance", a, b, anchor_a=(0.5, 0, 0), anchor_b=(0.8, 0.1, 0))
-    else:
-        scene.add_box((0.2, 0.7, 1.3), 2.0, angular_velocity=(0.1, 8.0, 0.2), quaternion=(0.3, 0.2, 0.1, 0.9))
     sim = lv.Simulation(scene)
 
     def momentum(o):

@@ -59,16 +59,6 @@ def test_the_step_reports_the_bits_of_the_front_door(name, more):
     assert rows > 0
 
 
-def test_every_substep_of_the_defaults_has_the_bits_of_the_front_door():
-    sim = lv.Simulation(lv.Scene("stack", dt=1 / 60))
-    assert sim.scene.parameters.substeps == 4
-    for _ in range(40):
-        problem = sim.constraint_problem()
-        expected = lv.solve(problem, "sequential_impulses", tol=0, max_iter=16).impulse
-        assert sim.state.kernel.substeps(1) == (0, 1)
-        np.testing.assert_array_equal(sim.state.a["impulse"][: problem.m], expected)
-
-
 @pytest.mark.parametrize("name", SCENES)
 def test_asking_for_the_problem_changes_no_state(name):
     one, two = (lv.Simulation(lv.Scene(name, **SCENES[name])) for _ in range(2))
