@@ -292,7 +292,7 @@ class Cones:
         elif pair and not box:
             mu, ratio = axes_of(mu)
             sides = 0 if ratio is None else CONTACT_ELLIPSE
-        given = 1 if type(mu) is float or np.ndim(mu) == 0 else len(mu)
+        given = 1 if type(mu) is float or np.ndim(mu) == 0 else shape_of("mu", mu)[0]
         k = given if count is None else whole_number("count", count)
         if type(mu) is not float or not (mu == 0.0 or LEAST <= mu <= MOST):
             mu = sizes_of("mu", mu, k)

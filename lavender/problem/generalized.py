@@ -297,7 +297,7 @@ class Generalized:
 def _rows(jac: Any, n: int) -> Compressed:
     sparse = issparse(jac)
     given = jac if sparse else borrowed("J", jac, (None, None))
-    if given.shape[1] != n:
+    if len(given.shape) != 2 or given.shape[1] != n:
         raise InputError(f"J has shape {given.shape}; (any, {n}) is needed, as M has {n} velocities")
     return compressed("J", given) if sparse else dense_to_csr(given)
 
@@ -320,7 +320,7 @@ def lower_of(
     """Lower triangle of a symmetric matrix, dense or sparse, with every entry of its diagonal, zero or not."""
     sparse = issparse(matrix)
     given = matrix if sparse else borrowed(name, matrix, (None, None))
-    if given.shape[0] != given.shape[1]:
+    if len(given.shape) != 2 or given.shape[0] != given.shape[1]:
         raise InputError(f"{name} has shape {given.shape}; a square matrix is needed")
     lower, (i, j, worst) = (
         kernels.lower_of_rows(*compressed(name, given)) if sparse else kernels.lower_of_dense(given)

@@ -153,6 +153,7 @@ def test_pinned_bodies_are_legal():
 # -- bad input ---------------------------------------------------------------------------------------------
 
 NAN, INF = np.nan, np.inf
+ONE = sp.coo_array(np.ones(2))
 GAP = np.ma.array([1.0, 2.0], mask=[False, True])
 BAD_PROBLEMS = {
     "NaN in A": (
@@ -182,6 +183,13 @@ BAD_PROBLEMS = {
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
     "masked b": (lambda: lv.Problem.lcp(I2, GAP), r"b \[m/s\] has no value at \[1\], 1 masked in all"),
+    "sparse J of one dimension": (lambda: lv.Generalized(ONE, I2, [0, 0]), r"J has shape \(2,\)"),
+    "sparse M of one dimension": (lambda: lv.Generalized(I2, ONE, [0, 0]), r"M has shape \(2,\)"),
+    "sparse M of three dimensions": (
+        lambda: lv.Generalized(I2, sp.coo_array(np.ones((2, 2, 2))), [0, 0]),
+        "a square",
+    ),
+    "sparse mu": (lambda: lv.Cones.contacts(ONE), "mu has dtype object"),
     "names are no words": (lambda: lv.Problem.lcp(I2, [1, 1], names=7), "a sequence of 2 words"),
     "a word for names": (lambda: lv.Generalized(I2, I2, [0, 0], names="ab"), "a sequence of 2 words"),
     "friction beyond float64": (
