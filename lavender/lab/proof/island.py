@@ -275,6 +275,7 @@ class FloatInverse:
             unit[np.arange(first, last), np.arange(last - first)] = 1.0
             yield first, self.factor.solve(unit, trans="T")
 
+    @np.errstate(under="ignore")  # TINY is more
     def reach(self, box: list[Any], speeds: Any, value: list[Any], wide: FloatArray) -> FloatArray:
         """|Y F| + |I - Y F'(X)| (X - x), rounded up; inf where numbers are beyond float64."""
         slope, n = self.island.floats(box, speeds), len(box)
