@@ -11,6 +11,8 @@ from lavender.io.stored import writable
 
 __all__ = ["export"]
 
+VECTORS = 4  # problems in the test vectors, at most
+
 
 @click.command()
 @click.argument("kind", type=click.Choice(["c", "npm"]))
@@ -20,9 +22,6 @@ __all__ = ["export"]
     help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors (c only).",
 )  # fmt: skip
 @click.option("--solver", help="With --for: use this solver of the records, not the recommended one.")
-@click.option(
-    "--vectors", default=4, show_default=True, help="With --for: the most problems in the test vectors."
-)
 @click.option("--replace", is_flag=True, help="Overwrite files of an earlier export that differ.")
 @click.pass_context
 def export(
@@ -31,18 +30,16 @@ def export(
     folder: Path,
     records: Path | None,
     solver: str | None,
-    vectors: int,
     replace: bool,
 ) -> None:
     """Write the kernels for use without Python: a C library with one header, or an npm package."""
-    from lavender.out import library
-    from lavender.out import vectors as chosen
+    from lavender.out import library, vectors
 
     if records is None:
-        refuse_unused(context, ["solver", "vectors"], "without --for")
+        refuse_unused(context, ["solver"], "without --for")
     elif kind != "c":
         raise click.UsageError("--for goes with c: test vectors are checked by a C program")
     writable(folder, folder=True)  # before the vectors are solved for
-    more = chosen.made(records, solver, vectors) if records is not None else {}
+    more = vectors.made(records, solver, VECTORS) if records is not None else {}
     written = library.write(kind, folder, more=more, replace=replace)
     click.echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

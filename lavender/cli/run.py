@@ -58,9 +58,6 @@ FILES = ("trace", "plot", "film", "record")  # options that leave them
     help="Write the problem of every step (.npz) to this folder.",
 )
 @click.option(
-    "--skip", type=int, default=0, show_default=True, help="Number of steps before the first recorded one."
-)
-@click.option(
     "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
 )
 @click.option("--view", is_flag=True, help="Show the run live in a web page on this machine, until Ctrl-C.")
@@ -91,7 +88,7 @@ def run(
 
     record = asked["record"]
     if record is None:
-        refuse_unused(context, ["skip", "replace"], "without --record")
+        refuse_unused(context, ["replace"], "without --record")
 
     live, files = sys.stdout.isatty(), any(asked[name] is not None for name in FILES)
 

@@ -10,25 +10,18 @@ __all__ = ["solvers"]
 
 
 @click.command()
-@click.option(
-    "--problem",
-    default=None,
-    help="Say for each solver whether it accepts this problem (a file, or a case of the suite).",
-)
-def solvers(problem: str | None) -> None:
+def solvers() -> None:
     """List the solvers: what each can do, and what to install for those that are missing."""
     from rich.table import Table
 
-    from lavender.lab import bench
     from lavender.problem import LAWS, OPERATORS
     from lavender.solvers import registry
 
-    given = bench.resolve([problem])[0].problem if problem else None
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("solver", "laws", "reads", "can", "what it is"):
         table.add_column(name, no_wrap=name == "solver", overflow="fold")
-    reasons = registry.known(given)
-    # What is here, and what takes the problem, first.
+    reasons = registry.known()
+    # What is here first.
     order = sorted(registry.specs().items(), key=lambda pair: (reasons[pair[0]] is not None, pair[0]))
     for name, spec in order:
         abilities = [

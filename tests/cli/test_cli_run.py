@@ -18,7 +18,7 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
     words = ["run", "stack", "--iterations", "8", "--no-warm-start", "--steps", "12", "--set", "n=2"]
     words += ["--order", "top_down", "--residual"]
-    files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2], "--skip", "9"]
+    files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2]]
     code, printed, _ = lavender(*words, *files)
     assert not code
     assert "step     12" in printed and "contacts     8  matches     0" in printed and "worst" in printed
@@ -28,14 +28,7 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
     assert table["residual_final"].max() < table["residual_initial"].max()
     assert set(table["order"]) == {"top_down"}
     assert paths[1].read_text().lstrip().startswith("<?xml") and "order top_down" in paths[1].read_text()
-    assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == [8, 8, 8]
-
-
-def test_a_recording_of_nothing_is_refused(lavender, tmp_path):
-    words = ["run", "stack", "--set", "n=2", "--steps", "3", "--record", tmp_path / "problems", "--skip"]
-    code, _, err = lavender(*words, "3")
-    assert code == 2 and "skip is 3 of 3 steps" in err and not (tmp_path / "problems").exists()
-    assert lavender(*words, "2")[0] == 0
+    assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == 12 * [8]
 
 
 @pytest.mark.parametrize(

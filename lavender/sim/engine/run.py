@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, whole_number
-from lavender.base.errors import InputError
 from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
 from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
 from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
@@ -83,24 +82,21 @@ def run(
     steps: int,
     *,
     record: str | PathLike[str] | None = None,
-    skip: int = 0,
     replace: bool = False,
     watch: Callable[[int, dict[str, Any], dict[str, Any]], Any] | None = None,
 ) -> Trace:
     """Step a simulation and keep its trace; stops where the state is no longer finite.
 
-    `record`: a folder for the problem of every step after the first `skip`; `replace` takes the problems of another
-    recording out of it, which is refused otherwise. `watch(step, observation, info)` is called after every step.
+    `record`: a folder for the problem of every step; `replace` takes the problems of another recording out of it, which
+    is refused otherwise. `watch(step, observation, info)` is called after every step.
     """
-    steps, skip = whole_number("steps", steps, 1), whole_number("skip", skip)
-    if record is not None and skip >= steps:
-        raise InputError(f"skip is {skip} of {steps} steps: nothing would be recorded; give a smaller one")
+    steps = whole_number("steps", steps, 1)
     recorded = 0
     solver, depth, cost, time = np.zeros((steps, 8)), np.zeros(steps), np.zeros(steps), np.zeros(steps)
     lost, done = "", 0
     with nullcontext() if record is None else folder_for_steps(record, replace) as folder:
         while done < steps and not lost:
-            if folder is not None and done >= skip:
+            if folder is not None:
                 recorded += simulation.write_problem(folder, 6) is not None
             start = perf_counter()
             observation, _, _, _, info = simulation.step()
@@ -160,7 +156,6 @@ def run_scene(
     trace: str | PathLike[str] | None = None,
     plot: str | PathLike[str] | None = None,
     record: str | PathLike[str] | None = None,
-    skip: int = 0,
     replace: bool = False,
     film: str | PathLike[str] | None = None,
     view: bool = False,
@@ -199,7 +194,7 @@ def run_scene(
             sleep(max(0.0, info["time"] - (perf_counter() - begun)))
 
     try:
-        found = run(simulation, steps, record=record, skip=skip, replace=replace, watch=watch)
+        found = run(simulation, steps, record=record, replace=replace, watch=watch)
         if found.lost_body:
             show(f"stopped: the state of {found.lost_body!r} is not finite")
         if trace is not None:
