@@ -395,9 +395,9 @@ class Problem:
         nothing = bool(line / 16 <= energy0 <= line * 16)
         if below:
             energy0, velocity0 = rhs_energy, rhs_velocity
-        # An error w / d of the start that float64 holds no number for: there is nothing to be better than.
-        nothing |= bool(energy0 <= 2 * NORMAL * np.sqrt(self.d.sum()))
-        nothing |= bool(velocity0 <= 2 * NORMAL * np.sqrt(self.nu * self.d).max(initial=ZERO))
+        # Where an error w / d of the start is dust, of bounds that are, there is nothing to be better than.
+        nothing |= bool(energy0 <= LEAST * np.sqrt(self.d.sum()))
+        nothing |= bool(velocity0 <= LEAST * np.sqrt(self.nu * self.d).max(initial=ZERO))
         f = L(2.0) ** -53 * size
         rounded = L(2.0) ** -53 * self.d * np.abs(lam)  # of lambda - Pi, where d is not A_ii
         more = self.roundings * (f + rounded + DENORMAL * (1 + np.abs(lam).max(initial=ZERO)))
