@@ -12,7 +12,7 @@ theta is equal on all tangents of a disk, which makes (1) a closed form.
 """
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
-from libc.string cimport memset
+from libc.string cimport memcpy, memset
 
 from lavender_ext.core.block cimport block_error, row_error
 from lavender_ext.core.contact_map cimport contact_map
@@ -256,17 +256,20 @@ cdef inline void find_column(const flow_t* f, int32_t place) noexcept nogil:
 
 cdef inline bint times_a(const flow_t* f, const double* x, double* out) noexcept nogil:
     """out = A x on the island's rows; whether any x is other than 0."""
-    cdef int32_t a, count = 0
-    cdef double* given = f.sum + f.rows
-    for a in range(f.n_own):
-        if x[f.own[a]] != 0.0:
+    cdef int32_t a, count = 0, n = f.n_own, rows = f.rows
+    cdef const int32_t* own = f.own                     # hoisted, as in `respond`
+    cdef int32_t* picks = f.picks
+    cdef double* sums = f.sum
+    cdef double* given = sums + rows
+    for a in range(n):
+        if x[own[a]] != 0.0:
             find_column(f, a)
-            f.picks[count] = a * f.rows
-            given[count] = x[f.own[a]]
+            picks[count] = a * rows
+            given[count] = x[own[a]]
             count += 1
-    combine(f.wide, f.rows, count, f.a, f.picks, given, f.sum)
-    for a in range(f.n_own):
-        out[f.own[a]] = f.sum[a]
+    combine(f.wide, rows, count, f.a, picks, given, sums)
+    for a in range(n):
+        out[own[a]] = sums[a]
     return count > 0
 
 
@@ -302,8 +305,8 @@ cdef inline void keep(const flow_t* f, int32_t island, const double* x, double* 
     """to = x on the island's rows."""
     cdef int32_t a, k
     for a in range(f.iptr[island], f.iptr[island + 1]):
-        for k in range(row_from(f, a), row_end(f, a)):
-            to[k] = x[k]
+        k = row_from(f, a)
+        memcpy(to + k, x + k, (row_end(f, a) - k) * sizeof(double))
 
 
 cdef inline void blank(const flow_t* f, int32_t island, double* out) noexcept nogil:

@@ -43,6 +43,8 @@ cdef enum:
     IDLE_STEPS = 30             # steps without a better iterate after which an island is stuck
     LINE_STEPS = 24             # evaluations of one line search
     RENEW = 16                  # steps after which s is formed anew
+    UNSEEN = 8                  # steps after which errors are looked at however large |G| is,
+    FAR = 100                   # and before that where it is at most so many times their limit
     ROUNDS = 12                 # of Coulomb friction: what these leave is not for this method
 
 
@@ -88,12 +90,16 @@ cdef inline double search(flow_t* f, int32_t island) noexcept nogil:
     cdef int32_t a, c, n
     cdef double py = 0.0, pp = 0.0, pg = 0.0, low = 0.0, high, at_low, at_high, t, x, enough
     cdef int32_t side = 0
+    cdef const int32_t* own = f.own
+    cdef const double* y = f.y
+    cdef const double* grad = f.grad
+    cdef const double* step = f.step
     cdef const double* p = f.q if f.formed else f.step
     for a in range(f.n_own):
-        c = f.own[a]
-        py += p[c] * f.y[c]
-        pp += p[c] * f.step[c]
-        pg += f.step[c] * f.grad[c]
+        c = own[a]
+        py += p[c] * y[c]
+        pp += p[c] * step[c]
+        pg += step[c] * grad[c]
     if not pg < 0.0:
         return 0.0
     enough = -0.1 * pg
@@ -269,35 +275,73 @@ cdef inline void begin_descent(flow_t* f, int32_t island, int32_t law, double le
     renew(f, island)
 
 
+cdef inline double weigh(flow_t* f, int32_t island, bint moves, double* energy) noexcept nogil:
+    """How many times over its limits the error of lambda is, with u of `gather`; kept where that is the least."""
+    cdef descent_t* x = &f.descent
+    cdef double velocity, over
+    energy[0] = measure(f, island, f.lam, moves, &velocity)
+    over = excess(f, energy[0], velocity)
+    if over < x.lowest:
+        x.idle = x.idle if over > 0.9 * x.lowest else 0
+        x.lowest = over
+    if over < x.least:
+        x.least = over
+        keep(f, island, f.lam, f.best)
+    return over
+
+
+cdef inline int32_t given_up(flow_t* f, int32_t island, bint moves, bint far, double goal, int32_t end) noexcept nogil:
+    """How it ended, at an iterate that nobody has looked at where it is far."""
+    cdef double energy
+    return REACHED if far and weigh(f, island, moves, &energy) <= goal else end
+
+
+cdef inline double gradient(flow_t* f) noexcept nogil:
+    """|G|, with G in `grad`; where A is formed h, and its size."""
+    cdef int32_t a, c
+    cdef double size = 0.0
+    cdef const int32_t* own = f.own
+    cdef const double* y = f.y
+    cdef const double* u = f.u
+    cdef double* grad = f.grad
+    if f.formed:
+        for a in range(f.n_own):
+            c = own[a]
+            grad[c] = (f.s[c] + f.p.b[c]) - u[c]
+            size += (y[c] - f.lam[c]) * grad[c]
+    else:
+        for a in range(f.n_own):
+            c = own[a]
+            grad[c] = y[c] - u[c]
+            size += grad[c] * grad[c]
+    return sqrt(size) if size > 0.0 else size * 0.0     # of h, rounding may leave less than 0; NaN stays
+
+
 cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nogil:
     """Newton steps until the error is `goal` times its limits, or nothing moves; MORE: call again to go on.
 
     The iterate with the least error stands in `best`; `share` of d is the softness of rows without one, lowered where the
     centre's progress is slow. Idle is what does not lower the least error of this descent: the first step of one often
-    leaves a larger one than it began with.
+    leaves a larger one than it began with. First iterates that are far from G = 0 are only looked at where steps end there.
     """
     cdef descent_t* x = &f.descent
     cdef int32_t a, c
-    cdef bint square = f.p.law == COULOMB, rigid, moves
-    cdef double energy, velocity, over, t, size, bound
+    cdef bint square = f.p.law == COULOMB, rigid, moves, far
+    cdef double energy = 0.0, t, size, bound, over
     rigid = is_rigid(f, island)
     while True:
         if not x.known:
             respond_all(f, island, f.s, f.lam)
         x.known = 0
         moves = gather(f, island, f.lam, f.u)
-        energy = measure(f, island, f.lam, moves, &velocity)
-        over = excess(f, energy, velocity)
-        if over != over:
-            return LOST
-        if over < x.lowest:
-            x.idle = x.idle if over > 0.9 * x.lowest else 0
-            x.lowest = over
-        if over < x.least:
-            x.least = over
-            keep(f, island, f.lam, f.best)
-        if over <= goal:
-            return REACHED
+        size = gradient(f)
+        far = not (rigid or square) and x.n < UNSEEN and size > FAR * f.energy_limit
+        if not far or f.steps <= 0:
+            over = weigh(f, island, moves, &energy)
+            if over != over:
+                return LOST
+            if over <= goal and not far:                # far: as where nobody asked
+                return REACHED
         if f.steps <= 0:
             x.known = 1                                 # N, s and lambda stay as they are
             return MORE
@@ -305,16 +349,6 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         x.n += 1
         if x.idle > IDLE_STEPS:
             return STUCK
-        size = 0.0
-        for a in range(f.n_own):
-            c = f.own[a]
-            if f.formed:
-                f.grad[c] = (f.s[c] + f.p.b[c]) - f.u[c]
-                size += (f.y[c] - f.lam[c]) * f.grad[c]
-            else:
-                f.grad[c] = f.y[c] - f.u[c]
-                size += f.grad[c] * f.grad[c]
-        size = sqrt(size) if size > 0.0 else size * 0.0     # of h, rounding may leave less than 0; NaN stays
         if rigid and (size <= 0.1 * energy and size <= 0.1 * pull(f, island) or size == 0.0):
             # The softened problem is solved as well as it needs to be: its centre moves.
             follow(f, island)
@@ -331,7 +365,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
         if x.stale or not (x.moved or is_held(f, island)):
             form(f, island, square)
             if not factor(f, island, square):
-                return BROKEN
+                return given_up(f, island, moves, far, goal, BROKEN)
         x.stale = x.moved = 0
         newton_step(f, island, square)
         if square:
@@ -345,7 +379,7 @@ cdef inline int32_t descend(flow_t* f, int32_t island, double goal) noexcept nog
             t = search(f, island)
         if t == 0.0:
             if x.fresh:
-                return STUCK
+                return given_up(f, island, moves, far, goal, STUCK)
             x.fresh = x.stale = 1                       # s anew, once: rounding may be in the way
             renew(f, island)
             continue
