@@ -388,14 +388,32 @@ cdef class Friction(Small):
         if matrix.blocks.law == CONE or not (data.factored or data.is_general):
             self.at, self.prepared = gauss_seidel.prepare(matrix)
         if count > 1:
-            ptr = np.asarray(<int32_t[:data.blocks.n_blocks + 1]>data.blocks.ptr)
-            rows, joint = np.diff(ptr), np.arange(len(label)) < (matrix.rows.n_joints if matrix.factored else 0)
-            entries = 0 * rows
-            if not matrix.factored:
-                entries = np.diff(np.asarray(<int32_t[:data.blocks.n_rows + 1]>matrix.csr.indptr)[ptr])
-            self.block = np.argsort(label, kind="stable").astype(np.int32)
-            size = [np.bincount(label, of, count) for of in (rows, 1 + 0 * rows, entries, joint * rows, joint)]
-            self.size = np.array(size, np.int32).T.copy()
+            self.find_sizes(label)
+
+    cdef int find_sizes(self, const int32_t[::1] label) except -1:
+        """What each island has, and blocks by their islands."""
+        cdef Data of = self.matrix
+        cdef const int32_t* ptr = of.blocks.ptr
+        cdef int32_t i, k = of.blocks.n_blocks, rows, joints = of.rows.n_joints if of.factored else 0, at = 0
+        self.size, self.block = np.zeros((self.count, SIZES), np.int32), np.empty(k, np.int32)
+        cdef int32_t[:, ::1] size = self.size
+        cdef int32_t[::1] block = self.block, first = np.empty(self.count, np.int32)
+        for i in range(k):
+            rows = ptr[i + 1] - ptr[i]
+            size[label[i], 0] += rows
+            size[label[i], 1] += 1
+            if not of.factored:
+                size[label[i], 2] += of.csr.indptr[ptr[i + 1]] - of.csr.indptr[ptr[i]]
+            if i < joints:
+                size[label[i], 3] += rows
+                size[label[i], 4] += 1
+        for i in range(self.count):
+            first[i] = at
+            at += size[i, 1]
+        for i in range(k):
+            block[first[label[i]]] = i
+            first[label[i]] += 1
+        return 0
 
     cdef solve(self, own, double tol, bint follow, double* most):
         cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
