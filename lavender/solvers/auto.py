@@ -10,8 +10,9 @@
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
                                 and, but for a matrix, bounded ones and cones only where 200 cost less than it; of a
                                 matrix each contact is solved exactly
-    a loose pile                PILE contacts or more under Coulomb's law that do not roll, nearly each of another pair:
-                                for as much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law
+    a loose pile                contacts of PILE rows or more under Coulomb's law, nearly each of another pair: for as
+                                much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law, but not
+                                of what rolls
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
@@ -65,7 +66,7 @@ MANY = (
 )
 SPARSE, DENSE = 0.05, 0.5  # shares of entries, below which A is sparse, and above which it is dense
 FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
-PILE = 130  # contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
+PILE = 390  # rows of contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
 EARLY = 0.25  # of the counted cost, after which an interior point has an impulse that is worth having
@@ -201,11 +202,11 @@ class Tree:
 
     @cached_property
     def is_loose(self) -> bool:
-        """Contacts under Coulomb's law that do not roll, nearly each between another pair of bodies or of trees of M:
-        sweeps then decide what sticks.
+        """Contacts under Coulomb's law, nearly each between another pair of bodies or of trees of M: sweeps then decide
+        what sticks.
         """
         p = self.problem
-        if self.law != "coulomb" or p.cones.has_more_parts or np.count_nonzero(p.cones.is_contact) < PILE:
+        if self.law != "coulomb" or np.count_nonzero(p.cones.contact_rows) < PILE:
             return False
         return 4 * pairs(p) > 3 * p.n_blocks
 
@@ -274,7 +275,8 @@ class Tree:
             why = f"{words(cost)} of what newton costs"
             yield self.sweeps(cost, why, newton)
             if self.is_loose:
-                yield self.iterations("nncg from the cone law", cost, why)
+                rolls = self.problem.cones.has_more_parts
+                yield self.iterations("nncg" if rolls else "nncg from the cone law", cost, why)
 
     def sweeps(self, cost: float, why: str, most: float = inf) -> Stage:
         """Sweeps of so much cost, as long as no more than `most` is predicted to be left."""

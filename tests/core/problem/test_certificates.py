@@ -44,7 +44,9 @@ def test_what_is_proved_is_said(name):
         solution = lv.solve(opposed(eps), name)
         assert solution.status is lv.Status.INFEASIBLE and not solution.contradicted
         assert (solution.impulse_bound == np.inf) is (eps == 0.0)
-        assert eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0  # the sum of (2 / eps + 1, 2 / eps)
+        assert (
+            eps == 0.0 or 9e15 <= solution.impulse_bound <= 4.0 / eps + 2.0
+        )  # the sum of (2 / eps + 1, 2 / eps)
         assert words in solution.message
     assert lv.solve(opposed(1.0), name).impulse_bound is None
 

@@ -69,6 +69,7 @@ FIRST = {
     "a loose pile": (lambda: suite.granular(n=4, friction="coulomb").problem, LOOSE),
     "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
+    "a pile that rolls": (lambda: suite.case("drawn_rolling(seed=98103)").problem, LOOSE),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, ["anderson", "anderson", "newton"]),
 }  # fmt: skip
 
