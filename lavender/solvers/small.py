@@ -47,13 +47,15 @@ COLUMNS = 12.0  # velocities of two bodies
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
 
 
-def limits(sweeps: float, most: float = MOST) -> Limits:
-    """Limits of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`."""
+def limits(sweeps: float, most: float = MOST, steps: float = 1500.0) -> Limits:
+    """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`, in so many
+    steps.
+    """
     count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
     step = RATES["entry"], RATES["work"]["velocities"]
     rows = SMALL_ROWS, DENSE_ROWS, SHARED, COLUMNS
-    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most, *rows]))
+    return Limits(np.array([*step, *count, STEPS, SOFT, *sweep, general.ROOM, most, *rows, steps]))
 
 
 def call_ends_within(problem: Problem, seconds: float | None) -> bool:
@@ -280,6 +282,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(SWEEPS), True, True)
+AUTO = SmallCall("auto", limits(SWEEPS, steps=1e6), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", limits(inf), False)

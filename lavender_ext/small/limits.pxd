@@ -29,6 +29,7 @@ cdef struct limits_t:           # ns, as in lavender/solvers/costs.py
     double cone_rows            # and where a contact of the cone law is rigid,
     double dense                # unless so many rows share a velocity,
     double columns              # or a row reaches more of them: else they may be those of bodies (`graph.bodies_in`)
+    double steps                # of all islands at most
 
 
 cdef inline double step_cost(const blocks_t* p, const generalized_t* g, const limits_t* l, double work) noexcept nogil:

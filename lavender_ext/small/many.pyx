@@ -46,8 +46,7 @@ cdef extern from *:
 
 
 cdef enum:
-    STEPS = 128                 # of newton for each island, and in all as many as `newton` has by default
-    MOST = 1500
+    STEPS = 128                 # of newton for each island
     AT_A_TIME = 256             # problems between two checks for Ctrl-C
     # Counted in readings of all entries, fitted to 500 drawn problems; within 1.4 times what nine of ten take.
     READ = 10                   # what is worked out and judged
@@ -151,7 +150,7 @@ cdef inline bint has_numbers(job_t* j) noexcept nogil:
 
 cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, double tol) noexcept nogil:
     cdef view_t v
-    cdef options_t o = options_t(NEWTON, MOST, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
+    cdef options_t o = options_t(NEWTON, STEPS, 0, 0, has_wide(), tol, 0.0, 0.0, limits.values)
     cdef room_t r
     cdef int32_t m = j.p.n_rows, code = ROOM
     cdef bint soft
@@ -175,8 +174,7 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     if not has_room(room, 0, r.n_real):
         return
     r.real = room.real
-    if r.islands <= MOST // STEPS:
-        o.budget = STEPS * r.islands
+    o.budget = <int32_t>min(<double>STEPS * r.islands, limits.steps)
     o.e0, o.v0 = j.begin[0], j.begin[1]
     if j.cold:
         do_nothing(&j.p, j.lam, j.both)
@@ -221,7 +219,7 @@ cdef void remember(job_t* j, Data p):
 
 
 cdef class Limits:
-    """Of the numbers of a `limits_t` (17,)."""
+    """Of the numbers of a `limits_t` (18,)."""
     cdef limits_t at
 
     def __init__(self, const double[::1] numbers):

@@ -399,3 +399,4 @@ def test_the_one_call_keeps_to_what_newton_does_by_default():
     v = 2.0 * rng.normal(size=4500)
     problem = lv.Problem.from_jacobian(jac, mass, v, cones=lv.Cones.contacts(0.0, tangents=0, count=1500))
     assert check(problem, "newton").iterations <= registry.get("newton").max_iter
+    assert len(check(problem, "auto").turns) == 1  # whose own default is more
