@@ -48,8 +48,8 @@ MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities u
 
 
 def limits(sweeps: float, most: float = MOST, steps: float = 1500.0) -> Limits:
-    """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most`, in so many
-    steps.
+    """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most` [ns], and
+    take so many steps.
     """
     count = (factorisations(law, "velocities") for law in ("lcp", "coulomb", "cone"))
     sweep = TREE, RATES["sweep row"], RATES["sweep cone"], sweeps
