@@ -24,7 +24,7 @@
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
 problem is solved in the same way on every machine. Under a time limit the tree is the same, but whoever factors begins
-only if a result would be there in time, cones are swept first where SURE times its cost do not fit, sweeps before it
+only if a result would be there in time, all are swept first where SURE times its cost do not fit, sweeps before it
 have at most half of what is left, and sweeps have the rest if it had no time.
 `Solution.turns` lists what ran, `lavender.explain` what would run.
 """
