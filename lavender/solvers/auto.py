@@ -6,7 +6,7 @@
                                 not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for; as long, but after sweeps, bounded rows
-                                whose factor is dense, and others after `newton`
+                                whose factor is dense
     sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
                                 and, but for a matrix, bounded ones and cones only where 200 cost less than it; of a
                                 matrix each contact is solved exactly
@@ -235,8 +235,6 @@ class Tree:
         yield from self.factorisations(MOST)
         if self.is_program:
             return
-        if self.problem.matrix is not None and self.law == "lcp" and not (self.is_narrow or self.is_dense):
-            yield self.rounds(self.newton, "bounded rows of a matrix")
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
         if "newton over rows" not in self.states:
             self.add_rows(max(MOST * self.newton, LITTLE))

@@ -45,9 +45,10 @@ TREE = 2e5  # ns, Python's share of two lines of the tree, which one compiled ca
 SHARED = 10.0  # rows for each velocity, from which N is full and small beside what it is made of
 COLUMNS = 12.0  # velocities of two bodies
 MOST = 1e7  # counted cost [ns] of Newton's method over generalised velocities up to which no clock is read in between
+NEWTON_STEPS, AUTO_STEPS = 1500.0, 1e6  # of all islands of velocities: within what each may do by default
 
 
-def limits(sweeps: float, most: float = MOST, steps: float = 1500.0) -> Limits:
+def limits(sweeps: float, most: float = MOST, steps: float = NEWTON_STEPS) -> Limits:
     """Of the compiled calls over generalised velocities: they may cost as much as so many sweeps, and `most` [ns], and
     take so many steps.
     """
@@ -282,6 +283,6 @@ def said(name: str, work: Mapping[str, int]) -> str:
     return name
 
 
-AUTO = SmallCall("auto", limits(SWEEPS, steps=1e6), True, True)
+AUTO = SmallCall("auto", limits(SWEEPS, steps=AUTO_STEPS), True, True)
 DIRECT = SmallCall("direct", None, True)
 NEWTON = SmallCall("newton", limits(inf), False)
