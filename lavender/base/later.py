@@ -72,8 +72,8 @@ def above(name: str) -> Any:
 
 
 def load(*more: str) -> None:
-    """Load sparse arrays, LAPACK and further modules, if they are not."""
-    for name in ("scipy.sparse", "scipy.linalg.lapack", *more):
+    """Load sparse arrays and their graphs (orders of factors), LAPACK and further modules, if they are not."""
+    for name in ("scipy.sparse", "scipy.sparse.csgraph", "scipy.linalg.lapack", *more):
         imported(name)
 
 
