@@ -50,11 +50,11 @@ __all__ = ["QPSolution", "QuadraticProgram"]
 PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
-FAR = 1e3  # v* over the size of x that the right-hand sides let one expect: D is made large enough
+FAR = 1e3  # v* over the size of x that right-hand sides, or else q, let one expect: D is made large enough
 # Entries of J, whitened, over those of J and of M's factor, from which (4) costs less than more than one compiled call
 # over velocities; and of more than MANY variables than that call; variables up to which it does not.
 FILLED, WHOLLY, MANY, FEW = 1.0, 3.0, 300, 100
-FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where all of them vanish at the solution
+FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where q is zero: all of them may vanish
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
@@ -109,12 +109,14 @@ class QPSolution:
     def _residuals(self) -> tuple[float, ...]:
         """r_p, r_d, gap and error."""
         qp, of = self.qp, self.qp.generalized
-        least = 0.0
+        least = curved = 0.0
         if largest(qp.target) == 0.0:  # x = 0 may be the solution
             least = FLAT * largest(of.velocity_of(of.v_free))
+        if largest(qp.q) == 0.0:  # all forces may vanish; with q an x that runs away must not excuse it
+            curved = FLAT * largest(of.operator.mass[2])
         found: tuple[float, ...] = program_residuals(
             self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
-            qp.free, least, FLAT * largest(of.operator.mass[2]),
+            qp.free, least, curved,
         )  # fmt: skip
         return found
 
@@ -143,8 +145,8 @@ class QPSolution:
         """The largest of the three, each relative to what it is the sum of; 0 is a solution.
 
         The primal residual over the largest of |J x| and |target|, where all targets are 0 of 1e-3 |J v*| too; the dual
-        one over the largest of |q|, |P x|, |J^T lambda| and 1e-3 max |P_ij| max |x_i|; the gap over these two times the
-        sums of |lambda| and |x|.
+        one over the largest of |q|, |P x| and |J^T lambda|, where q is 0 of 1e-3 max |P_ij| max |x_i| too; the gap over
+        these two times the sums of |lambda| and |x|.
         """
         return self._residuals[3]
 
@@ -477,8 +479,8 @@ def _definite(
         d = PROXIMAL * unit
         made = _shifted(lower, jac, d, momentum)
         assert made is not None  # as with less
-    size = np.abs(jac[2]).max(initial=0.0)
-    expected = np.abs(target).max(initial=0.0) / size if size > 0.0 else 0.0
+    size, asked = np.abs(jac[2]).max(initial=0.0), np.abs(target).max(initial=0.0)
+    expected = asked / size if size > 0.0 < asked else np.abs(momentum / unit).max(initial=0.0)
     far = np.abs(made.v_free).max() / (FAR * expected) if expected > 0.0 else 0.0
     if far > 1.0:
         d = far * d

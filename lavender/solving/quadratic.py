@@ -37,7 +37,9 @@ SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M st
 IDLE = 10  # steps in a row without a smaller error, after which no other is made,
 FAILED = 3  # and so many that stall
 TIGHTEST = 1e-15  # tol of a step
+CENTRED = 1e-9  # tol of a step around a centre, at most: a ray shows only to UNBOUNDED
 CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
+HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 # Nothing better comes of the same problem; of another centre something may.
 ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
@@ -103,24 +105,24 @@ def solve_qp(
     if answer.error <= tol and qp.proximal is None:
         return answer
     for _ in range(STEPS):
+        if solution.status in ENDS:
+            return answer
         ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
         if ray is not None:
             return replace(answer, ray=ray)
-        if solution.status in ENDS:
-            return answer
         left = end - perf_counter()
         if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH[qp.proximal is not None]:
             break
         if qp.proximal is not None:
             slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
-            rough = ROUNDING * _distance(answer) > answer.error
+            rough = solution.status in HARD or ROUNDING * _distance(answer) > answer.error
             soft = slow and qp.proximal.max() > SOFTEST * np.abs(qp.generalized.operator.mass[2]).max()
             qp = qp.around(centre, 1.0 / SOFTER if rough else SOFTER if soft else 1.0)
             general = qp.generalized
             problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
         # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
         far = max(1.0, _distance(answer))
-        inner = max(tol / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
+        inner = max(min(tol, CENTRED) / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
         if qp.proximal is None and inner >= tightest:
             break
         tightest, limit = inner, None if time_limit is None else left

@@ -5,6 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.sparse as sp
 from hypothesis import given, settings
 from random_problems import seeds
@@ -229,10 +230,12 @@ def test_an_empty_row_that_nothing_fulfils_is_infeasible_and_one_that_asks_nothi
         (np.zeros((2, 2)), [-1.0, 0.0], {"lb": [0.0, 0.0]}),
         (np.diag([1.0, 0.0]), [1.0, -1.0], {"G": [[1.0, 0.0]], "h": [1.0]}),
         (np.ones((2, 2)), [1.0, -1.0], {"A": [[0.0, 0.0]], "b": [0.0]}),
+        (np.zeros((2, 2)), [8.0, -28.0], {"lb": [-0.5, 0.5], "ub": [0.25, np.inf]}),
     ],
 )
-def test_an_unbounded_program_has_a_ray(hessian, q, rows):
-    answer = lv.solve_qp(lv.Problem.from_qp(hessian, q, **rows))
+@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
+def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
+    answer = lv.solve_qp(lv.Problem.from_qp(hessian, q, **rows), tol=tol)
     assert not answer.found
     assert str(answer).startswith("unbounded: the objective falls for ever")
     d = answer.ray
@@ -240,6 +243,35 @@ def test_an_unbounded_program_has_a_ray(hessian, q, rows):
     np.testing.assert_allclose(hessian @ d, 0.0, atol=1e-6)
     assert np.dot(q, d) < -0.5
     assert rows.get("lb") is None or d.min() >= -1e-6
+
+
+def test_a_program_without_a_feasible_point_is_infeasible_though_its_objective_falls_for_ever():
+    answer = lv.solve_qp(lv.Problem.from_qp([[0.0]], [-1.0], G=[[0.0]], h=[-1.0]))
+    assert answer.solution.status is lv.Status.INFEASIBLE
+    assert answer.ray is None
+    assert str(answer).startswith("not solved")
+
+
+@pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-4, 1e-9])
+def test_a_distant_start_of_a_singular_p_excuses_no_error(tol):
+    # 1/2 (2 x_0 + x_1 + x_2)^2 + x_0 - x_1 + x_2, x_0 and x_2 >= 0: least at (0, 1, 0); no right-hand side has a size.
+    root = np.array([[2.0, 1.0, 1.0]])
+    problem = lv.Problem.from_qp(root.T @ root, [1.0, -1.0, 1.0], lb=[0.0, -np.inf, 0.0])
+    answer = lv.solve_qp(problem, tol=tol)
+    assert answer.found
+    np.testing.assert_allclose(answer.x, [0.0, 1.0, 0.0], atol=10.0 * tol)
+
+
+@given(seed=seeds)
+def test_least_squares_with_fewer_rows_than_unknowns_that_are_not_negative(seed):
+    rng = np.random.default_rng(seed)
+    n = rng.integers(2, 20)
+    F = rng.normal(size=(rng.integers(1, n), n))
+    y = rng.normal(size=len(F))
+    answer = lv.solve_qp(lv.Problem.from_qp(F.T @ F, -F.T @ y, lb=np.zeros(n)), tol=1e-8)
+    _, distance = scipy.optimize.nnls(F, y)
+    assert answer.found
+    np.testing.assert_allclose(np.linalg.norm(F @ answer.x - y), distance, atol=1e-6)
 
 
 # -- what is refused -------------------------------------------------------------------------------
