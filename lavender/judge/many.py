@@ -47,7 +47,7 @@ class Many:
         place[:, PLACE["rows"]], place[:, PLACE["row"]] = self._sizes, self._first
         self._impulse, self._velocity = np.zeros(int(self._sizes.sum())), None
         self._worlds = Worlds(place, self._impulse, np.zeros(0), cold)
-        self._worlds.of_objects(self._data, starts)
+        self._worlds.of_objects(given, self._data, starts)
 
     @property
     def relative(self) -> FloatArray:

@@ -33,6 +33,8 @@ from lavender_ext.small.many import PLACE, Worlds
 __all__ = ["Batch"]
 
 ERRORS = ("raise", "status")
+FIELDS = ("inv_mass", "inv_inertia", "v_free", "jac", "normal", "tangent", "arm_a", "arm_b")  # of bodies
+PAIRS = ("joint_body", "contact_body")
 MADE = {np.dtype(np.float32), np.dtype(np.float64)}
 
 
@@ -156,11 +158,7 @@ class Batch(Sequence[Problem]):
         soft, at[:, PLACE["soft"]] = _vectors(
             "compliance", 0.0 if compliance is None else compliance, n, room, sizes
         )
-        rub = None
-        if mu is not None:
-            k = at[:, PLACE["blocks"]]
-            rub, at[:, PLACE["mu"]] = _vectors("mu", mu, n, self.cones.n_blocks if self._shared else None, k)
-        self._arrays: Any = (jac, mass, free, goal, soft, rub)
+        self._arrays: Any = (jac, mass, free, goal, soft, self._frictions(mu))
 
     # -- other ways to make one ------------------------------------------------------------------------
 
@@ -178,12 +176,16 @@ class Batch(Sequence[Problem]):
         matrix, rhs = _numbers("A", A), _numbers("b", b)
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
             raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
-        made = cls._of_makers(len(matrix), matrix.shape[1], friction, precision_of(matrix, rhs))
+        n, m = rhs.shape
+        made = cls._of_makers(n, m, friction, precision_of(matrix, rhs))
         made._place_cones(cones)
-        given = None if mu is None else as_array("mu", mu, (len(matrix), None), finite=False)
+        at, place = made.at, PLACE
+        flat, at[:, place["jac"]], made._jac_row = _matrices("A", matrix, n, (m, m), None)
+        goal, at[:, place["target"]] = _vectors("b", rhs, n, m, None)
+        made._arrays = flat, None, None, goal, None, made._frictions(mu)
 
         def make(i: int) -> Problem:
-            own = made._cones_of(i, None if given is None else given[i])
+            own = made._cones_of(i, None if mu is None else made._part(i, 5))
             return Problem(rhs[i], own, matrix[i], friction=friction, precision=made.precision)
 
         made._make = make
@@ -222,17 +224,23 @@ class Batch(Sequence[Problem]):
         def make(i: int) -> Problem:
             of: dict[str, Any] = {name: x[i] if x.ndim > known[name] else x for name, x in parts.items()}
             own: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
-            return Problem.from_rows(Rows(**of), **own)
+            problem = Problem.from_rows(Rows(**of), **own)
+            if i and problem.m != made.shape[1]:
+                raise InputError(
+                    f"it has {problem.m} rows, the first world {made.shape[1]}: give tangents=, which mu 0 leaves out"
+                )
+            return problem
 
         first = make(0) if n else None
         made = cls._of_makers(
             n, 0 if first is None else first.m, "coulomb" if first is None else first.friction, "float64"
         )
-        made._make = make
+        made._make, made._bodies = make, (parts, more)
         if first is not None and first.rows is not None:
             made.precision, made.velocity_shape = first.precision, (n, 6 * first.rows.n_bodies)
             nv = 6 * first.rows.n_bodies
             made.at[:, PLACE["velocities"]], made.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
+            made.at[:, PLACE["blocks"]] = first.cones.n_blocks
         return made
 
     @classmethod
@@ -245,6 +253,9 @@ class Batch(Sequence[Problem]):
         return made
 
     _make: Callable[[int], Problem] | None = None
+    _pattern: tuple[np.ndarray, np.ndarray] | None = None
+    _jac_row = _mass_row = 0
+    _bodies: tuple[dict[str, Any], dict[str, Any]] | None = None  # fields and bounds of `of_bodies`
     names_of: Callable[[int], Sequence[str]] | None = None  # of the blocks of a world
     _shared = True
 
@@ -283,6 +294,15 @@ class Batch(Sequence[Problem]):
                 f"a block of the cones begins in world {off[0]} and ends in the next; or their sizes differ"
             )
         at[:, PLACE["block"]], at[:, PLACE["blocks"]], at[:, PLACE["cone_row"]] = block, last - block, first
+
+    def _frictions(self, mu: Any) -> np.ndarray | None:
+        """mu of all worlds, flat."""
+        if mu is None:
+            return None
+        k = self.at[:, PLACE["blocks"]]
+        each = self.cones.n_blocks if self._shared else None
+        found, self.at[:, PLACE["mu"]] = _vectors("mu", mu, len(self), each, k)
+        return found
 
     def _cones_of(self, i: int, mu: FloatArray | None = None) -> Cones:
         """Blocks of world i, with their own mu (k,) where it is given."""
@@ -358,10 +378,13 @@ class Batch(Sequence[Problem]):
     def worlds(self, impulse: FloatArray, velocity: FloatArray, cold: bool) -> Worlds:
         """What the compiled loop works on; results into impulse and velocity, flat."""
         made = Worlds(self.at, impulse, velocity, cold)
-        if self._make is not None or self.cones.has_ellipse:
-            made.of_objects([None] * len(self), [])
+        if self._bodies is not None and (read := self._read_bodies()):
+            made.of_bodies(*read)
+        elif self._arrays is None or self.cones.has_ellipse:
+            made.of_objects([], [None] * len(self), [])
         else:
-            allowed = ASYMMETRY32 if self._arrays[1].dtype == np.float32 else ASYMMETRY
+            mass = self._arrays[1]
+            allowed = ASYMMETRY32 if mass is not None and mass.dtype == np.float32 else ASYMMETRY
             made.of_arrays(
                 self._arrays,
                 (self._jac_row, self._mass_row),
@@ -371,6 +394,38 @@ class Batch(Sequence[Problem]):
                 allowed,
             )
         return made
+
+    def _read_bodies(self) -> Any:
+        """What the compiled loop reads of bodies; None where worlds differ in more than numbers of one layout."""
+        parts, more = self._bodies  # type: ignore[misc]
+        stacked = {name for name, x in more.items() if np.ndim(x) == 2}
+        if not stacked <= {"target", "compliance", "mu"} or "guess" in more or not len(self):
+            return None
+        try:
+            first = self[0]
+        except InputError:
+            return None
+        rows, n, mu = first.rows, len(self), more.get("mu", 0.0)
+        if rows is None or first.m != self.shape[1] or np.ndim(parts.get("joint_ptr", 0)) == 2:
+            return None
+        if "mu" in stacked and (mu.shape[1] != rows.n_contacts or ((mu > 0.0) != (mu[0] > 0.0)).any()):
+            return None
+        one: dict[str, Any] = {name: getattr(rows, name) for name in (*FIELDS, *PAIRS)}
+        goal = 0.0 if "target" in stacked else more.get("target", 0.0)
+        one["target"] = np.array(np.broadcast_to(goal, first.m), float)
+        one |= {"compliance": first.compliance, "mu": first.cones.mu[rows.n_joints :]}
+        found = {}
+        for name, own in one.items():
+            x, kind = {**parts, **more}.get(name, own), np.int32 if name in PAIRS else np.float64
+            if np.ndim(x) <= own.ndim:
+                found[name] = np.ascontiguousarray(own), 0
+            elif x.shape == (n, *own.shape) and (x.dtype in MADE if kind is np.float64 else _are_indices(x)):
+                found[name] = np.ascontiguousarray(x, kind), own.size
+            else:
+                return None
+        fields = [found[name] for name in (*FIELDS, "target", "compliance", "mu")]
+        sizes = rows.n_bodies, rows.n_joints, rows.n_contacts
+        return fields, [found[name] for name in PAIRS], *sizes, first.cones._blocks, LAWS[first.friction]
 
     def __repr__(self) -> str:
         return f"<Batch of {self._n} worlds, impulses {self.shape}, {self.precision}>"
@@ -393,6 +448,11 @@ def _numbers(name: str, x: Any) -> np.ndarray:
     if given.dtype not in MADE:
         given = as_array(name, given, (None,) * given.ndim, finite=False)
     return given
+
+
+def _are_indices(x: np.ndarray) -> bool:
+    """Whether all are whole numbers of 32 bits."""
+    return x.dtype.kind == "i" and (x.itemsize <= 4 or bool(((x >= -(2**31)) & (x < 2**31)).all()))
 
 
 def _firsts(sizes: Any) -> np.ndarray:

@@ -42,6 +42,10 @@ class SmallCall(Protocol):
     def limits(self) -> Any:
         """What it may cost over generalised velocities."""
 
+    @property
+    def rules(self) -> Any:
+        """What is asked for of few rows of A or of bodies."""
+
     def attempt(
         self, problem: Problem, impulse: FloatArray | None, tol: float, most: float = ...
     ) -> tuple[Any, Any]:

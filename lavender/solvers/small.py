@@ -9,7 +9,7 @@ solver runs as on any other problem, from the beginning.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from math import inf, nan
 from typing import Any
@@ -26,7 +26,7 @@ from lavender.solvers.newton_systems import general
 from lavender.solvers.newton_systems.systems import DENSE_ROWS
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.setup_times import forming
-from lavender_ext.small.call import Bounded, Friction, Small
+from lavender_ext.small.call import Islands, Rules, Small
 from lavender_ext.small.many import Limits, solve_first
 
 #: Why nothing ran, by the status of a start.
@@ -83,8 +83,7 @@ def prepared(problem: Problem) -> Any:
 
 
 def _make(problem: Problem) -> Small | None:
-    law, cones, count, label = problem.law, problem.cones, 1, None
-    bounded = law in ("linear", "lcp")
+    cones, count, label, bounded = problem.cones, 1, None, pivots(problem)
     if cones.has_round or cones.has_more_parts:
         return None
     if problem.m > SMALL_ROWS:
@@ -94,18 +93,19 @@ def _make(problem: Problem) -> Small | None:
         if count == 1 or np.bincount(label, np.diff(cones.ptr)).max() > ISLAND:
             return None
     reference(problem)
-    data, start = problem.metric, problem._start
+    data = problem.metric
     if len(data.empty) or data.start_relative < 0.0:
         return None
-    if not bounded:
-        split = 0 if problem.rows is None else problem.rows.n_joints
-        # Islands are cut out of the bodies where these have fewer unknowns than rows, else out of A.
-        bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
-        over = data if count == 1 or bodies else problem.csr_data
-        return Friction(data, start, over, split, SWEPT, label, count)
-    symmetric = problem.is_symmetric
-    band = max(problem.bandwidth) if symmetric else problem.m - 1
-    return Bounded(data, start, problem.csr_data, band, law == "linear", symmetric)
+    if bounded or count == 1:
+        return Small(data, problem.csr_data if bounded else data)
+    # Islands are cut out of the bodies where these have fewer unknowns than rows, else out of A.
+    bodies = problem.rows is not None and problem.m > 6 * problem.rows.n_bodies
+    return Islands(data, data if bodies else problem.csr_data, label, count)
+
+
+def pivots(problem: Problem) -> bool:
+    """Whether the compiled call over A or bodies pivots: its rows are bounded."""
+    return problem.law in ("linear", "lcp")
 
 
 def who(problem: Problem) -> str:
@@ -119,7 +119,7 @@ def who(problem: Problem) -> str:
     small = prepared(problem)
     if small is None:
         return ""
-    if small.pivots:
+    if pivots(problem):
         return "direct (block pivots), then lemke where these do not end"
     count = islands(problem)[0] if problem.m > SMALL_ROWS else 1
     return "sweeps (anderson), then newton" + (f", on each of {count} islands" if count > 1 else "")
@@ -134,6 +134,11 @@ class SmallCall:
     pivots: bool  # bounded rows
     # And friction; a start that is a solution is the result, a bad one is not started from.
     hands_over: bool = False
+    rules: Rules = field(init=False)
+
+    def __post_init__(self) -> None:
+        rules = Rules(SMALL_ROWS, SWEPT, WARM, self.pivots, self.hands_over)
+        object.__setattr__(self, "rules", rules)
 
     def may_cost(self, problem: Problem, kernel: Any) -> float:
         """What the call over J and M may cost as counted [ns]; 0 where it is not made whatever it costs."""
@@ -160,9 +165,9 @@ class SmallCall:
             small = kept.small
             if small is None and (problem.m <= SMALL_ROWS or self.hands_over):
                 small = prepared(problem)
-            if not small or not (self.pivots if small.pivots else self.hands_over):
+            if not small or not (self.pivots if pivots(problem) else self.hands_over):
                 return None, ()
-            found = small.run(impulse, tol, self.hands_over, WARM, most)
+            found = small.run(impulse, tol, self.rules, most)
         if found[0] is None and most == inf:
             self.in_vain(problem, impulse, tol, found[1])
         made: tuple[Any, Any] = found
@@ -183,7 +188,7 @@ class SmallCall:
             return []
         if problem.generalized is not None:
             return [("newton", replace(general.claim(Status.STALLED, counts), iterations=0))]
-        done = (_by_pivots if problem.derived.small.pivots else _in_turns)(counts)
+        done = (_by_pivots if pivots(problem) else _in_turns)(counts)
         return [(name, Claim(Status.STALLED, 0, work)) for name, work in done[1]]
 
     def claim(
@@ -206,7 +211,7 @@ class SmallCall:
             if not any(claim.work.values()):
                 return Claim(status, done, {}, nothing)
         else:
-            done, ran = (_by_pivots if problem.derived.small.pivots else _in_turns)(counts)
+            done, ran = (_by_pivots if pivots(problem) else _in_turns)(counts)
         if self.name == "direct":
             rank, shifts = ran[0][1].get("rank"), ran[0][1].get("shifts")
             symmetric = problem.is_symmetric
@@ -224,19 +229,19 @@ Ran = list[tuple[str, dict[str, int]]]  # who, and what it did
 
 
 def _by_pivots(counts: tuple[int, ...]) -> tuple[int, Ran]:
-    """Iterations, and what was done, by the counts of `Bounded`."""
+    """Iterations, and what was done, by the counts of `pivot_few`."""
     done, swept, refined, factored, exchanged, shifts, rank, path = counts
     work = {
         "sweeps": 4 * swept, "rank": rank, "shifts": shifts, "refinements": refined, "factorisations": factored,
         "pivots": exchanged,
     }  # fmt: skip
     direct = "direct", {what: count for what, count in work.items() if count}
-    return done + path, [direct, ("lemke", {"pivots": path})] if path else [direct]
+    return done, [direct, ("lemke", {"pivots": path})] if path else [direct]
 
 
 def _in_turns(counts: tuple[int, ...]) -> tuple[int, Ran]:
-    """The same by those of `Friction`."""
-    done, sweeps, restarts, factorisations, driven, count = counts
+    """The same by those of sweeps in turns."""
+    done, sweeps, restarts, factorisations, driven, count, *_ = counts
     where = f" on {count} islands" if count > 1 else ""
     ran = [("anderson" + where, {"sweeps": sweeps, "restarts": restarts})]
     if not sweeps and factorisations:

@@ -169,7 +169,7 @@ class Solutions(Many, Sequence[Solution]):
             rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
             return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * columns + 4.0)))
         both = zip(self.problems, self._data, strict=True)
-        return sum(LATE + reading_time(p) if data else UNREAD for p, data in both)
+        return sum(LATE + reading_time(p) if data and p.generalized else UNREAD for p, data in both)
 
     def empty_refused(self) -> None:
         """What stands in the arrays for worlds that are REFUSED is no answer."""
@@ -204,8 +204,14 @@ class Solutions(Many, Sequence[Solution]):
     def _rest(self, i: int, impulse: FloatArray, status: Status) -> dict[str, Any]:
         problem = self.problems[i]
         found = judged(problem, impulse)
-        counts = None if status is Status.TIME_LIMIT else tuple(self._worlds.counts[i].tolist())
+        started = self._worlds.code[i] in (CODE["late"], CODE["started"])
+        counts = None if started else self._counts(problem, i)
         return rest_of(problem, self._spec, found, counts, self.start(i), status)
+
+    def _counts(self, problem: Problem, i: int) -> tuple[int, ...]:
+        """What the loop did for world i."""
+        counts = tuple(self._worlds.counts[i].tolist())
+        return counts if problem.generalized is None else counts[:4]
 
     def __repr__(self) -> str:
         return f"<Solutions of {len(self)} worlds by {self._spec.name}, {int(self.success.sum())} to {self.tol:g}>"
@@ -274,19 +280,19 @@ def solve_many(
     # What `solve` would ask of one compiled call.
     together = spec.own and not options and max_iter is None and isinstance(tol, float) and 0.0 < tol < np.inf
     small = spec.small if together else None
-    limits = small.limits if small is not None else None
+    asked = (small.limits, small.rules) if small is not None else (None, None)
 
     def turn(hand: Hand) -> int:
         if not deadline.is_set:
-            return int(hand.solve(tol, limits))
+            return int(hand.solve(tol, *asked))
         if deadline.passed(0.0):
             return int(hand.judge(False, True))
-        return int(hand.solve(tol, limits, COUNTED * (deadline.left(LEAST) or LEAST)))
+        return int(hand.solve(tol, *asked, COUNTED * (deadline.left(LEAST) or LEAST)))
 
     def alone(i: int) -> None:
         problem, start = given[i], made.start(i)
         if small is not None and made._worlds.code[i] == CODE["tried"] and not deadline.is_set:
-            small.in_vain(problem, start, tol, tuple(made._worlds.counts[i].tolist()))
+            small.in_vain(problem, start, tol, made._counts(problem, i))
         if deadline.is_set and not isinstance(given, Batch):
             deadline.keep(-UNREAD)
             if deadline.passed():

@@ -36,6 +36,11 @@ cdef double entries_of(const generalized_t* g, double* on) noexcept nogil
 cdef int32_t make_numbers(blocks_t* p, generalized_t* g, made_t* out) noexcept nogil
 
 
+cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step, int32_t* empty,
+                                      double* minv_jac, double* coupling, double* swing) noexcept nogil
+cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step, int32_t* empty) noexcept nogil
+
+
 cdef class Data:
     cdef blocks_t blocks
     cdef csr_t csr              # where A is given, or formed

@@ -78,6 +78,14 @@ cdef public void lav_matrix_nu(const blocks_t* p, double* nu) noexcept nogil:
     block_weights(p, p.d, nu)
 
 
+cdef int32_t matrix_numbers(const blocks_t* p, const csr_t* a, double* d, double* nu, double* step,
+                            int32_t* empty) noexcept nogil:
+    """d, which is that of p, nu and step of a matrix; empty rows."""
+    cdef int32_t n_empty = lav_csr_diagonal(p, a, d, step, empty)
+    lav_matrix_nu(p, nu)
+    return n_empty
+
+
 cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double* d, double* nu, double* step,
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* swing) noexcept nogil:
@@ -313,8 +321,7 @@ cdef class Data:
             if data.shape[0] > 0:
                 self.csr.indices = &indices[0]
                 self.csr.data = &data[0]
-            n_empty = lav_csr_diagonal(&self.blocks, &self.csr, d, step, empty)
-            lav_matrix_nu(&self.blocks, nu)
+            n_empty = matrix_numbers(&self.blocks, &self.csr, d, nu, step, empty)
         self._numbers = numbers_
         self.empty = _NONE
         if n_empty:

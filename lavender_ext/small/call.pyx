@@ -15,26 +15,30 @@ does not end below tol on the judge's own measure is nobody's result: the caller
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, sqrt
 from libc.stdint cimport int32_t, int64_t
-from libc.stdlib cimport free
-from libc.string cimport memcmp, memcpy
+from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.csr cimport csr_t
-from lavender_ext.core.parts cimport CONE, FRICTIONS, blocks_t, frictions_of, lay_frictions
-from lavender_ext.core.problem cimport Data, Room, room_for
+from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.csr cimport csr_t, scan_entries
+from lavender_ext.core.parts cimport CONE, CONTACT_ROLLING, FRICTIONS, ROUND, blocks_t, frictions_of, is_rows, lay_frictions
+from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport rows_t
-from lavender_ext.core.view cimport view_t
 from lavender_ext.core.method cimport room_t
 from lavender_ext.factor.tiles cimport has_wide
+from lavender_ext.small.call cimport COUNTS, ENDED, FAILED, KEPT, Rules, few_rules_t, few_t, rooms_t
 from lavender_ext.small.friction cimport ask_t, part_t, solve_part, work_of
-from lavender_ext.judge.measure cimport Judged
-from lavender_ext.judge.measure import same_bits
-from lavender_ext.local import gauss_seidel
+from lavender_ext.small.limits cimport is_linear
+from lavender_ext.small.room cimport has_room, leave
+from lavender_ext.judge.measure cimport do_nothing, judge_view, judged_from, relative_of, scratch_of
+from lavender_ext.judge.score cimport relative
+from lavender_ext.local.gauss_seidel cimport prepare_blocks, prepared_sizes
 from lavender_ext.pivot.direct cimport (HALVED, direct_begin, direct_begin_passes, direct_factor, direct_first,
                                         direct_index, direct_lay, direct_linear, direct_pass, direct_real, direct_t, is_end)
 from lavender_ext.pivot.lemke cimport RAY, lemke_begin, lemke_index, lemke_lay, lemke_real, lemke_run, lemke_t
 from lavender_ext.pivot.principal cimport INDEFINITE, SMALL, SOLVED
+
+cdef object new = np.empty
 
 
 cdef enum:
@@ -46,57 +50,79 @@ cdef enum:
     LISTEN = 5000000            # multiply-adds between two checks for Ctrl-C, a few milliseconds
 
 
-cdef class Small:
-    """One problem, its error of doing nothing known to `data`; `run` only reads it.
+cdef bint are_bounded(const blocks_t* p) noexcept nogil:
+    """Does nothing bound a row but its own two numbers?"""
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        if not is_rows(p, i) and p.ptr[i + 1] - p.ptr[i] > 1:
+            return False
+    return True
 
-    Parameters
-    ----------
-    data : Data
-        What the judge reads.
-    start : (m,) N s
-        Pi(0), read-only.
-    matrix : Data
-        What is solved: of bounded rows and islands A in compressed rows.
+
+cdef bint lay_few(few_t* s, room_t* room) noexcept nogil:
+    """What the call needs beside both views and the error of doing nothing; in `room`, where it stays."""
+    cdef const blocks_t* p = &s.v.p
+    cdef int32_t band[2]
+    cdef int64_t n
+    s.pivots, s.linear, s.at, s.prepared = are_bounded(p), is_linear(p), NULL, NULL
+    s.split = s.v.r.n_joints if s.v.r != NULL else 0
+    if not has_room(room, p.n_blocks + 1 + p.n_rows, 0):
+        return False
+    if s.pivots:
+        s.symmetric = scan_entries(s.over.a, s.over.p.d, p.n_rows, room.index, band) <= 1e-14
+        s.band = max(band[0], band[1]) if s.symmetric else p.n_rows - 1
+    elif p.law == CONE or s.v.a != NULL:                # within a contact of a matrix that was given, units may be unlike
+        n = <int64_t>prepared_sizes(p, room.index) + 1
+        if not has_room(room, 0, n):
+            return False
+        memset(room.real, 0, n * sizeof(double))
+        prepare_blocks(&s.over, room.index, room.real)
+        s.at, s.prepared = room.index, room.real
+    return True
+
+
+cdef bint has_call(const blocks_t* p) noexcept nogil:
+    """Do these calls solve every block? Neither round cones nor what rolls."""
+    cdef int32_t i
+    for i in range(p.n_blocks):
+        if p.kind[i] == ROUND or p.kind[i] == CONTACT_ROLLING:
+            return False
+    return True
+
+
+cdef void judge_few(few_t* s, const double* lam, double* both, double* scratch) noexcept nogil:
+    """w and e into both (2 m); scratch as `judge_view`."""
+    cdef int32_t m = s.v.p.n_rows
+    s.score.energy = s.score.velocity = s.score.floor_energy = s.score.floor_velocity = 0.0
+    s.score.worst, s.score.finite = -1, 1
+    judge_view(&s.v, lam, both, both + m, scratch, True, &s.score)
+    s.floor = relative(s.score.floor_energy, s.score.floor_velocity, s.begin[0], s.begin[1])
+    s.relative = relative_of(&s.score, both, m, s.begin[0], s.begin[1])
+
+
+cdef bint begin_few(few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double* both,
+                    double* scratch) noexcept nogil:
+    """`own` (m) [N s] where it is started from, from doing nothing if `cold`; is that a solution, and judged?
+
+    Asked where another method comes next. It is no start where its residual is above that of doing nothing, or for pivots above
+    `warm`. scratch: m numbers and as `judge_view`.
     """
-
-    cdef readonly Data data
-    cdef readonly object start
-    cdef readonly bint pivots
-    cdef Data matrix
-
-    def __init__(self, Data data, start, Data matrix):
-        self.data, self.start, self.matrix = data, start, matrix
-
-    def run(self, impulse, double tol, bint follows, double warm, double most=INFINITY):
-        """From `impulse` (m,) [N s], or from `start` where it is None: (what the judge finds, what was done).
-
-        follows: another method comes next. Is `impulse` a solution? It is no start where its residual is above that of doing
-        nothing, or for pivots above `warm`. And what pivots find is good where it is below tol, not to rounding alone,
-        with Lemke's path where exchanges are stuck. The judge finds None where it does not end below tol. What was done is
-        None where `impulse` is the solution. most: counted cost [ns] where what was found by then is the result.
-        """
-        cdef Judged found
-        cdef double before = self.data.start_relative
-        if follows:
-            if impulse is None or same_bits(impulse, self.start):
-                impulse = None
-                if before <= tol:
-                    return Judged(self.data, self.start.copy()), None
-            else:
-                found = Judged(self.data, impulse.copy())
-                before = found.relative
-                if before <= tol:
-                    return found, None
-            if not before <= (warm if self.pivots else 1.0):
-                impulse = None
-        own = (self.start if impulse is None else impulse).copy()
-        good, counts = self.solve(own, tol, follows, &most)
-        found = Judged(self.data, own) if good else None
-        good = good and (self.pivots or found.relative <= tol or not most > 0.0)
-        return found if good else None, counts
-
-    cdef solve(self, own, double tol, bint follow, double* most):
-        """`own` (m,) N s in place: is it good, and counts. What it cost is taken off `most`, which ends it at 0 or below."""
+    cdef int32_t m = s.v.p.n_rows
+    cdef double before = s.begin[2]
+    do_nothing(&s.v.p, scratch, both)
+    if cold:
+        memcpy(own, scratch, m * sizeof(double))
+    if not rules.follows:
+        return False
+    cold = memcmp(own, scratch, m * sizeof(double)) == 0
+    if not cold or before <= tol:
+        judge_few(s, own, both, scratch + m)
+        before = before if cold else s.relative
+    if before <= tol:
+        return True
+    if not before <= (rules.warm if s.pivots else 1.0):
+        memcpy(own, scratch, m * sizeof(double))
+    return False
 
 
 cdef inline bint met(const direct_t* t, double tol, bint enough) noexcept nogil:
@@ -129,68 +155,103 @@ cdef inline bint pivot(direct_t* t, const double* start, double tol, bint enough
     return met(t, tol, enough)
 
 
-cdef class Bounded(Small):
-    """Linear or boxed; counts are (rounds, whether swept, refinements, factorisations, pivots, shifts, rank of a singular
-    linear system or 0, pivots of Lemke's path).
+cdef inline int32_t followed(direct_t* t, double tol, double* most, room_t* room) noexcept nogil:
+    """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
 
-    Parameters
-    ----------
-    band, linear, symmetric : int, bool, bool
-        Half bandwidth of A, m - 1 where it is not symmetric; whether every row is free.
+    Pivots of the paths, -1 where they do not end below tol.
     """
+    cdef lemke_t l
+    cdef double each = 2.0 * <double>t.s.n ** 2
+    cdef int32_t last = PATH * t.s.n if most[0] > PATH * t.s.n * each else <int32_t>(most[0] / each)
+    if not has_room(room, lemke_index(t.s.p), lemke_real(t.s.p)):
+        return -1
+    lemke_lay(&l, t, room.real, room.index)
+    lemke_begin(&l)
+    while lemke_run(&l, last - l.pivots) == RAY:
+        pass
+    if last < PATH * t.s.n:
+        most[0] -= l.pivots * each
+    return l.pivots if t.relative <= tol else -1
 
-    cdef int band
-    cdef bint linear, symmetric
 
-    def __init__(self, Data data, start, Data matrix, int band, bint linear, bint symmetric):
-        Small.__init__(self, data, start, matrix)
-        self.band, self.linear, self.symmetric, self.pivots = band, linear, symmetric, True
+cdef bint pivot_few(const few_t* s, double* own, double tol, bint follows, double* most, rooms_t* rooms,
+                    int32_t* counts) noexcept nogil:
+    """Linear or boxed; counts are (rounds and pivots of Lemke's path, whether swept, refinements, factorisations, pivots, shifts,
+    rank of a singular linear system or 0, pivots of Lemke's path).
 
-    cdef solve(self, own, double tol, bint follow, double* most):
-        cdef double[::1] start = own
-        cdef view_t v = self.data.view()
-        cdef int64_t n = direct_real(&v, self.band)
-        cdef Room room = room_for(n * sizeof(double) + direct_index(&v) * sizeof(int32_t))
-        cdef double* real = <double*>room.at
-        cdef direct_t t
-        cdef int32_t path = 0
-        cdef double each = ROUND_ROW * self.data.blocks.n_rows + 0.1 * self.data.blocks.n_rows * (self.band + 1.0) ** 2
-        cdef bint ended
-        t.e0, t.v0, t.least = self.data.start_energy, self.data.start_velocity, 1e-13
-        t.linear, t.symmetric = self.linear, self.symmetric
-        with nogil:
-            direct_lay(&t, &v, &self.matrix.csr, &self.matrix.blocks, self.band, NULL, 1e-13, real,
-                       <int32_t*>(real + n))
-            ended = pivot(&t, &start[0], tol, follow, most[0] / each)
-        most[0] -= t.s.n_rounds * each
-        if not ended and most[0] > 0.0:
-            path = self.followed(&t, own, tol, most) if follow and not t.linear and not t.solved else -1
-        if not ended:
-            ended = (path >= 0 and t.relative <= tol) or (not most[0] > 0.0 and t.relative < INFINITY)
-        if ended:
-            memcpy(&start[0], t.best, t.s.n * sizeof(double))
-        return ended, (t.s.n_rounds, bool(t.swept), t.refined, t.s.factorisations, t.s.exchanged, t.shifts, t.rank,
-                       max(path, 0))
+    What pivots find is good where it is below tol, not to rounding alone, with Lemke's path where exchanges are stuck, if another
+    method follows.
+    """
+    cdef direct_t t
+    cdef int32_t path = 0, m = s.v.p.n_rows
+    cdef double each = ROUND_ROW * m + 0.1 * m * (s.band + 1.0) ** 2
+    cdef bint ended
+    if not has_room(&rooms.work, direct_index(&s.v), direct_real(&s.v, s.band)):
+        return False
+    t.e0, t.v0, t.least = s.begin[0], s.begin[1], 1e-13
+    t.linear, t.symmetric = s.linear, s.symmetric
+    direct_lay(&t, &s.v, s.over.a, &s.over.p, s.band, NULL, 1e-13, rooms.work.real, rooms.work.index)
+    ended = pivot(&t, own, tol, follows, most[0] / each)
+    most[0] -= t.s.n_rounds * each
+    if not ended and most[0] > 0.0:
+        path = followed(&t, tol, most, &rooms.more) if follows and not t.linear and not t.solved else -1
+    if not ended:
+        ended = (path >= 0 and t.relative <= tol) or (not most[0] > 0.0 and t.relative < INFINITY)
+    if ended:
+        memcpy(own, t.best, t.s.n * sizeof(double))
+    path = max(path, 0)
+    counts[0], counts[1], counts[2], counts[3] = t.s.n_rounds + path, t.swept != 0, t.refined, t.s.factorisations
+    counts[4], counts[5], counts[6], counts[7] = t.s.exchanged, t.shifts, t.rank, path
+    return ended
 
-    cdef int followed(self, direct_t* t, own, double tol, double* most) except -2:
-        """Where exchanges are stuck: Lemke's paths, and exchanges at their end.
 
-        Pivots of the paths, -1 where they do not end below tol.
-        """
-        cdef lemke_t l
-        cdef double each = 2.0 * <double>t.s.n ** 2
-        cdef int32_t last = PATH * t.s.n if most[0] > PATH * t.s.n * each else <int32_t>(most[0] / each)
-        cdef int64_t n = lemke_real(t.s.p)
-        cdef Room room = room_for(n * sizeof(double) + lemke_index(t.s.p) * sizeof(int32_t))
-        cdef double* real = <double*>room.at
-        with nogil:
-            lemke_lay(&l, t, real, <int32_t*>(real + n))
-            lemke_begin(&l)
-            while lemke_run(&l, last - l.pivots) == RAY:
-                pass
-        if last < PATH * t.s.n:
-            most[0] -= l.pivots * each
-        return l.pivots if t.relative <= tol else -1
+cdef inline void counted(const ask_t* o, int32_t parts, int32_t* counts) noexcept nogil:
+    """(longest of a part, sweeps, undone, factorisations, parts that asked for these, parts)"""
+    counts[0], counts[1], counts[2] = o.longest, <int32_t>o.swept, <int32_t>o.undone
+    counts[3], counts[4], counts[5] = <int32_t>o.factorisations, o.driven, parts
+
+
+cdef bint sweep_few(const few_t* s, double* own, double tol, int32_t swept, double* most, rooms_t* rooms,
+                    int32_t* counts) noexcept nogil:
+    """Contacts, as one part; counts as `counted`. swept: at most, before its factors."""
+    cdef int32_t m = s.v.p.n_rows, n = s.over.r.n_bodies if s.over.r != NULL else 0
+    cdef part_t part
+    cdef ask_t o = ask_t(tol, s.begin[0], s.begin[1], swept, swept, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
+    cdef bint good
+    if not has_room(&rooms.work, s.v.p.n_blocks, work_of(m, n) + m):
+        return False
+    part.v, part.lam, part.answer, part.split = s.over, own, rooms.work.real, s.split
+    part.at, part.prepared, part.nothing = s.at, s.prepared, s.begin[2]
+    good = solve_part(&part, &o, &rooms.more, rooms.work.real + m, rooms.work.index)
+    memcpy(own, part.answer, m * sizeof(double))
+    most[0] = o.left
+    counted(&o, 1, counts)
+    return good or not o.left > 0.0
+
+
+cdef int32_t run_few(few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
+                     rooms_t* rooms, int32_t* counts) noexcept nogil:
+    """From `own` (m) [N s], from doing nothing if `cold`, into it, judged: how it ended (`FAILED` ...)."""
+    cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
+    memset(counts, 0, COUNTS * sizeof(int32_t))
+    if not has_room(&rooms.work, 0, scratch):
+        return FAILED
+    if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
+        return KEPT
+    if not (pivot_few(s, own, tol, rules.follows, &most, rooms, counts) if s.pivots
+            else sweep_few(s, own, tol, rules.swept, &most, rooms, counts)):
+        return FAILED
+    if not has_room(&rooms.work, 0, scratch):
+        return FAILED
+    judge_few(s, own, both, rooms.work.real)
+    return ENDED if s.pivots or s.relative <= tol or not most > 0.0 else FAILED
+
+
+cdef class Rules:
+    """What the calls of few rows are asked for: `few_rules_t`."""
+
+    def __init__(self, int rows, int swept, double warm, bint pivots, bint follows):
+        self.at.rows, self.at.swept, self.at.warm, self.at.pivots, self.at.follows = rows, swept, warm, pivots, follows
 
 
 cdef enum:                      # numbers of an island's
@@ -364,37 +425,81 @@ cdef inline int32_t swept_before(const blocks_t* p, int32_t most) noexcept nogil
     return 0 if p.law == CONE else most * FEW // p.n_rows
 
 
-cdef class Friction(Small):
-    """Contacts; counts are (longest of a part, sweeps, undone, factorisations, parts that asked for these, parts).
+cdef class Small:
+    """A problem of few rows, its error of doing nothing known to `data`; `run` only reads it.
 
     Parameters
     ----------
-    split, most : int
-        Blocks before it are swept before the others: joints, contacts; sweeps of one part at most, before its factors.
-    label : (k,) int32, or None
-        The island of each block, from 0 to count - 1.
-    count : int
-        Islands; 1 is the whole.
+    data : Data
+        What the judge reads.
+    over : Data
+        What is solved: of bounded rows A in compressed rows.
     """
 
-    cdef readonly int count
-    cdef object block, size, at, prepared
-    cdef int split, most
+    cdef readonly Data data
+    cdef readonly int count                             # of islands
+    cdef Data over
+    cdef few_t at
+    cdef room_t room
 
-    def __init__(self, Data data, start, Data matrix, int split, int most, label=None, int count=1):
-        Small.__init__(self, data, start, matrix)
-        self.split, self.most, self.count = split, most, count
-        # Within a contact of a matrix that was given, units may be unlike.
-        if matrix.blocks.law == CONE or not (data.factored or data.is_general):
-            self.at, self.prepared = gauss_seidel.prepare(matrix)
-        if count > 1:
-            self.find_sizes(label)
+    def __init__(self, Data data, Data over):
+        self.data, self.over, self.count = data, over, 1
+        self.at.v, self.at.over = data.view(), over.view()
+        self.at.begin[0], self.at.begin[1], self.at.begin[2] = data.start_energy, data.start_velocity, data.start_relative
+        if not lay_few(&self.at, &self.room):
+            raise MemoryError(f"{data.blocks.n_rows} rows")
 
-    cdef int find_sizes(self, const int32_t[::1] label) except -1:
-        """What each island has, and blocks by their islands."""
-        cdef Data of = self.matrix
-        cdef const int32_t* ptr = of.blocks.ptr
-        cdef int32_t i, k = of.blocks.n_blocks, rows, joints = of.rows.n_joints if of.factored else 0, at = 0
+    def __dealloc__(self):
+        leave(&self.room)
+
+    def run(self, impulse, double tol, Rules rules, double most=INFINITY):
+        """From `impulse` (m,) [N s], or from doing nothing where it is None: (what the judge finds, what was done).
+
+        The judge finds None where it does not end below tol. What was done is None where `impulse` is the solution. most: counted
+        cost [ns] where what was found by then is the result.
+        """
+        cdef few_t s = self.at
+        cdef rooms_t rooms
+        cdef int32_t counts[COUNTS]
+        cdef Py_ssize_t m = s.v.p.n_rows
+        cdef double[::1] own = new(m), both = new(2 * m + 1)
+        cdef int32_t code
+        memset(&rooms, 0, sizeof(rooms))
+        if impulse is not None:
+            memcpy(&own[0], doubles(impulse, m), m * sizeof(double))
+        try:
+            code = self.end(&s, &rules.at, &own[0], impulse is None, tol, most, &both[0], &rooms, counts)
+        finally:
+            leave(&rooms.work)
+            leave(&rooms.more)
+        found = judged_from(self.data, own.base, both.base, &s.score, s.relative, s.floor) if code != FAILED else None
+        return found, None if code == KEPT else tuple([counts[i] for i in range(COUNTS)])
+
+    cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
+                     rooms_t* rooms, int32_t* counts) except -1:
+        """As `run_few`."""
+        with nogil:
+            return run_few(s, rules, own, cold, tol, most, both, rooms, counts)
+
+
+cdef class Islands(Small):
+    """Islands under friction.
+
+    Parameters
+    ----------
+    label : (k,) int32
+        The island of each block, from 0 to count - 1.
+    count : int
+        More than one.
+    """
+
+    cdef object block, size
+
+    def __init__(self, Data data, Data over, const int32_t[::1] label, int count):
+        Small.__init__(self, data, over)
+        self.count = count
+        cdef const int32_t* ptr = over.blocks.ptr
+        cdef int32_t i, k = over.blocks.n_blocks, rows, joints = over.rows.n_joints if over.factored else 0, at = 0
         self.size, self.block = np.zeros((self.count, SIZES), np.int32), np.empty(k, np.int32)
         cdef int32_t[:, ::1] size = self.size
         cdef int32_t[::1] block = self.block, first = np.empty(self.count, np.int32)
@@ -402,8 +507,8 @@ cdef class Friction(Small):
             rows = ptr[i + 1] - ptr[i]
             size[label[i], 0] += rows
             size[label[i], 1] += 1
-            if not of.factored:
-                size[label[i], 2] += of.csr.indptr[ptr[i + 1]] - of.csr.indptr[ptr[i]]
+            if not over.factored:
+                size[label[i], 2] += over.csr.indptr[ptr[i + 1]] - over.csr.indptr[ptr[i]]
             if i < joints:
                 size[label[i], 3] += rows
                 size[label[i], 4] += 1
@@ -413,48 +518,32 @@ cdef class Friction(Small):
         for i in range(k):
             block[first[label[i]]] = i
             first[label[i]] += 1
-        return 0
 
-    cdef solve(self, own, double tol, bint follow, double* most):
-        cdef ask_t o = ask_t(tol, self.data.start_energy / sqrt(<double>self.count), self.data.start_velocity, self.most,
-                             self.most, has_wide(), 0, 0, 0, 0.0, most[0], 0, 0)
-        cdef room_t r = room_t(0, 0, NULL, NULL, 0, 0, 0, 0.0)
-        try:
-            good = self.whole(own, &o, &r) if self.count == 1 else self.islands(own, &o, &r)
-        finally:
-            free(r.index)
-            free(r.real)
-        most[0] = o.left
-        done = o.longest, o.swept, o.undone, o.factorisations, o.driven, self.count
-        return good or (self.count == 1 and not o.left > 0.0), done
-
-    cdef bint whole(self, double[::1] own, ask_t* o, room_t* r) except -1:
-        cdef part_t s
-        cdef const blocks_t* p = &self.matrix.blocks
-        cdef int32_t m = p.n_rows, n = 0 if self.matrix.csr.indptr != NULL else self.matrix.rows.n_bodies
-        cdef Room room = room_for((work_of(m, n) + m) * sizeof(double) + p.n_blocks * sizeof(int32_t))
-        cdef double* x = <double*>room.at
-        cdef const int32_t[::1] at
-        cdef const double[::1] prepared
+    cdef int32_t end(self, few_t* s, const few_rules_t* rules, double* own, bint cold, double tol, double most, double* both,
+                     rooms_t* rooms, int32_t* counts) except -1:
+        cdef int64_t m = s.v.p.n_rows, scratch = m + scratch_of(&s.v)
+        cdef ask_t o = ask_t(tol, s.begin[0] / sqrt(<double>self.count), s.begin[1], rules.swept, rules.swept, has_wide(), 0, 0, 0,
+                             0.0, most, 0, 0)
         cdef bint good
-        s.v = self.matrix.view()
-        s.lam, s.answer, s.split = &own[0], x, self.split
-        s.at, s.prepared, s.nothing = NULL, NULL, self.data.start_relative
-        if self.prepared is not None:
-            at, prepared = self.at, self.prepared
-            s.at, s.prepared = &at[0], &prepared[0]
-        with nogil:
-            good = solve_part(&s, o, r, x + m, <int32_t*>(x + m + work_of(m, n)))
-        memcpy(&own[0], s.answer, m * sizeof(double))
-        return good
+        if not has_room(&rooms.work, 0, scratch):
+            raise MemoryError(f"{m} rows")
+        if begin_few(s, rules, own, cold, tol, both, rooms.work.real):
+            return KEPT
+        good = self.islands(own, &o, &rooms.more)
+        memset(counts, 0, COUNTS * sizeof(int32_t))
+        counted(&o, self.count, counts)
+        if not good:
+            return FAILED
+        judge_few(s, own, both, rooms.work.real)
+        return ENDED if s.relative <= tol or not o.left > 0.0 else FAILED
 
-    cdef bint islands(self, double[::1] own, ask_t* o, room_t* r) except -1:
-        cdef const blocks_t* p = &self.matrix.blocks
-        cdef const rows_t* rows = &self.matrix.rows
-        cdef bint over_bodies = self.matrix.factored
-        cdef const int32_t[::1] block = self.block, prepared_at
+    cdef bint islands(self, double* own, ask_t* o, room_t* r) except -1:
+        """Each after the other from `own` (m) [N s], into it."""
+        cdef const blocks_t* p = &self.over.blocks
+        cdef const rows_t* rows = &self.over.rows
+        cdef bint over_bodies = self.over.factored
+        cdef const int32_t[::1] block = self.block
         cdef const int32_t[:, ::1] size = self.size     # SIZES of each
-        cdef const double[::1] prepared
         cdef int32_t n_bodies = rows.n_bodies if over_bodies else 0
         cdef int32_t[::1] place = np.empty(p.n_rows, np.int32), at, order, marks, number, body
         cdef double[::1] numbers, work
@@ -473,8 +562,6 @@ cdef class Friction(Small):
         numbers, marks, work = np.empty(2 * each), np.empty(2 * whole, np.int32), np.empty(work_of(m, max(n, 0)))
         at, order = np.empty(k + 1, np.int32), np.empty(k, np.int32)
         number, body = np.full(n_bodies + 1, -1, np.int32), np.empty(n + 2, np.int32)
-        if self.prepared is not None:
-            prepared_at, prepared = self.at, self.prepared
         two[1].n_numbers = -1
         with nogil:
             for i in range(self.count):
@@ -483,19 +570,19 @@ cdef class Friction(Small):
                 if over_bodies:
                     n = number_bodies(rows, &block[first], k, &number[0], &body[0])
                 lay(x, &numbers[(i % 2) * each], &marks[(i % 2) * whole], &size[i, 0], n)
-                cut(x, p, &block[first], &own[0], &place[0])
+                cut(x, p, &block[first], own, &place[0])
                 if over_bodies:
                     cut_rows(x, p, rows, &block[first], &number[0], &body[0])
                 else:
-                    cut_matrix(x, p, &self.matrix.csr, &block[first], &place[0])
+                    cut_matrix(x, p, &self.over.csr, &block[first], &place[0])
                 if same(x, last):
                     memcpy(x.s.answer, last.s.answer, m * sizeof(double))
                 else:
                     x.s.split, x.s.at, x.s.prepared, x.s.nothing = size[i, 4], NULL, NULL, -1.0
                     if p.law == CONE:
                         for j in range(k):
-                            at[j] = prepared_at[block[first + j]]
-                        x.s.at, x.s.prepared = &at[0], &prepared[0]
+                            at[j] = self.at.at[block[first + j]]
+                        x.s.at, x.s.prepared = &at[0], self.at.prepared
                     o.first = swept_before(&x.s.v.p, o.most)
                     swept, factored = o.swept, o.factored
                     good = solve_part(&x.s, o, r, &work[0], &order[0])

@@ -1,4 +1,4 @@
-"""Problems in generalised coordinates, one or many, without the interpreter: lay out, prepare, solve, judge.
+"""Problems by J and M, by A or by bodies, one or many, without the interpreter: lay out, prepare, solve, judge.
 
 The same kernels in the same order as on one problem alone, so the same bits and counts. What
 does not end below tol on the judge's own measure, has an empty row that b asks for or is counted to cost more than is
@@ -8,26 +8,34 @@ from cpython.exc cimport PyErr_CheckSignals
 from libc.stdint cimport int32_t, int64_t
 from libc.math cimport INFINITY, fabs, sqrt
 from libc.stdlib cimport calloc, free
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.arrays cimport doubles
+from lavender_ext.core.arrays cimport doubles, ints, ndarray
+from lavender_ext.core.assemble cimport lav_assemble, lav_body_blocks, lav_expand_rows
 from lavender_ext.core.blocks cimport Blocks
 from lavender_ext.core.door cimport first_outside
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.method cimport MORE, REACHED, ROOM, options_t, room_t, said_t
 from lavender_ext.core.parts cimport CONE, blocks_t, is_rows
-from lavender_ext.core.problem cimport MADE, Data, made_t, make_numbers
+from lavender_ext.core.csr cimport csr_t
+from lavender_ext.core.problem cimport MADE, Data, lav_rows_diagonal, made_t, make_numbers, matrix_numbers
+from lavender_ext.core.problem import LAWS
+from lavender_ext.core.rows cimport rows_t
 from lavender_ext.core.view cimport view_t
 from lavender_ext.driver.driver cimport NEWTON, lav_room, lav_start, lav_step
 from lavender_ext.factor.tiles cimport has_wide
 from lavender_ext.generalized.newton cimport is_soft
+from lavender_ext.small.call cimport (COUNTS, ENDED, KEPT, Rules, are_bounded, few_rules_t, few_t, has_call, judge_few,
+                                      lay_few, rooms_t, run_few)
 from lavender_ext.small.limits cimport allowed, cost_of, limits_t, step_cost
-from lavender_ext.small.room cimport has_room
-from lavender_ext.small.world cimport (BAD, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES, READY,
-                                       AT_ROW, ROWS, SOFT, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t, lay_world, worlds_t)
-from lavender_ext.judge.measure cimport do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of
+from lavender_ext.small.room cimport has_room, leave
+from lavender_ext.small.world cimport (BAD, BESIDE, BLOCK, BLOCKS, CONE_ROW, FREE, JAC, LATE, LEFT, MASS, MU, N_ARRAYS, PLACES,
+                                       READY, AT_ROW, FIELDS, ROWS, SOFT, STARTED, TARGET, TRIED, VELOCITIES, VELOCITY, desk_t,
+                                       lay_bodies, lay_matrix, lay_world, rows_of, worlds_t)
+from lavender_ext.judge.measure cimport (do_nothing, general_floor, general_slack, judge_nothing, judged_from, relative_of,
+                                         scratch_of)
 from lavender_ext.judge.rounding cimport relative_size, squares32
 from lavender_ext.judge.score cimport norms_of_rhs, relative, score_rows, score_t
 
@@ -57,7 +65,13 @@ cdef enum:
 
 cdef struct job_t:
     blocks_t p
+    bint general                # by J and M,
+    bint factored               # by bodies; else by A
     generalized_t g
+    csr_t a
+    rows_t r
+    const double* dense         # A (m, m), of which `a` is to be made
+    int64_t row                 # numbers from one row of it to the next
     made_t made                 # of the data, or of this call
     bint known                  # it is this problem's
     double begin[3]             # E0, V0, relative residual of doing nothing; E0 < 0 where not known
@@ -65,12 +79,19 @@ cdef struct job_t:
     double most                 # ns that it may cost as counted, then what it has come to is the result; inf: to the end
     bint solved
     bint spent                  # what it might cost is
-    int32_t counts[4]           # steps, factorisations, rounds, evaluations
+    int32_t counts[COUNTS]      # steps, factorisations, rounds, evaluations; or as of `run_few`
     double* lam                 # (m)
     double* both                # (2 m + 1) w, e
-    const double* push          # (n) M^-1 J^T lam of the judge, in room that the next world takes
+    const double* push          # (n) M^-1 J^T lam of the judge, not of A; in room that the next world takes
     score_t score
     double relative, floor
+
+
+cdef struct few_rooms_t:        # of one thread
+    room_t made                 # A, d, nu and step
+    room_t formed               # of `form_matrix`
+    room_t kept                 # of `lay_few`
+    rooms_t call
 
 
 cdef inline void begin(job_t* j, double* w) noexcept nogil:
@@ -190,20 +211,162 @@ cdef inline void solve_job(job_t* j, room_t* room, const limits_t* limits, doubl
     j.solved = j.relative <= tol
 
 
+cdef inline bint make_matrix(job_t* j, room_t* room) noexcept nogil:
+    """A in compressed rows, d, nu and step in `room`."""
+    cdef int64_t m = j.p.n_rows, entries = m * m + BESIDE if j.dense != NULL else 0
+    cdef double* x
+    cdef int32_t* empty
+    if not has_room(room, 2 * (m + 1) + entries, 3 * (m + 1) + entries):
+        return False
+    x, empty = room.real, room.index
+    if j.dense != NULL:
+        j.a.indptr, j.a.indices, j.a.data = empty + m + 1, empty + 2 * (m + 1), x + 3 * (m + 1)
+        rows_of(j.dense, j.row, j.p.n_rows, j.p.n_rows, <int32_t*>j.a.indptr, <int32_t*>j.a.indices, <double*>j.a.data)
+    j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
+    j.made.n_empty = matrix_numbers(&j.p, &j.a, x, x + m + 1, x + 2 * (m + 1), empty)
+    return True
+
+
+cdef inline bint make_bodies(job_t* j, room_t* room) noexcept nogil:
+    """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts in `room`; within the door?"""
+    cdef int64_t m = j.p.n_rows, joints = j.p.ptr[j.r.n_joints], c = j.r.n_contacts
+    cdef int64_t n = 3 * (m + 1) + 12 * joints + 5 * c + 6 * (m - joints)
+    cdef double* x
+    cdef double* of_joints
+    if not has_room(room, m + 1, n):
+        return False
+    x, of_joints = room.real, room.real + 3 * (m + 1)
+    memset(x, 0, n * sizeof(double))
+    j.p.d, j.p.nu, j.p.step = x, x + m + 1, x + 2 * (m + 1)
+    j.r.minv_jac, j.r.coupling, j.r.swing = of_joints, of_joints + 12 * joints, of_joints + 12 * joints + 5 * c
+    j.made.n_empty = lav_rows_diagonal(&j.p, &j.r, x, x + m + 1, x + 2 * (m + 1), room.index, of_joints, of_joints + 12 * joints,
+                                       of_joints + 12 * joints + 5 * c)
+    return first_outside(j.p.d, m) < 0
+
+
+cdef inline bint form_matrix(job_t* j, few_t* s, room_t* room) noexcept nogil:
+    """A of bodies in `room`, to be solved in their stead: d of its own, and nu of theirs."""
+    cdef int64_t m = j.p.n_rows, k = j.p.n_blocks, most
+    cdef int32_t* start
+    cdef int32_t* blocks
+    cdef int32_t* near
+    cdef int32_t* ptr
+    cdef double* x
+    if not has_room(room, j.r.n_bodies + 6 * k + 3 * m + m * m + 7, 3 * (m + 1) + 24 * m + m * m + 1):
+        return False
+    start, x = room.index, room.real
+    blocks = start + j.r.n_bodies + 1
+    near = blocks + 2 * k + 1
+    ptr = near + 4 * k + 2 + m
+    lav_body_blocks(&j.p, &j.r, start, blocks, &most)
+    j.a.indptr, j.a.indices, j.a.data = ptr, ptr + 2 * (m + 1), x + 3 * (m + 1) + 24 * m
+    lav_expand_rows(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m)
+    lav_assemble(&j.p, &j.r, x + 3 * (m + 1), x + 3 * (m + 1) + 12 * m, start, blocks, near, near + 2 * k + 1, near + 4 * k + 2,
+                 ptr, <int32_t*>j.a.indices, <double*>j.a.data)
+    s.over = view_t(j.p, &j.a, NULL, NULL)
+    s.over.p.d, s.over.p.nu, s.over.p.step = x, j.p.nu, x + 2 * (m + 1)
+    matrix_numbers(&s.over.p, &j.a, x, x + m + 1, x + 2 * (m + 1), ptr + m + 1)
+    return True
+
+
+cdef inline view_t view_of(job_t* j) noexcept nogil:
+    """As the judge reads it."""
+    cdef view_t v = view_t(j.p, NULL, NULL, NULL)
+    if j.general:
+        v.g = &j.g
+    elif j.factored:
+        v.r = &j.r
+    else:
+        v.a = &j.a
+    return v
+
+
+cdef inline bint prepare_few(job_t* j, few_t* s, few_rooms_t* rooms) noexcept nogil:
+    """What is worked out of A or bodies before a solve or the judge; False where it is left to the caller, as are empty rows."""
+    cdef int64_t m = j.p.n_rows
+    cdef double* x
+    if not j.known:
+        j.known = make_bodies(j, &rooms.made) if j.factored else make_matrix(j, &rooms.made)
+    if not j.known or j.made.n_empty:
+        return False
+    s.v = s.over = view_of(j)
+    if j.begin[0] < 0.0:
+        if not has_room(&rooms.call.work, 0, 3 * m + scratch_of(&s.v)):
+            return False
+        x = rooms.call.work.real
+        judge_nothing(&s.v, x, x + m, x + 2 * m, x + 3 * m, j.begin)
+    s.begin[0], s.begin[1], s.begin[2] = j.begin[0], j.begin[1], j.begin[2]
+    return j.begin[2] >= 0.0
+
+
+cdef inline void found_by(job_t* j, const few_t* s) noexcept nogil:
+    j.score, j.relative, j.floor = s.score, s.relative, s.floor
+
+
+cdef inline int32_t solve_few(job_t* j, few_rooms_t* rooms, const few_rules_t* rules, double tol) noexcept nogil:
+    """A or bodies by the call of few rows; LEFT, TRIED, STARTED or READY."""
+    cdef few_t s
+    cdef int32_t code
+    cdef bint pivots = are_bounded(&j.p)
+    if j.p.n_rows > rules.rows or not has_call(&j.p) or not (rules.pivots if pivots else rules.follows):
+        return LEFT
+    if not prepare_few(j, &s, rooms) or (pivots and j.factored and not form_matrix(j, &s, &rooms.formed)):
+        return LEFT
+    if not lay_few(&s, &rooms.kept):
+        return LEFT
+    code = run_few(&s, rules, j.lam, j.cold, tol, j.most, j.both, &rooms.call, j.counts)
+    found_by(j, &s)
+    j.push = rooms.call.work.real + (j.p.n_rows if code == KEPT else 0)
+    if code != KEPT and code != ENDED:
+        return TRIED
+    return LEFT if not s.relative <= tol else STARTED if code == KEPT else READY
+
+
+cdef int take_given(job_t* j, problem) except -1:
+    """The problem of A or of bodies of which nothing was worked out."""
+    cdef Blocks blocks = problem.cones._blocks
+    cdef Py_ssize_t m = blocks.at.n_rows, n, c, joints
+    rows, matrix = problem.rows, problem.matrix
+    j.p, j.known, j.begin[0], j.factored = blocks.at, False, -1.0, rows is not None
+    j.p.law, j.p.b = LAWS[problem.friction], doubles(problem.b, m)
+    if j.factored:
+        n, c, joints = len(rows.inv_mass), len(rows.normal), len(rows.joint_body)
+        j.r.n_bodies, j.r.n_joints, j.r.n_contacts = <int32_t>n, <int32_t>joints, <int32_t>c
+        j.r.jac, j.r.joint_body = doubles(rows.jac, 12 * j.p.ptr[joints]), ints(rows.joint_body, 2 * joints)
+        j.r.normal, j.r.tangent = doubles(rows.normal, 3 * c), doubles(rows.tangent, 3 * c)
+        j.r.arm_a, j.r.arm_b = doubles(rows.arm_a, 3 * c), doubles(rows.arm_b, 3 * c)
+        j.r.contact_body, j.r.compliance = ints(rows.contact_body, 2 * c), doubles(problem.compliance, m)
+        j.r.inv_mass, j.r.inv_inertia = doubles(rows.inv_mass, n), doubles(rows.inv_inertia, 9 * n)
+    elif isinstance(matrix, ndarray):
+        j.dense, j.row = doubles(matrix, m * m), m
+    else:
+        indptr, indices, data = problem._compressed
+        j.a.indptr, j.a.indices, j.a.data = ints(indptr, m + 1), ints(indices, len(indices)), doubles(data, len(data))
+    return 0
+
+
 cdef int take(job_t* j, Data p, start, double* lam, double* both) except -1:
     """The problem of `p` from `start` (m,) [N s], or from doing nothing where it is None."""
-    cdef const double[::1] given
-    j.p, j.g = p.blocks, p.general
+    j.p, j.g, j.a, j.r, j.general, j.factored = p.blocks, p.general, p.csr, p.rows, p.is_general, p.factored
     j.known = p.ready
     j.made = p.made
+    if not p.is_general:
+        j.made.n_empty = <int32_t>len(p.empty)
     j.begin[0], j.begin[1], j.begin[2] = p.start_energy, p.start_velocity, p.start_relative
+    return take_start(j, start, lam, both)
+
+
+cdef int take_start(job_t* j, start, double* lam, double* both) except -1:
+    cdef const double[::1] given
     j.lam, j.both = lam, both
     j.solved, j.spent, j.cold, j.most = False, False, start is None, INFINITY
     if not j.cold:
         given = start
         if given.shape[0] != j.p.n_rows:
             raise ValueError(f"{given.shape[0]} numbers for {j.p.n_rows} rows")
-        memcpy(lam, &given[0], j.p.n_rows * sizeof(double))
+        if j.p.n_rows:
+            memcpy(lam, &given[0], j.p.n_rows * sizeof(double))
+    return 0
 
 
 cdef result(job_t* j, Data p, impulse, both):
@@ -248,8 +411,7 @@ def solve_first(Data p, start, double tol, Limits limits, double most=INFINITY):
     j.most = most
     with nogil:
         solve_job(&j, &room, &limits.at, tol)
-        free(room.index)
-        free(room.real)
+        leave(&room)
     if not known and j.known:
         p.adopt(&j.made)
     elif not known:
@@ -280,7 +442,7 @@ PLACE = {"rows": ROWS, "velocities": VELOCITIES, "blocks": BLOCKS, "jac": JAC, "
 #: Rows of `Worlds.numbers` and codes of worlds by their names.
 NUMBER = {"relative": RELATIVE, "energy": ENERGY, "speed": SPEED, "floor": FLOOR, "start_energy": START_ENERGY,
           "start_speed": START_SPEED, "start_relative": START_RELATIVE, "rhs_energy": RHS_ENERGY, "push": PUSH}
-CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE}
+CODE = {"left": LEFT, "ready": READY, "bad": BAD, "tried": TRIED, "late": LATE, "started": STARTED}
 
 
 cdef enum:                      # what `Hand` says in the place of a world's number
@@ -289,38 +451,45 @@ cdef enum:                      # what `Hand` says in the place of a world's num
 
 
 def data_of(list problems, kind):
-    """(Data of each problem in generalised coordinates, None of one that the loop leaves; rows of each (n,))."""
+    """(Of each problem its Data, True where nothing was worked out, None of one that the loop leaves; rows of each (n,))."""
     cdef Py_ssize_t i, n = len(problems)
-    cdef Data p
     cdef list data = [None] * n
     sizes = np.empty(n, np.int64)
     cdef int64_t[::1] rows = sizes
     for i in range(n):
         problem = problems[i]
         p = problem.derived.view
-        if p is None:
-            rows[i] = problem.m
+        rows[i] = problem.m if p is None else (<Data>p).blocks.n_rows
+        if type(problem) is not kind or (<Blocks>problem.cones._blocks).has_ellipse:
             continue
-        rows[i] = p.blocks.n_rows
-        if type(problem) is kind and not (<Blocks>p.keep[0]).has_ellipse:
-            data[i] = p
+        if p is None:
+            p = problem.__dict__.get("data", True)
+        data[i] = p
     return data, sizes
 
 
-cdef class Worlds:
-    """Problems in generalised coordinates, each made of a few arrays when its turn comes, or given; and what came of them.
+cdef struct hand_t:             # rooms of one thread
+    room_t room
+    room_t both
+    made_t made
+    desk_t desk
+    few_rooms_t few
 
-    `numbers` (N_NUMBERS, n) are those of the judge, `worst` (n,) his worst row, `counts` (n, 4) as of `Newton.run`; `code`
+
+cdef class Worlds:
+    """Problems, each made of a few arrays when its turn comes, or given; and what came of them.
+
+    `numbers` (N_NUMBERS, n) are those of the judge, `worst` (n,) his worst row, `counts` (n, COUNTS) as of `job_t`; `code`
     (n,) is LEFT, READY or BAD. `impulse` and `velocity` hold the worlds' one after the other, in the places that `at` says.
 
     Parameters
     ----------
-    data : list of Data or None
-        Of problems that are objects; None of one that is left to the caller. Starts come with it: (m,) [N s] or None.
+    problems, data : list
+        Of problems that are objects, and `data_of` them. Starts come with it: (m,) [N s] or None.
     at : (n, PLACES) int64
         Of arrays, as in `world.pxd`; of objects its columns ROWS and AT_ROW alone.
     arrays : sequence of 6
-        J, M, v*, target, compliance, mu (or None), flat float64 or float32.
+        J, M, v*, target, compliance, mu (or None), flat float64 or float32; or A, None, None, b, None, mu.
     strides : (int, int)
         Numbers from one row to the next of J and of M, 0: as many as velocities.
     pattern : (indptr, indices) int32, or None
@@ -346,7 +515,7 @@ cdef class Worlds:
         cdef Py_ssize_t n = at.shape[0]
         self.impulse, self.velocity, self.cold = impulse.base, velocity.base, cold
         self.numbers, self.worst = np.zeros((N_NUMBERS, n + 1)), np.full(n + 1, -1, np.int32)
-        self.counts, self.code = np.zeros((n + 1, 4), np.int32), np.zeros(n + 1, np.int8)
+        self.counts, self.code = np.zeros((n + 1, COUNTS), np.int32), np.zeros(n + 1, np.int8)
         cdef double[:, ::1] numbers = self.numbers
         cdef int32_t[::1] worst = self.worst
         cdef int32_t[:, ::1] counts = self.counts
@@ -369,7 +538,7 @@ cdef class Worlds:
         if pattern is not None:
             ptr, col = pattern
             self.w.mass_ptr, self.w.mass_col = &ptr[0], &col[0]
-        self.w.blocks, self.w.asymmetry = blocks.at, asymmetry
+        self.w.blocks, self.w.asymmetry, self.w.general = blocks.at, asymmetry, arrays[1] is not None
         self.w.blocks.law = law
         self.w.jac_row, self.w.mass_row = strides
         self.keep += [blocks, pattern, *arrays]
@@ -385,28 +554,48 @@ cdef class Worlds:
                 wide = arrays[i]
                 self.w.array[i] = &wide[0]
 
-    def of_objects(self, list data, list starts):
-        """Of Data, None where one is left to the caller."""
+    def of_bodies(self, fields, pairs, int bodies, int joints, int contacts, Blocks blocks, int law):
+        """Of bodies: (array, numbers from one world to the next) of each field of `bodies_t`, and of the pairs."""
+        cdef int32_t i
+        self.w.blocks, self.w.general, self.w.factored = blocks.at, False, True
+        self.w.blocks.law = law
+        self.keep += [blocks, fields, pairs]
+        for i in range(FIELDS):
+            array, self.w.bodies.step[i] = fields[i]
+            self.w.bodies.field[i] = doubles(array, array.size)
+        for i in range(2):
+            array, self.w.bodies.pair_step[i] = pairs[i]
+            self.w.bodies.pair[i] = ints(array, array.size)
+        self.w.bodies.n, self.w.bodies.joints, self.w.bodies.contacts = bodies, joints, contacts
+
+    def of_objects(self, list problems, list data, list starts):
+        """Of problems by their `data_of`, None where one is left to the caller."""
         cdef int64_t i
-        cdef Data p
+        cdef job_t* j
         self.jobs = <job_t*>calloc(self.w.n + 1, sizeof(job_t))
         if self.jobs == NULL:
             raise MemoryError(f"{self.w.n} problems")
-        self.keep.append(data)
+        self.keep += [problems, data]
         for i in range(self.w.n):
-            p = data[i]
-            if p is not None:
-                take(&self.jobs[i], p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+            p, j = data[i], &self.jobs[i]
+            if p is True:
+                take_given(j, problems[i])
+                take_start(j, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
+            elif p is not None:
+                take(j, p, starts[i], self.lam + self.w.at[i * PLACES + AT_ROW], NULL)
 
     def remember(self, data):
         """Doing nothing stays with the data of what was solved."""
         cdef int64_t i
         for i in range(self.w.n):
-            if self.code_at[i] == READY:
+            if self.code_at[i] == READY and data[i] is not True:
                 remember(&self.jobs[i], data[i])
 
+    cdef bint is_general(self, int64_t i) noexcept nogil:
+        return self.jobs[i].general if self.jobs != NULL else self.w.general
+
     cdef int32_t lay(self, int64_t i, desk_t* desk, room_t* both, const made_t* made, job_t* j) noexcept nogil:
-        """World i for `solve_job` or for the judge."""
+        """World i for a solve or for the judge."""
         cdef const int64_t* at = self.w.at + i * PLACES
         cdef int32_t code = READY
         if self.jobs != NULL:
@@ -414,10 +603,16 @@ cdef class Worlds:
             if j.p.n_rows == 0:
                 return LEFT
         else:
-            code = lay_world(&self.w, i, desk, &j.p, &j.g)
+            j.general, j.factored = self.w.general, self.w.factored
+            if j.general:
+                code = lay_world(&self.w, i, desk, &j.p, &j.g)
+            elif j.factored:
+                code = lay_bodies(&self.w, i, desk, &j.p, &j.r)
+            else:
+                code = lay_matrix(&self.w, i, desk, &j.p, &j.dense, &j.row)
             j.begin[0] = -1.0
             j.solved, j.spent, j.cold, j.known, j.lam = False, False, self.cold, False, self.lam + at[AT_ROW]
-        if not j.known:
+        if not j.known and j.general:
             j.made = made[0]
         j.most = INFINITY
         if not has_room(both, 0, 2 * at[ROWS] + 1):
@@ -438,11 +633,9 @@ cdef class Worlds:
             self.number[(START_ENERGY + k) * n + i] = j.begin[k]
         self.worst_at[i] = j.score.worst
         self.number[PUSH * n + i] = fabs(j.both[j.p.n_rows + j.score.worst]) if j.score.worst >= 0 else 0.0
-        for k in range(4):
-            self.count[4 * i + k] = j.counts[k]
         if self.jobs == NULL:
             v = self.v + at[VELOCITY]
-            for k in range(j.g.n):
+            for k in range(at[VELOCITIES]):
                 v[k] = desk.free[k] + j.push[k]
 
     cdef int32_t empty(self, int64_t i, const desk_t* desk) noexcept nogil:
@@ -451,57 +644,78 @@ cdef class Worlds:
                self.w.at[i * PLACES + VELOCITIES] * sizeof(double))
         return READY
 
-    cdef int32_t solve(self, int64_t i, desk_t* desk, room_t* room, room_t* both, made_t* made, const limits_t* limits,
-                       double tol, double most) noexcept nogil:
+    cdef int32_t solve(self, int64_t i, hand_t* h, const limits_t* limits, const few_rules_t* rules, double tol,
+                       double most) noexcept nogil:
         cdef job_t j
-        cdef int32_t code = self.lay(i, desk, both, made, &j)
-        cdef bint known = j.known
+        cdef int32_t code = LEFT
+        cdef bint known
+        if limits == NULL if self.is_general(i) else rules == NULL:
+            return LEFT
+        code = self.lay(i, &h.desk, &h.both, &h.made, &j)
         if code != READY:
             return code
         if j.p.n_rows == 0:
-            return self.empty(i, desk)
-        j.most = most
-        solve_job(&j, room, limits, tol)
-        if j.solved:
-            self.keep_result(i, &j, desk)
+            return self.empty(i, &h.desk)
+        known, j.most = j.known, most
+        if j.general:
+            solve_job(&j, &h.room, limits, tol)
+            if not known:
+                h.made = j.made                         # whose room the next one has
+            code = READY if j.solved else TRIED
         else:
-            memcpy(&self.count[4 * i], j.counts, sizeof(j.counts))
-        if not known:
-            made[0] = j.made                            # whose room the next one has
+            code = solve_few(&j, &h.few, rules, tol)
+        if code == READY or code == STARTED:
+            self.keep_result(i, &j, &h.desk)
+        if code != LEFT:
+            memcpy(&self.count[COUNTS * i], j.counts, sizeof(j.counts))
         if self.jobs != NULL:
             self.jobs[i].begin[0], self.jobs[i].begin[1], self.jobs[i].begin[2] = j.begin[0], j.begin[1], j.begin[2]
-        return READY if j.solved else TRIED
+        return code
 
-    cdef int32_t judge(self, int64_t i, desk_t* desk, room_t* room, room_t* both, made_t* made, bint narrow) noexcept nogil:
-        """The judge alone, beside the floor of float32 where `narrow`; empty rows are left to the caller."""
+    cdef int32_t judge(self, int64_t i, hand_t* h, bint narrow, bint late) noexcept nogil:
+        """The judge alone, beside the floor of float32 where `narrow`; empty rows are left to the caller.
+
+        late: so are problems of A and of bodies, whose numbers wait until they are read.
+        """
         cdef job_t j
-        cdef int32_t k, code = self.lay(i, desk, both, made, &j), m = j.p.n_rows
+        cdef few_t s
+        cdef int32_t k, code = self.lay(i, &h.desk, &h.both, &h.made, &j), m = j.p.n_rows
         cdef bint known = j.known
         cdef double size
         cdef double* x
         if code != READY:
             return code
         if m == 0:
-            return self.empty(i, desk)
+            return self.empty(i, &h.desk)
         code = LEFT
-        if has_numbers(&j) and j.made.n_empty == 0 and has_room(room, 0, 4 * <int64_t>m + 5 * j.g.n):
-            code, x = READY, room.real
+        if not j.general:
+            if narrow or (late and self.jobs != NULL) or not prepare_few(&j, &s, &h.few):
+                return LEFT
+            if not has_room(&h.few.call.work, 0, scratch_of(&s.v)):
+                return LEFT
+            if j.cold:
+                do_nothing(&j.p, j.lam, j.both)
+            code = READY
+            judge_few(&s, j.lam, j.both, h.few.call.work.real)
+            found_by(&j, &s)
+            j.push = h.few.call.work.real
+        elif has_numbers(&j) and j.made.n_empty == 0 and has_room(&h.room, 0, 4 * <int64_t>m + 5 * j.g.n):
+            code, x = READY, h.room.real
             if j.cold:
                 do_nothing(&j.p, j.lam, j.both)
             begin(&j, x)
             judge_job(&j, x)
-            for k in range(4):
-                j.counts[k] = 0
             if narrow:
                 x += j.g.n                              # behind what is pushed
-                squares32(&j.p, &j.g, &desk.mass, desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
+                squares32(&j.p, &j.g, &h.desk.mass, h.desk.free, j.lam, x, x + m, x + 2 * m, x + 3 * m)
                 for k in range(m):
                     x[k] = x[k] + x[m + k] + x[2 * m + k]
                 j.floor = relative_size(&j.p, x, j.begin[0], j.begin[1])
-            self.keep_result(i, &j, desk)
+        if code == READY:
+            self.keep_result(i, &j, &h.desk)
             norms_of_rhs(&j.p, &self.number[RHS_ENERGY * (self.w.n + 1) + i], &size)
-        if not known:
-            made[0] = j.made
+        if j.general and not known:
+            h.made = j.made
         return code
 
     def __dealloc__(self):
@@ -516,45 +730,44 @@ cdef class Hand:
     """
 
     cdef Worlds worlds
-    cdef room_t room
-    cdef room_t both
-    cdef made_t made
-    cdef desk_t desk
+    cdef hand_t h
     cdef const unsigned char[::1] stop
 
     def __init__(self, Worlds worlds, const unsigned char[::1] stop):
-        self.worlds, self.stop, self.desk.n_tree = worlds, stop, -1
+        self.worlds, self.stop, self.h.desk.n_tree = worlds, stop, -1
 
     def __dealloc__(self):
-        free(self.room.index)
-        free(self.room.real)
-        free(self.both.index)
-        free(self.both.real)
-        free(self.made.marks)
-        free(self.made.numbers)
-        free(self.desk.room.index)
-        free(self.desk.room.real)
-        free(self.desk.tree.index)
-        free(self.desk.tree.real)
+        leave(&self.h.room)
+        leave(&self.h.both)
+        leave(&self.h.desk.room)
+        leave(&self.h.desk.tree)
+        leave(&self.h.few.made)
+        leave(&self.h.few.formed)
+        leave(&self.h.few.kept)
+        leave(&self.h.few.call.work)
+        leave(&self.h.few.call.more)
+        free(self.h.made.marks)
+        free(self.h.made.numbers)
 
-    def solve(self, double tol, Limits limits, double most=INFINITY):
+    def solve(self, double tol, Limits limits, Rules rules, double most=INFINITY):
         """Solve worlds until one is left to the caller, which is returned; DONE_ALL where there are no more.
 
-        Without limits every world is left. most : counted cost [ns] of a world at which it is; LISTEN is then returned after
-        each.
+        Without limits every world of J and M is left, without rules every other. most : counted cost [ns] of a world at which it
+        is; LISTEN is then returned after each.
         """
-        return self.run(tol, limits, most, 0, False)
+        return self.run(tol, limits, rules, most, 0, False)
 
     def judge(self, bint narrow, bint late=False):
         """Judge the impulses of worlds until one is left to the caller; narrow: beside the floor of float32.
 
         late: as what they keep where there was no time to solve.
         """
-        return self.run(0.0, None, INFINITY, LATE if late else READY, narrow)
+        return self.run(0.0, None, None, INFINITY, LATE if late else READY, narrow)
 
-    cdef int64_t run(self, double tol, Limits limits, double most, int32_t judges, bint narrow) except? -3:
+    cdef int64_t run(self, double tol, Limits limits, Rules rules, double most, int32_t judges, bint narrow) except? -3:
         cdef Worlds w = self.worlds
         cdef const limits_t* at = &limits.at if limits is not None else NULL
+        cdef const few_rules_t* few = &rules.at if rules is not None else NULL
         cdef int64_t i, n = w.w.n
         cdef int32_t code, done = 0
         with nogil:
@@ -563,13 +776,11 @@ cdef class Hand:
                 if i >= n:
                     return DONE_ALL
                 if judges:
-                    code = w.judge(i, &self.desk, &self.room, &self.both, &self.made, narrow)
+                    code = w.judge(i, &self.h, narrow, judges == LATE)
                     if code == READY:
                         code = judges
-                elif at == NULL:
-                    code = LEFT
                 else:
-                    code = w.solve(i, &self.desk, &self.room, &self.both, &self.made, at, tol, most)
+                    code = w.solve(i, &self.h, at, few, tol, most)
                 w.code_at[i] = <signed char>code
                 if code == LEFT or code == TRIED:
                     return i

@@ -16,3 +16,8 @@ cdef inline bint has_room(room_t* r, int64_t n_index, int64_t n_real) noexcept n
         r.real = <double*>malloc(2 * n_real * sizeof(double))
         r.n_real = 2 * n_real if r.real != NULL else 0
     return n_index <= r.n_index and n_real <= r.n_real
+
+
+cdef inline void leave(room_t* r) noexcept nogil:
+    free(r.index)
+    free(r.real)

@@ -7,11 +7,12 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcmp, memcpy, memset
 
-from lavender_ext.core.door cimport first_outside, first_unsized, is_number, is_size, largest, least
+from lavender_ext.core.door cimport first_outside, first_unsized, is_definite, is_frame, is_number, is_size, largest, least
 from lavender_ext.core.generalized cimport generalized_t, jac_row
 from lavender_ext.core.tree cimport tree_factor, tree_pattern
 from lavender_ext.core.method cimport room_t
 from lavender_ext.core.parts cimport blocks_t, from_block, is_rows
+from lavender_ext.core.rows cimport rows_t, rows_times
 from lavender_ext.judge.rounding cimport mass_t
 from lavender_ext.small.room cimport has_room
 from lavender_ext.small.thin cimport thin
@@ -23,6 +24,7 @@ cdef enum:                      # what became of a world
     BAD = 2                     # numbers that no problem has
     TRIED = 3                   # to the caller, after the same compiled call as of one problem
     LATE = 4                    # its start is judged: there was no time to solve
+    STARTED = 5                 # its start is a solution
 
 cdef enum:                      # columns of `at`: how many it has, and where they begin
     ROWS = 0
@@ -48,8 +50,34 @@ cdef enum:
     MESH = 400                  # velocities from which on `Generalized` looks for another order
 
 
+cdef enum:                      # fields of bodies
+    INV_MASS = 0
+    INV_INERTIA = 1
+    V_FREE = 2
+    JOINT_JAC = 3
+    NORMAL = 4
+    TANGENT = 5
+    ARM_A = 6
+    ARM_B = 7
+    GOAL = 8                    # target,
+    SOFTNESS = 9                # compliance,
+    RUB = 10                    # mu of the contacts
+    FIELDS = 11
+
+
+cdef struct bodies_t:
+    int32_t n, joints, contacts
+    const double* field[FIELDS]     # of the first world,
+    int64_t step[FIELDS]        # and numbers from one to the next, 0: of all
+    const int32_t* pair[2]      # of joints, of contacts
+    int64_t pair_step[2]
+
+
 cdef struct worlds_t:
     int64_t n
+    bint general                # J and M;
+    bint factored               # bodies; else A in the place of J, b in that of the target
+    bodies_t bodies
     const int64_t* at           # (n, PLACES)
     const void* array[N_ARRAYS]     # J, M, v*, target, compliance, mu (NULL: that of the blocks)
     int32_t narrow[N_ARRAYS]    # in float32
@@ -338,24 +366,96 @@ cdef inline int32_t lay_world(const worlds_t* w, int64_t i, desk_t* d, blocks_t*
         return BAD
     if 0.0 < largest(b, m) < least():
         return BAD
-    lay_blocks(w, at, p, idx + half, x + n + 2 * m)
-    p.b = b
-    for j in range(k):
-        if not is_size(p.mu[j]) or (not is_rows(p, j) and not is_size(p.mu[j] * p.patch_radius[j])):
+    return lay_blocks(w, at, p, b, idx + half, x + n + 2 * m)
+
+
+cdef inline int32_t lay_matrix(const worlds_t* w, int64_t i, desk_t* d, blocks_t* p, const double** a, int64_t* row) noexcept nogil:
+    """World i of A (m, m), `row` numbers from one row to the next, on the desk; READY, BAD or LEFT."""
+    cdef const int64_t* at = w.at + i * PLACES
+    cdef int32_t m = <int32_t>at[ROWS], k = <int32_t>at[BLOCKS], j
+    cdef double* b
+    if not has_room(&d.room, k + 1, m + k + <int64_t>m * m):
+        return LEFT
+    b, row[0] = d.room.real, w.jac_row
+    a[0] = widened(w, 0, at[JAC], m, m, row, b + m + k)
+    for j in range(m):
+        if has_outside(a[0] + j * row[0], m):
             return BAD
-    return READY
+    widen(w, 3, at[TARGET], m, b)
+    if has_outside(b, m) or 0.0 < largest(b, m) < least():
+        return BAD
+    return lay_blocks(w, at, p, b, d.room.index, b + m)
 
 
-cdef inline void lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, int32_t* ptr, double* mu) noexcept nogil:
-    """Its blocks, whose rows count from 0, with its own mu where it has one."""
+cdef inline bint are_pairs(const int32_t* pair, int32_t k, int32_t n, bint moves) noexcept nogil:
+    """As `checks.are_pairs`."""
+    cdef int32_t i, a, b
+    for i in range(k):
+        a, b = pair[2 * i], pair[2 * i + 1]
+        if not -1 <= a < n or not -1 <= b < n or a == b and (moves or a >= 0):
+            return False
+    return True
+
+
+cdef inline int32_t lay_bodies(const worlds_t* w, int64_t i, desk_t* d, blocks_t* p, rows_t* r) noexcept nogil:
+    """World i of bodies; READY, or LEFT: `Rows` makes whole what is a little off, and has words for the rest."""
+    cdef const int64_t* at = w.at + i * PLACES
+    cdef const bodies_t* o = &w.bodies
+    cdef const double* x[FIELDS]
+    cdef int32_t m = <int32_t>at[ROWS], kj = o.joints, c = o.contacts, k
+    cdef int32_t size[FIELDS]
+    cdef double* b
+    cdef double* mu
+    size[:] = [o.n, 9 * o.n, 6 * o.n, 12 * w.blocks.ptr[kj], 3 * c, 3 * c, 3 * c, 3 * c, m, m, c]
+    if not has_room(&d.room, kj + c + 1, m + kj + c):
+        return LEFT
+    for k in range(FIELDS):
+        x[k] = o.field[k] + i * o.step[k]
+        if has_outside(x[k], size[k]):
+            return LEFT
+    r.n_bodies, r.n_joints, r.n_contacts = o.n, kj, c
+    r.joint_body, r.contact_body = o.pair[0] + i * o.pair_step[0], o.pair[1] + i * o.pair_step[1]
+    r.inv_mass, r.inv_inertia, r.jac, r.compliance = x[INV_MASS], x[INV_INERTIA], x[JOINT_JAC], x[SOFTNESS]
+    r.normal, r.tangent, r.arm_a, r.arm_b = x[NORMAL], x[TANGENT], x[ARM_A], x[ARM_B]
+    if not are_pairs(r.joint_body, kj, o.n, False) or not are_pairs(r.contact_body, c, o.n, True):
+        return LEFT
+    if first_unsized(r.inv_mass, o.n) >= 0 or first_unsized(r.compliance, m) >= 0:
+        return LEFT
+    for k in range(o.n):
+        if not is_size(largest(r.inv_inertia + 9 * k, 9)) or not is_definite(r.inv_inertia + 9 * k, 5e-10, 0.0, 1e-6):
+            return LEFT
+    for k in range(c):
+        if not is_frame(r.normal + 3 * k, r.tangent + 3 * k, 5e-10):
+            return LEFT
+    b, mu = d.room.real, d.room.real + m
+    memset(mu, 0, kj * sizeof(double))
+    memcpy(mu + kj, x[RUB], c * sizeof(double))
+    if lay_blocks(w, at, p, b, d.room.index, mu, True) != READY:
+        return LEFT
+    d.free = <double*>x[V_FREE]
+    rows_times(p, r, d.free, b)
+    for k in range(m):
+        b[k] = x[GOAL][k] - b[k]
+    return LEFT if has_outside(b, m) or 0.0 < largest(b, m) < least() else READY
+
+
+cdef inline int32_t lay_blocks(const worlds_t* w, const int64_t* at, blocks_t* p, const double* b, int32_t* ptr,
+                               double* mu, bint has_mu=False) noexcept nogil:
+    """Its blocks, whose rows count from 0, with its own mu where it has one (`has_mu`: there already); READY or BAD."""
     cdef const blocks_t* all = &w.blocks
     cdef int32_t k, first = <int32_t>at[CONE_ROW], block = <int32_t>at[BLOCK]
     p[0] = all[0]
     p.n_rows, p.n_blocks = <int32_t>at[ROWS], <int32_t>at[BLOCKS]
     for k in range(p.n_blocks + 1):
         ptr[k] = all.ptr[block + k] - first
-    p.ptr, p.lower, p.upper = ptr, all.lower + first, all.upper + first
+    p.b, p.ptr, p.lower, p.upper = b, ptr, all.lower + first, all.upper + first
     from_block(p, all, block)
-    if w.array[5] != NULL:
+    if has_mu:
+        p.mu = mu
+    elif w.array[5] != NULL:
         widen(w, 5, at[MU], p.n_blocks, mu)
         p.mu = mu
+    for k in range(p.n_blocks):
+        if not is_size(p.mu[k]) or (not is_rows(p, k) and not is_size(p.mu[k] * p.patch_radius[k])):
+            return BAD
+    return READY

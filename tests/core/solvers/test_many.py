@@ -3,11 +3,15 @@
 import copy
 import pickle
 import threading
+from itertools import product
 
 import numpy as np
 import pytest
+from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
+from benchmarks.made import fresh
+from lavender.solvers import registry
 from lavender.solving import many as many_module
 
 DISKS = lv.Cones.contacts(0.5, count=4)
@@ -354,6 +358,80 @@ def test_matrices_and_bodies_go_the_same_way():
     assert many.impulse.shape == (3, 3) and many.success.all()
     assert many.impulse[:, 0] == pytest.approx([2.2, 2.1, 1.55], rel=1e-5)  # m (v + 0.1), s
     assert many.velocity.reshape(3, 6)[:, 2] == pytest.approx(0.1, rel=1e-5)
+
+
+@pytest.mark.parametrize("solver", ["auto", "direct", "newton"])
+@pytest.mark.parametrize("tol", [1e-6, 1e-10])
+def test_a_list_of_matrices_and_bodies_has_the_bits_of_single_solves(solver, tol):
+    """Fresh, and with all that a single solve works out; warm from anywhere, from a solution, from nothing."""
+    drawn = [random_lcp(seed, m=4 + 3 * seed, rank=3 if seed % 3 == 0 else None) for seed in range(9)]
+    drawn += [lv.Problem.linear(p.matrix, p.b) for p in drawn[:4]]
+    drawn += [lv.Problem.lcp(p.matrix + np.triu(p.matrix, 1), p.b) for p in drawn[:4]]
+    for seed, law in product(range(5), ("coulomb", "cone")):
+        rows = random_contact_problem(seed, law, spin=seed % 2 == 0, contacts=3 + 4 * seed, rolling=seed == 3)
+        drawn += [rows, as_matrix(rows)]
+    drawn += [random_contact_problem(seed, tangents=0, spin=False, joints=seed) for seed in range(3)]
+    drawn += [lv.Problem.lcp(np.zeros((2, 2)), [0.0, -1.0]), lv.Problem.lcp([[1e13]], [1.0], [1.5], [1.5])]
+    given = [p for p in drawn if not registry.get(solver).refuses(p)]
+    rng = np.random.default_rng(0)
+    starts = [
+        (None, rng.standard_normal(p.m), lv.solve(p, solver, tol=tol).impulse)[i % 3]
+        for i, p in enumerate(given)
+    ]
+    singles = [lv.solve(fresh(p), solver, tol=tol, impulse=x) for p, x in zip(given, starts, strict=True)]
+    for problems in (given, [fresh(p) for p in given]):
+        many = lv.solve_many(problems, solver, tol=tol, impulses=starts, threads=2)
+        found = lv.residual_many(problems, [s.impulse for s in many])
+        assert found.relative.tobytes() == many.relative.tobytes()
+        for i, single in enumerate(singles):
+            assert_same(many, i, single)
+
+
+@pytest.mark.parametrize(
+    "mu", [0.0, 0.5, np.linspace(0.1, 1.0, 48).reshape(6, 8)], ids=["none", "one", "each"]
+)
+@pytest.mark.parametrize("friction", ["coulomb", "cone"])
+def test_bodies_in_arrays_have_the_bits_of_single_solves(mu, friction, monkeypatch):
+    """Boxes of two on each other; what is wrong with one, or a little off, is no matter of the others."""
+    rng = np.random.default_rng(5)
+    corners, up = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]), np.array([0.0, 0.0, 0.5])
+    fields = {
+        "inv_mass": rng.uniform(0.5, 2.0, (6, 2)), "inv_inertia": np.tile(6.0 * np.eye(3), (2, 1, 1)),
+        "v_free": [0.3, 0.0, -0.16, 0.0, 0.0, 0.0] + 0.05 * rng.standard_normal((6, 2, 6)),
+        "contact_body": np.tile(np.repeat([(-1, 0), (0, 1)], 4, axis=0), (6, 1, 1)),
+        "normal": np.tile([0.0, 0.0, 1.0], (6, 8, 1)), "tangent": np.tile([1.0, 0.0, 0.0], (8, 1)),
+        "arm_a": np.tile(corners + up, (2, 1)), "arm_b": np.tile(corners - up, (2, 1)),
+    }  # fmt: skip
+    more = {"mu": mu, "friction": friction, "tangents": 2 if friction == "cone" else None, "compliance": 0.01}
+    target = 0.1 * rng.standard_normal((6, 24 if np.any(mu) or friction == "cone" else 8))
+    batch = lv.Batch.of_bodies(fields, target=target, **more)
+    singles = [lv.solve(batch[i]) for i in range(6)]
+    fields["v_free"][1] = np.nan  # where it stands: the batch reads it there
+    fields["inv_mass"][2] = -1.0
+    fields["normal"][3, 0, 0] = 1e-7  # which `Rows` takes out
+    fields["contact_body"][4, 0, 1] = 9
+    alone, solve = [], many_module.solve
+    monkeypatch.setattr(many_module, "solve", lambda *of, **more: alone.append(of) or solve(*of, **more))
+    many = lv.solve_many(batch, threads=2, errors="status")
+    assert sorted(many.faults) == [1, 2, 4] and "body 9" in str(many.faults[4])
+    assert len(alone) == 1
+    for i in (0, 5):
+        assert_same(many, i, singles[i])
+        assert many.velocity[i].tobytes() == batch[i].velocity(singles[i].impulse).tobytes()
+    assert_same(many, 3, lv.solve(batch[3]))
+
+
+def test_bodies_whose_rows_differ_between_worlds_are_told_so():
+    """No mu, no tangents, unless they are asked for: ten rows went into the place of twelve."""
+    ball = {
+        "inv_mass": np.ones((2, 1)), "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)),
+        "contact_body": [(-1, 0)], "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)],
+        "arm_a": [(0.0, 0.0, 0.0)], "arm_b": [(0.0, 0.0, -0.1)],
+    }  # fmt: skip
+    mu = np.array([[0.5], [0.0]])
+    with pytest.raises(lv.InputError, match="world 1: it has 1 rows, the first world 3: give tangents="):
+        lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
+    assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
 
 
 @pytest.mark.parametrize(

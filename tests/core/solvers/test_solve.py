@@ -120,13 +120,13 @@ def test_a_copy_of_what_is_prepared_is_prepared_for_itself(copied):
 
 
 @pytest.mark.skipif(not hasattr(signal, "pthread_kill"), reason="signals of POSIX")
-@pytest.mark.parametrize("form", ["matrix", "J and M"])
-def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkeypatch):
+@pytest.mark.parametrize("solver", ["pgs", "auto"])
+def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(solver, monkeypatch):
     """The signal comes with the first problem that a thread takes, one by one or in the compiled loop."""
     n, begun, solve, hand = 2000, [], many.solve, loop.Hand
 
     def interrupt():
-        begun.append(form)
+        begun.append(solver)
         if len(begun) == 1:
             signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
         time.sleep(1e-3)
@@ -140,7 +140,7 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkey
             self.hand, self.stop = hand(worlds, stop), stop
 
         def solve(self, *args):
-            if form == "matrix":
+            if solver == "pgs":
                 return self.hand.solve(*args)
             interrupt()
             while not self.stop[0]:
@@ -149,11 +149,6 @@ def test_ctrl_c_while_many_are_handed_out_to_threads_begins_no_more(form, monkey
 
     monkeypatch.setattr(many, "solve", slow)
     monkeypatch.setattr(loop, "Hand", SlowHand)
-    problem = (
-        TINY
-        if form == "matrix"
-        else lv.Problem.from_jacobian(np.eye(2), np.eye(2), -np.ones(2), cones=TINY.cones)
-    )
     with pytest.raises(KeyboardInterrupt):
-        lv.solve_many([dataclasses.replace(problem, copy=False) for _ in range(n)], threads=2)
+        lv.solve_many([dataclasses.replace(TINY, copy=False) for _ in range(n)], solver, threads=2)
     assert 1 <= len(begun) < n / 2

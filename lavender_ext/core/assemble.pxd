@@ -1,0 +1,13 @@
+"""A of bodies, for other compiled loops."""
+from libc.stdint cimport int32_t, int64_t
+
+from lavender_ext.core.parts cimport blocks_t
+from lavender_ext.core.rows cimport rows_t
+
+
+cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil
+cdef public void lav_body_blocks(const blocks_t* p, const rows_t* r, int32_t* start, int32_t* blocks,
+                                 int64_t* bound) noexcept nogil
+cdef public void lav_assemble(const blocks_t* p, const rows_t* r, const double* jac, const double* minv_jac,
+                              const int32_t* start, const int32_t* blocks, int32_t* near, int32_t* sides,
+                              int32_t* next_, int32_t* indptr, int32_t* indices, double* data) noexcept nogil
