@@ -167,7 +167,8 @@ class Solutions(Many, Sequence[Solution]):
         """What the results take [s] where nobody has his turn."""
         if isinstance(self.problems, Batch):
             rows, columns = (self.problems.at[:, PLACE[of]].astype(float) for of in ("rows", "velocities"))
-            return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * columns + 4.0)))
+            entries = np.where(columns > 0.0, columns, rows)  # of a row; A has its own
+            return LATE * len(rows) + ENTRY * float(np.sum(rows * (2.0 * entries + 4.0)))
         both = zip(self.problems, self._data, strict=True)
         return sum(LATE + reading_time(p) if data and p.generalized else UNREAD for p, data in both)
 
