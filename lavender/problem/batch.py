@@ -105,8 +105,7 @@ class Batch(Sequence[Problem]):
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
     ) -> None:
-        if friction not in FRICTION:
-            raise InputError(f"friction is {friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
+        _check_friction(friction)
         values, *pattern = M if isinstance(M, tuple) else (M,)
         jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
@@ -177,18 +176,12 @@ class Batch(Sequence[Problem]):
         if matrix.ndim != 3 or matrix.shape[1] != matrix.shape[2] or rhs.shape != matrix.shape[:2]:
             raise InputError(f"A has shape {matrix.shape} and b {rhs.shape}; (n, m, m) and (n, m) are needed")
         n, m = rhs.shape
-        made = cls._of_makers(n, m, friction, precision_of(matrix, rhs))
+        made = cls._of_form(n, m, friction, precision_of(matrix, rhs))
         made._place_cones(cones)
         at, place = made.at, PLACE
         flat, at[:, place["jac"]], made._jac_row = _matrices("A", matrix, n, (m, m), None)
         goal, at[:, place["target"]] = _vectors("b", rhs, n, m, None)
         made._arrays = flat, None, None, goal, None, made._frictions(mu)
-
-        def make(i: int) -> Problem:
-            own = made._cones_of(i, None if mu is None else made._part(i, 5))
-            return Problem(rhs[i], own, matrix[i], friction=friction, precision=made.precision)
-
-        made._make = make
         return made
 
     @classmethod
@@ -220,44 +213,34 @@ class Batch(Sequence[Problem]):
                 f"stacked arrays are of {sorted(lengths)} worlds; one number of them, in at least one array, is needed"
             )
         n = lengths.pop()
-
-        def make(i: int) -> Problem:
-            of: dict[str, Any] = {name: x[i] if x.ndim > known[name] else x for name, x in parts.items()}
-            own: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
-            problem = Problem.from_rows(Rows(**of), **own)
-            if i and problem.m != made.shape[1]:
-                raise InputError(
-                    f"it has {problem.m} rows, the first world {made.shape[1]}: give tangents=, which mu 0 leaves out"
-                )
-            return problem
-
-        first = make(0) if n else None
-        made = cls._of_makers(
-            n, 0 if first is None else first.m, "coulomb" if first is None else first.friction, "float64"
-        )
-        made._make, made._bodies = make, (parts, more)
-        if first is not None and first.rows is not None:
-            made.precision, made.velocity_shape = first.precision, (n, 6 * first.rows.n_bodies)
-            nv = 6 * first.rows.n_bodies
+        made = cls._of_form(n, 0, more.get("friction", "coulomb"), "float64")
+        made._bodies = parts, more, {name for name, x in parts.items() if x.ndim > known[name]}
+        if n:
+            first = made[0]
+            made.shape, made.precision = (n, first.m), first.precision
+            made.at[:, PLACE["rows"]], made.at[:, PLACE["row"]] = first.m, first.m * np.arange(n)
+            nv = 6 * first.rows.n_bodies if first.rows is not None else 0
+            made.velocity_shape = (n, nv)
             made.at[:, PLACE["velocities"]], made.at[:, PLACE["velocity"]] = nv, nv * np.arange(n)
             made.at[:, PLACE["blocks"]] = first.cones.n_blocks
         return made
 
     @classmethod
-    def _of_makers(cls, n: int, m: int, friction: str, precision: str) -> Batch:
+    def _of_form(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
         made: Batch = object.__new__(cls)
+        _check_friction(friction)
         made._n, made.friction, made.precision, made._arrays = n, friction, precision, None
-        made.shape, made.velocity_shape = (n, m), (0,)
+        made.shape, made.velocity_shape = (n, m), (n, 0)
         made.at = np.zeros((n, len(PLACE)), np.int64)
         made.at[:, PLACE["rows"]], made.at[:, PLACE["row"]] = m, m * np.arange(n)
         return made
 
-    _make: Callable[[int], Problem] | None = None
-    _pattern: tuple[np.ndarray, np.ndarray] | None = None
-    _jac_row = _mass_row = 0
-    _bodies: tuple[dict[str, Any], dict[str, Any]] | None = None  # fields and bounds of `of_bodies`
     names_of: Callable[[int], Sequence[str]] | None = None  # of the blocks of a world
     _shared = True
+    _pattern: tuple[np.ndarray, np.ndarray] | None = None
+    _jac_row = _mass_row = 0
+    # Of `of_bodies`: fields, bounds, and which fields are stacked.
+    _bodies: tuple[dict[str, Any], dict[str, Any], set[str]] | None = None
 
     # -- blocks ----------------------------------------------------------------------------------------
 
@@ -331,14 +314,26 @@ class Batch(Sequence[Problem]):
         i = places(i, self._n)
         if isinstance(i, list):
             return [self[j] for j in i]
-        if self._make is not None:
-            return self._make(i)
+        if self._bodies is not None:
+            return self._of_bodies(i, *self._bodies)
         jac, mass, free, target, soft, mu = (self._part(i, which) for which in range(6))
         own = self._cones_of(i, None if mu is None else as_array("mu", mu, (None,)))
+        if mass is None:
+            return Problem(target, own, jac, friction=self.friction, precision=self.precision)
         return Problem.from_jacobian(
             jac, mass, free, target=target, cones=own, compliance=soft, friction=self.friction,
             precision=self.precision, names=None if self.names_of is None else self.names_of(i),
         )  # fmt: skip
+
+    def _of_bodies(self, i: int, parts: dict[str, Any], more: dict[str, Any], stacked: set[str]) -> Problem:
+        of: dict[str, Any] = {name: x[i] if name in stacked else x for name, x in parts.items()}
+        own: dict[str, Any] = {name: x[i] if np.ndim(x) == 2 else x for name, x in more.items()}
+        problem = Problem.from_rows(Rows(**of), **own)
+        if i and problem.m != self.shape[1]:
+            raise InputError(
+                f"it has {problem.m} rows, the first world {self.shape[1]}: give tangents=, which mu 0 leaves out"
+            )
+        return problem
 
     def _part(self, i: int, which: int) -> Any:
         """One array of world i, as it stands."""
@@ -353,6 +348,8 @@ class Batch(Sequence[Problem]):
             row, whole = np.repeat(np.arange(nv), np.diff(ptr)), np.zeros((nv, nv), array.dtype)
             whole[row, col] = whole[col, row] = array[first : first + len(col)]
             return whole
+        if self._arrays[1] is None:
+            nv = m  # of A in the place of J
         if which < 2:
             rows, stride = ((m, self._jac_row), (nv, self._mass_row))[which]
             size = array.itemsize
@@ -397,7 +394,7 @@ class Batch(Sequence[Problem]):
 
     def _read_bodies(self) -> Any:
         """What the compiled loop reads of bodies; None where worlds differ in more than numbers of one layout."""
-        parts, more = self._bodies  # type: ignore[misc]
+        parts, more, _ = self._bodies  # type: ignore[misc]
         stacked = {name for name, x in more.items() if np.ndim(x) == 2}
         if not stacked <= {"target", "compliance", "mu"} or "guess" in more or not len(self):
             return None
@@ -438,6 +435,11 @@ def check_errors(errors: str) -> None:
     """What is done about a world that is bad."""
     if errors not in ERRORS:
         raise InputError(f"errors is {errors!r}; {' or '.join(map(repr, ERRORS))} is needed")
+
+
+def _check_friction(friction: Any) -> None:
+    if not (isinstance(friction, str) and friction in FRICTION):
+        raise InputError(f"friction is {friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
 
 
 def _numbers(name: str, x: Any) -> np.ndarray:

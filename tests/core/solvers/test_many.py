@@ -48,9 +48,15 @@ def test_what_came_of_many_is_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
-    for given in (batch, mixed):
+    ball = {
+        "inv_mass": np.ones((3, 1)), "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)),
+        "contact_body": [(-1, 0)], "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)],
+        "arm_a": [(0.0, 0.0, 0.0)], "arm_b": [(0.0, 0.0, -0.1)],
+    }  # fmt: skip
+    matrices = lv.Batch.of_matrices(np.array([np.eye(12)] * 3), np.ones((3, 12)), cones=DISKS)
+    for given in (batch, mixed, matrices, lv.Batch.of_bodies(ball, mu=0.5)):
         many = lv.solve_many(given, tol=1e-10)
-        found = lv.residual_many(given, many.impulse if given is batch else [s.impulse for s in many])
+        found = lv.residual_many(given, [s.impulse for s in many])
         twin, verdicts = again(many), again(found)
         for name in ("impulse", "velocity", "status", "relative", "worst_row", "iterations", "ptr"):
             np.testing.assert_array_equal(getattr(twin, name), getattr(many, name))
@@ -429,6 +435,8 @@ def test_bodies_whose_rows_differ_between_worlds_are_told_so():
         "arm_a": [(0.0, 0.0, 0.0)], "arm_b": [(0.0, 0.0, -0.1)],
     }  # fmt: skip
     mu = np.array([[0.5], [0.0]])
+    with pytest.raises(lv.InputError, match="friction is 'wet'"):
+        lv.Batch.of_bodies(ball, friction="wet")
     with pytest.raises(lv.InputError, match="world 1: it has 1 rows, the first world 3: give tangents="):
         lv.solve_many(lv.Batch.of_bodies(ball, mu=mu))
     assert lv.solve_many(lv.Batch.of_bodies(ball, mu=mu, tangents=2)).success.all()
