@@ -16,7 +16,7 @@
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost, at once of bounded rows that failed in the compiled call
+                                SURE times that cost, of bounded rows that failed in the compiled call over rows
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE), `admm`, `nncg`, and sweeps as long as these
                                 gain; all together LAST times Newton's cost, and no longer than LONG
@@ -227,8 +227,9 @@ class Tree:
         if self.is_dense:
             yield self.rounds(self.newton, "a dense factor, of the rows that are free")
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
-            if not (self.tried and self.law == "lcp"):
-                yield from islice(self.factorisations(SURE), 1)
+            if self.tried and self.law == "lcp":
+                self.add_rows(LITTLE)
+            yield from islice(self.factorisations(SURE), 1)
             yield Stage(
                 "certificate", 1.0, self.newton, "whether the least violation proves that there is none"
             )

@@ -1,7 +1,8 @@
 """What Newton's method tries when.
 
-Bounded rows: exchanges from the warm start and from the solution of H z = g, an interior point, exchanges at each of its
-decades. Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
+Bounded rows: exchanges from the warm start and from the solution of H z = g; of bodies and sparse matrices proximal rounds,
+as long as they get anywhere, which pass rows that depend on each other; an interior point, exchanges at each of its decades.
+Cones: interior points with two weights. What these leave: the augmented system of bodies, proximal rounds.
 
 Coulomb friction: proximal rounds on the Alart-Curnier map from the start, as long as they get anywhere; De Saxce's
 interior point, ended by rounds; a path of smoothed problems, but for closed loops of joints; De Saxce's with less of phi's
@@ -186,7 +187,11 @@ cdef inline void go_convex(newton_t* n) noexcept nogil:
             n.at = 13
         else:
             put_aside(n, n.before, n.before_z)
-            begin_steps(n, True)
+            if n.s.form != DENSE:
+                begin_rounds(n, 1, n.best_z, CONE, 1e-3, INNER)
+                pursue(n, 1, STRETCH, 1.0 / 0.0)
+    elif at == 3 and not over(n):
+        begin_steps(n, True)
     else:
         n.at = 13 if over(n) else 10
         if n.at == 10:

@@ -489,7 +489,7 @@ def test_a_wide_program_without_a_feasible_point_is_proven_infeasible():
 @pytest.mark.parametrize("coupled", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_few_rows_that_contradict_each_other_among_many_are_proven_by_the_least_violation(seed, coupled):
-    """No factor of all rows, no turns with doubled work: it ends at the proof, and its twin is solved."""
+    """No turns with doubled work: it ends at the proof, and its twin is solved."""
     rng = np.random.default_rng(seed)
     n, fight = 120, rng.choice(200, 3, replace=False)
     G, x, weight = rng.normal(size=(200, n)), rng.normal(size=n), rng.uniform(0.5, 1.5, 3)
@@ -503,7 +503,7 @@ def test_a_few_rows_that_contradict_each_other_among_many_are_proven_by_the_leas
         lv.solve_qp(lv.Problem.from_qp(P, q, np.vstack([G, last]), np.append(h, at), **box)) for at in sides
     )
     assert none.solution.status is lv.Status.INFEASIBLE and not none.solution.contradicted
-    assert not {turn.solver for turn in none.solution.turns} & {"newton over rows", "nncg", "admm"}
+    assert not {turn.solver for turn in none.solution.turns} & {"nncg", "admm"}
     _, z, _ = none.qp.multipliers(none.solution.certificate)
     assert set(np.flatnonzero(z)) == {*fight, 200}
     assert twin.found
