@@ -308,12 +308,16 @@ class QuadraticProgram:
         if self.proximal is None or not 0.0 < size < np.inf or not self.q @ direction < 0.0:
             return None
         d = direction / size
-        of, rows = self.generalized, np.abs(self.generalized.operator.jac[2]).max(initial=0.0)
-        curved, along = np.abs(of.momentum_of(d) - self.proximal * d).max(), of.velocity_of(d)
-        short = max(np.abs(along[: self.free]).max(initial=0.0), -along[self.free :].min(initial=0.0))
-        steep, largest = -float(self.q @ d), np.abs(self.q).max()
-        heavy = np.abs(of.operator.mass[2]).max(initial=0.0)
-        falls = curved <= tol * heavy and short <= tol * rows and steep > tol * largest
+        of, along = self.generalized, self.generalized.velocity_of(d)
+        curved = np.abs(of.momentum_of(d) - self.proximal * d)
+        short = np.concatenate([np.abs(along[: self.free]), -along[self.free :]])
+        heavy, rows = largest(of.operator.mass[2]), largest(of.operator.jac[2])
+        steep = -float(self.q @ d) > tol * largest(self.q)
+        if not steep or curved.max() > tol * heavy or short.max(initial=0.0) > tol * rows:
+            return None
+        # Each row by its own largest entry: units of rows do not matter.
+        each = tuple(abs(matrix).max(axis=1).toarray().ravel() for matrix in (of.mass, of.jac))
+        falls = (curved <= tol * each[0]).all() and (short <= tol * each[1]).all()
         return read_only(d) if falls else None
 
 

@@ -245,6 +245,26 @@ def test_an_unbounded_program_has_a_ray(hessian, q, rows, tol):
     assert rows.get("lb") is None or d.min() >= -1e-6
 
 
+@pytest.mark.parametrize(
+    ("hessian", "rows", "x"),
+    [
+        (
+            [0.0, 0.0],
+            {"G": [[1e-9, 0.0], [0.0, 1.0]], "h": [2e-9, 0.0]},
+            [2.0, 0.0],
+        ),  # one row in other units
+        ([1e-8, 0.0, 1.0], {"lb": [-np.inf, 0.0, 0.0], "ub": [np.inf, 1.0, 1.0]}, [1e8, 0.0, 0.0]),
+    ],
+)
+def test_a_row_or_a_curvature_that_is_small_beside_others_holds_the_objective(hessian, rows, x):
+    q = np.zeros(len(hessian))
+    q[0] = -1.0
+    answer = lv.solve_qp(lv.Problem.from_qp(np.diag(hessian), q, **rows))
+    assert answer.ray is None
+    assert answer.found
+    np.testing.assert_allclose(answer.x[0], x[0], rtol=1e-6)
+
+
 def test_a_program_without_a_feasible_point_is_infeasible_though_its_objective_falls_for_ever():
     answer = lv.solve_qp(lv.Problem.from_qp([[0.0]], [-1.0], G=[[0.0]], h=[-1.0]))
     assert answer.solution.status is lv.Status.INFEASIBLE
