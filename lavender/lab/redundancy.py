@@ -1,4 +1,4 @@
-"""Which rows repeat others, what is unique all the same, and one impulse to stand for many.
+"""Which rows repeat others, and what is unique all the same.
 
 Where A is singular, impulses are not unique: a table on four legs. The slack w, and with it every body's
 velocity, is unique for symmetric positive semidefinite A without Coulomb friction. A row is redundant when
@@ -12,23 +12,19 @@ known, what is new in J alone counts, too: beside a body that is 1e13 times heav
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray, IntArray, number
-from lavender.base.errors import CapabilityError, InputError, SolveFailed
+from lavender.base.arrays import FloatArray, number
+from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import lapack
 from lavender.base.later import sparse as sp
-from lavender.judge.residuals import residual
 from lavender.problem import Problem, check_problem
-from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
 from lavender.problem.operators import semidefinite
 from lavender.problem.ordering import rows_of_each
-from lavender.solving.solve import solve
 from lavender_ext.pivot.direct import Pivoting
 
 __all__ = ["Redundancy", "redundancy"]
@@ -36,12 +32,10 @@ __all__ = ["Redundancy", "redundancy"]
 DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
 # Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
 SHIFT = 1e-13
-TIKHONOV = 1e-7  # -, weight of the distance to the wanted impulse while its rows are found
 FALLS_BACK = 1e-10  # A_ii over the largest entry of its row, up to which d is that entry
 SHARED = 1e-3  # A_ii over a d that two rows share, up to which their units are unlike
 SOUND = 1e-8  # -, above 1, up to which |A_ij| / sqrt(A_ii A_jj) is that of a semidefinite A
 UNMOVED = 1e-9  # -, entries of all unit null vectors up to which a row counts as not moved
-ACCEPTED = 1e-9  # relative residual of a representative, or twice its floor
 
 
 Places = npt.NDArray[np.intp]
@@ -57,9 +51,6 @@ class Redundancy:
     method: str  # how the rank was found, in words
     rows: tuple[int, ...]  # redundant rows: each adds nothing to the others that are kept
     impulse_is_unique: npt.NDArray[np.bool_]  # (m,) rows whose impulse no redundancy can change
-    _scale: FloatArray = field(repr=False)  # (m,) sqrt kg, D^-1/2
-    # Rows and orthonormal null basis of D^-1/2 A D^-1/2 on them, of each dense island that has one.
-    _null: tuple[tuple[IntArray, FloatArray], ...] = field(repr=False)
 
     @property
     def row_names(self) -> tuple[str, ...]:
@@ -91,48 +82,6 @@ class Redundancy:
             return ()
         impulse = ("impulse",) if self.rank == self.problem.m else ()
         return ("slack", "body velocities", "objective", *impulse)
-
-    def nearest_to(self, previous: Any) -> FloatArray:
-        """The solution with the least sum d (lambda - previous)^2 [J]; (m,) [N s].
-
-        Linear systems and boxed LCPs: to rounding. On friction cones: to about 1e-7 of its size.
-
-        Parameters
-        ----------
-        previous : (m,) N s
-
-        Raises
-        ------
-        CapabilityError
-            Coulomb friction, or bounded rows with asymmetric or indefinite A: solutions do not form one convex set.
-        SolveFailed
-            The judge did not accept the result.
-        """
-        p = self.problem
-        previous = p.impulse_array(previous, "previous")
-        if p.law == "coulomb" or (p.law != "linear" and not p.is_semidefinite):
-            raise CapabilityError(
-                "a representative impulse needs symmetric positive semidefinite A without Coulomb friction, where "
-                "solutions form one convex set; pass problem.relaxed('cone') for the convex relaxation of friction"
-            )
-        if p.law == "linear":
-            x = solve(p, "direct", impulse=previous, tol=ACCEPTED).impulse
-            return _accepted(p, self._nearest(x, previous))
-        near = _drawn_to(p, previous)
-        if p.law == "cone":
-            return _accepted(p, solve(near, _cone_solver(near), tol=1e-10).impulse, 1e-6)
-        rough = solve(
-            near, "direct", impulse=np.clip(previous, p.cones.lower, p.cones.upper), tol=1e-9
-        ).impulse
-        return _accepted(p, _polished(p, rough, previous))
-
-    def _nearest(self, x: FloatArray, previous: FloatArray) -> FloatArray:
-        # x less what of x - previous lies in the null space of A, in the metric of D.
-        z = (x - previous) / self._scale
-        for rows, basis in self._null:
-            for _ in range(2):
-                z[rows] -= basis @ (basis.T @ z[rows])
-        return previous + self._scale * z
 
     def __str__(self) -> str:
         m = self.problem.m
@@ -173,7 +122,6 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
     m = problem.m
     unique = np.ones(m, bool)
     dependent: list[int] = []
-    null: list[tuple[IntArray, FloatArray]] = []
     used, methods = tol, set()
     with np.errstate(all="ignore"):  # what is not finite is told below
         scale = 1.0 / np.sqrt(problem.csr_data.d)
@@ -194,7 +142,6 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
                 basis = _null_basis(a.toarray(), found)
                 if unit is not scale:  # to the metric of d
                     basis = np.linalg.qr(basis * (unit[island] / scale[island])[:, None])[0]
-                null.append((island, basis))
                 unique[island] = np.abs(basis).max(axis=1) <= UNMOVED
         else:
             found, limit, words = _other_island(a, sound, tol)
@@ -209,8 +156,6 @@ def redundancy(problem: Problem, *, tol: float = 1e-12) -> Redundancy:
         method="; ".join(sorted(methods)) or "no rows",
         rows=tuple(sorted(dependent)),
         impulse_is_unique=unique,
-        _scale=scale,
-        _null=tuple(null),
     )
 
 
@@ -357,45 +302,3 @@ def _sparse(a: sp.csr_array, limit: float) -> Places:
     upper = sp.triu(a + SHIFT * sp.eye_array(m), format="csc")
     _, pivot, order = qdldl.Solver(sp.csc_matrix(upper), upper=True).factors()
     return np.sort(np.asarray(order, np.intp)[pivot <= limit])
-
-
-def _drawn_to(p: Problem, previous: FloatArray) -> Problem:
-    """The problem with TIKHONOV / 2 sum d (lambda - previous)^2 added to its energy."""
-    weight = TIKHONOV * p.csr_data.d
-    a = sp.csr_array(p.csr + sp.diags_array(weight))
-    return Problem(p.b + weight * previous, p.cones, a, friction=p.friction)
-
-
-def _cone_solver(p: Problem) -> str:
-    from lavender.solvers.registry import available
-
-    here = [name for name in ("newton", "clarabel_cone") if name in available(p)]
-    if not here:
-        raise CapabilityError("friction cones need newton or clarabel_cone here; see lavender.known(problem)")
-    return here[0]
-
-
-def _polished(p: Problem, rough: FloatArray, previous: FloatArray) -> FloatArray:
-    """Free rows of `rough` solved on A itself, nearest to `previous`, the others at their bounds."""
-    c = p.cones
-    # A free row stands off its bounds by more than the weight could have moved it.
-    slop = (
-        10.0 * TIKHONOV * max(float(np.abs(rough).max(initial=0.0)), float(np.abs(previous).max(initial=0.0)))
-    )
-    free = (rough > c.lower + slop) & (rough < c.upper - slop)
-    x = np.where(free, rough, np.where(rough <= c.lower + slop, c.lower, c.upper))
-    rows = np.flatnonzero(free)
-    if len(rows):
-        rest = p.csr[rows] @ np.where(free, 0.0, x)
-        part = Problem(p.b[rows] - rest, Cones.free(len(rows)), p.csr[rows][:, rows])
-        y = redundancy(part).nearest_to(previous[rows])
-        x[rows] = np.clip(y, c.lower[rows], c.upper[rows])
-    good, bad = residual(p, x, "float64"), residual(p, rough, "float64")
-    return x if good.relative <= bad.relative or good.at_floor else rough
-
-
-def _accepted(p: Problem, impulse: FloatArray, tol: float = ACCEPTED) -> FloatArray:
-    r = residual(p, impulse, "float64")
-    if not (r.relative <= tol or r.at_floor):
-        raise SolveFailed(f"the representative impulse is not a solution to {tol:.0e}: {r}")
-    return impulse
