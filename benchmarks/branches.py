@@ -25,8 +25,6 @@ from lavender.sim.scene import Scene
 from lavender.solvers.registry import available
 from lavender.solving.solve import solve
 
-__all__ = ["RUNS", "WAYS", "Crossing", "command", "follow", "pushed", "table"]
-
 # Scene, its parameters, and the speed [m/s] that every body is pushed at, each in a direction of its own.
 RUNS: tuple[tuple[str, dict[str, object], float], ...] = (
     ("pyramid", {"base": 4}, 0.5),

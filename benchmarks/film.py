@@ -17,8 +17,6 @@ from lavender.lab.phenomena.parts import Phenomenon, Record, Track, Values
 from lavender.sim.engine import Film, Simulation
 from lavender.sim.engine.picture import picture_suffix, save_picture
 
-__all__ = ["command", "save_film"]
-
 FRAMES = 40  # of an animation, about
 SIZE = 2.0  # inch, of one engine's picture
 TURN, TILT = 0.25, 0.1  # rad, of the eye

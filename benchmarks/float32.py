@@ -28,8 +28,6 @@ from lavender.judge.residuals import AT_FLOOR, Residual, nothing_to_do, residual
 from lavender.problem import Problem
 from lavender.problem.cones import ROW
 
-__all__ = ["Stop", "command", "exchange", "newton", "planted", "robot_steps", "table"]
-
 ITERATIONS = 30  # of Newton, twice and more what any step here takes
 LAST = 10  # iterates in which nothing comes nearer any more
 FURTHER = 10.0  # than the worst of these: unfinished

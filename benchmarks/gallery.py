@@ -25,8 +25,6 @@ from lavender.sim.engine import Simulation
 from lavender.sim.scene import SCENES, Scene
 from lavender.sim.scene.parts import rotation
 
-__all__ = ["STEPS_PER_SECOND", "Stay", "command", "energy", "stay", "table"]
-
 STEPS_PER_SECOND = (60, 120)
 SETTLED = 2.0  # s
 LOOKS = 10  # a second

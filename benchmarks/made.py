@@ -13,8 +13,6 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-__all__ = ["forms", "fresh", "lattice_pile", "stacks"]
-
 
 def stacks(
     count: int, height: int, mu: float | None, equal: bool, corners: int = 4, seed: int = 0

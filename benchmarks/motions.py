@@ -26,20 +26,6 @@ from lavender.problem.cones import ROW
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
-__all__ = [
-    "Branches",
-    "Sample",
-    "branches",
-    "calibration",
-    "command",
-    "figure",
-    "is_searched",
-    "predictors",
-    "samples",
-    "several_table",
-    "table",
-]
-
 BUDGETS = (1, 4, 16, 64, 256)  # sweeps or iterations of each iterate
 SOLVERS = ("pgs", "jacobi", "anderson", "nncg", "block_gauss_seidel", "admm", "newton")
 # Above it an iterate is no attempt, below it rounding speaks.

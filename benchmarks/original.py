@@ -26,8 +26,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 
-__all__ = ["command"]
-
 # Where something is added: the text that is there once, and what stands there instead ({} is the text).
 ADDED = (
     (

@@ -13,8 +13,6 @@ import click
 from lavender.io.stored import writable, write_text
 from lavender.lab.bench import machine
 
-__all__ = ["markdown", "out_option", "write_json"]
-
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table; columns whose cells are all numbers are ruled like the others, for a diff that stays small."""

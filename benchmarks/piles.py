@@ -16,8 +16,6 @@ import numpy as np
 
 import lavender as lv
 
-__all__ = ["command"]
-
 DT = 1 / 60  # s
 NEAR = 0.02  # m, a gap that is a contact already
 WALLS = ((1, 1), (0, 1), (0, -1), (2, 1), (2, -1))  # axis and side: floor, and four walls

@@ -30,8 +30,6 @@ from lavender.problem.cones import ROW
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 
-__all__ = ["Law", "command", "drag", "edges_of", "laws", "scenes", "table"]
-
 MU = 0.5
 STEEP = 1.2  # tan of the slope over mu: more than a disk holds, less than a box on its diagonal
 TIGHT = 1e-9  # relative residual of the answers that are compared

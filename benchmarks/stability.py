@@ -40,8 +40,6 @@ from lavender.sim.engine.layout import HEAD, SETTING
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 
-__all__ = ["Modes", "command", "critical_gain", "figure", "model", "modes", "slowest"]
-
 TOWERS = ((2, 4), (4, 4), (6, 4))  # boxes, sweeps
 ORDERS = ("given", "symmetric", "alternating")
 PLAY = 2e-5  # m, gap of a face where feedback acts: more than the differences move it

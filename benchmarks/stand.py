@@ -35,19 +35,6 @@ from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, engine, l
 from lavender.sim.scene import Scene
 from lavender.sim.scene.scene import SCENE_ORDERS
 
-__all__ = [
-    "ENGINES",
-    "Line",
-    "Standing",
-    "Tower",
-    "command",
-    "installed",
-    "lines",
-    "measure",
-    "missing",
-    "table",
-]
-
 FRICTION = 0.5
 SETTLE = 2.0  # s
 LOOK = 0.1  # s

@@ -34,8 +34,6 @@ from lavender.lab.report.style import looks
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
 
-__all__ = ["BUDGETS", "SCENES", "Point", "command", "draw", "measure", "reference", "table"]
-
 SECONDS = 2.0
 DT = 1.0 / 60.0
 AGREE = 1e-4  # m

@@ -24,8 +24,6 @@ except ImportError as error:
         "lavender.jax needs JAX: pip install 'lavender-contact[jax]', or jax itself"
     ) from error
 
-__all__ = ["solve"]
-
 
 def _call(function: Any, like: Any, arrays: Any) -> Any:
     # What vmap adds are leading axes, on all arrays alike.

@@ -22,8 +22,6 @@ except ImportError as error:
         "lavender.torch needs PyTorch: pip install 'lavender-contact[torch]', or torch itself"
     ) from error
 
-__all__ = ["solve"]
-
 
 class _Solve(torch.autograd.Function):  # type: ignore[misc]
     """Forward and backward; a batch by `vmap` is leading axes."""

@@ -7,8 +7,6 @@ from lavender.sim.engine.layout import HEAD, SETTING
 from lavender.sim.engine.stepping import TOL
 from lavender_ext.warm.substep import Substep
 
-__all__ = ["NewtonSteps"]
-
 OK, NEED_ROOM = 0, 1
 
 

@@ -22,8 +22,6 @@ from lavender.sim.engine.simulation import Simulation
 from lavender.sim.scene.scene import Scene
 from lavender.solving.solve import prepare, solve
 
-__all__ = ["CASES", "Job", "Row", "job", "run"]
-
 
 @dataclass(frozen=True)
 class Row:

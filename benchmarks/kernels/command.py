@@ -12,8 +12,6 @@ from benchmarks.kernels.instructions import COUNTED, instructions
 from benchmarks.output import markdown
 from lavender.lab.bench import machine
 
-__all__ = ["command", "table"]
-
 
 def _number(x: float, form: str = "{:.3g}") -> str:
     return "-" if x != x else form.format(x)

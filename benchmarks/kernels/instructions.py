@@ -13,8 +13,6 @@ from pathlib import Path
 from benchmarks.kernels.cases import job
 from lavender.base.errors import InputError, SolverUnavailable
 
-__all__ = ["COUNTED", "instructions"]
-
 ROOT = Path(__file__).parents[2]  # of the checkout
 _COUNT = """
 import sys

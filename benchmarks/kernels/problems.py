@@ -9,8 +9,6 @@ import numpy as np
 from benchmarks.kernels import microbenchmarks
 from lavender.problem import Problem
 
-__all__ = ["bare_contacts", "raw_bytes", "tridiagonal"]
-
 
 def tridiagonal(m: int) -> Problem:
     """A stack of m unit masses, frictionless: 2 on the diagonal, -1 beside it."""

@@ -36,8 +36,6 @@ from lavender.problem import Problem
 from lavender.problem.cones import CONTACT
 from lavender.solving.solve import prepare
 
-__all__ = ["SCIPY", "SCRATCH", "TARGETS", "Contestant", "Result", "check_siconos", "contestants", "ours"]
-
 TARGETS = (1e-3, 1e-6, 1e-9)  # errors that all are asked for
 SCRATCH = ", from scratch"  # what names of ours end with that pay for forming A too
 SCIPY = "scipy "  # what names of SciPy's factorisations begin with

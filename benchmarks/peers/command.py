@@ -20,8 +20,6 @@ from benchmarks.peers.problems import PROBLEMS, problems
 from benchmarks.peers.tables import engines_table, solvers_tables
 from lavender.lab.bench import machine
 
-__all__ = ["command"]
-
 PACKAGES = ("mujoco", "pybullet", "pin", "clarabel", "daqp", "highspy", "piqp", "proxsuite", "qoco", "qpalm",
             "quadprog", "scs")  # fmt: skip
 

@@ -24,8 +24,6 @@ from lavender.lab.phenomena.engines import engine, lacks
 from lavender.problem import Problem
 from lavender.sim.scene import Scene
 
-__all__ = ["ENGINES", "SCENES", "Step", "export", "measure_scene"]
-
 DT = 1.0 / 240.0
 NAN = float("nan")
 SETTLE = 480  # steps, 2 s

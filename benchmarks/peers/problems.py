@@ -12,8 +12,6 @@ from lavender.problem import Problem
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 
-__all__ = ["PROBLEMS", "problems"]
-
 #: Cases of the suite, `mujoco:SCENE:CONE` (what MuJoCo exports), `scene:SCENE` (what LavenderSim exports).
 PROBLEMS = (
     "stack(n=8)",

@@ -15,8 +15,6 @@ from lavender.judge.residuals import residual
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
 
-__all__ = ["race"]
-
 REPEATS, REPEAT_TIME = 30, 0.1  # of one setting: at most so many, and as long as they take so long [s]
 AGAIN = 4.0  # a contestant runs again in later rounds when it is within so many times the fastest of its side
 PATIENCE = 10.0  # s, wall, beyond four times the limit of a call, before a contestant is ended

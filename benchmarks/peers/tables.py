@@ -12,8 +12,6 @@ from benchmarks.peers.engines import Step
 from lavender.lab.report.tables import geometric_mean
 from lavender.lab.report.text import residual, seconds
 
-__all__ = ["Comparison", "Mean", "compare", "engines_table", "losses", "means", "over_ours", "solvers_tables"]
-
 LARGE = 1000  # rows from which a problem counts as large
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from time import perf_counter
 
-__all__ = ["CHUNK_TIME", "NEVER", "Deadline", "Stopwatch", "TooLate"]
-
 CHUNK_TIME = 0.01  # s between two readings of the clock; five times that is still unnoticeable after Ctrl-C
 
 

@@ -11,8 +11,6 @@ from typing import Any
 
 from lavender.base.later import sparse as sp
 
-__all__ = ["sparse_lu"]
-
 
 def sparse_lu(matrix: Any, **options: Any) -> Any:
     """SuperLU's factor of a square sparse matrix (n, n), n > 0; RuntimeError if it is singular."""

@@ -11,8 +11,6 @@ import signal
 import sys
 from types import FrameType
 
-__all__ = ["begin", "end"]
-
 STATUS = 130  # what shells show of a command that Ctrl-C ended
 
 

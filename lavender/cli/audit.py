@@ -19,8 +19,6 @@ from lavender.cli.options import (
 )
 from lavender.io.stored import writable
 
-__all__ = ["audit"]
-
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))

@@ -12,8 +12,6 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_UNMET, one_thread
 from lavender.io.stored import writable, write_text
 
-__all__ = ["bench"]
-
 
 @click.group()
 def bench() -> None:

@@ -6,8 +6,6 @@ import click
 
 from lavender.cli.options import console
 
-__all__ = ["cases"]
-
 
 @click.command()
 @click.argument("pattern", default="")

@@ -19,8 +19,6 @@ from lavender.cli.options import (
     was_given,
 )
 
-__all__ = ["check"]
-
 
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")

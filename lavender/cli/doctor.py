@@ -11,8 +11,6 @@ from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET
 from lavender.lab.bench import doctor as bench_doctor
 
-__all__ = ["doctor"]
-
 
 @click.command()
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")

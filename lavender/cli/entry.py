@@ -15,8 +15,6 @@ from lavender.base import starting as _starting
 from lavender.base.errors import LavenderError, UnknownName
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, unheard
 
-__all__ = ["cli", "main"]
-
 #: Name -> the module that has the command.
 COMMANDS = {
     name: f"lavender.cli.{name}"

@@ -9,8 +9,6 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET
 
-__all__ = ["explain"]
-
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")

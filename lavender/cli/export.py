@@ -9,8 +9,6 @@ import click
 from lavender.cli.options import refuse_unused
 from lavender.io.stored import writable
 
-__all__ = ["export"]
-
 VECTORS = 4  # problems in the test vectors, at most
 
 

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
     P = TypeVar("P", bound=Plan)
 
-__all__ = ["Measured", "Progress", "measure", "run_campaign", "show_sheet"]
-
 EVERY = 10.0  # s between two lines of progress where there is no terminal
 
 

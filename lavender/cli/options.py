@@ -21,32 +21,6 @@ if TYPE_CHECKING:
 else:
     _ParamType = click.ParamType
 
-__all__ = [
-    "EXIT_BAD_INPUT",
-    "EXIT_INFEASIBLE",
-    "EXIT_INTERRUPTED",
-    "EXIT_UNMET",
-    "ManyValues",
-    "Names",
-    "Numbers",
-    "Seeds",
-    "bytes_of",
-    "console",
-    "going_on",
-    "one_thread",
-    "parameters_of",
-    "plain",
-    "plan_options",
-    "precision_option",
-    "recording_options",
-    "refuse_unused",
-    "refuse_unused_recording",
-    "threshold_option",
-    "unheard",
-    "was_given",
-    "worlds_options",
-]
-
 EXIT_UNMET = 1  # a claim not met: unsolved, a failed check, an unreadable file met in a folder
 EXIT_BAD_INPUT = 2  # or a folder that another process writes
 EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms

@@ -15,8 +15,6 @@ from lavender.lab.phenomena import WAYS, Record, chosen, run
 from lavender.lab.phenomena import table as tables
 from lavender.lab.phenomena.engines import versions_of_node
 
-__all__ = ["phenomena"]
-
 PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 

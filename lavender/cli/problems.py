@@ -10,8 +10,6 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused
 from lavender.io.stored import writable
 
-__all__ = ["problems"]
-
 
 @click.command()
 @click.argument("groups", nargs=-1, metavar="[@SET | FILE | FOLDER]...")

@@ -7,8 +7,6 @@ import click
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread
 
-__all__ = ["prove"]
-
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")

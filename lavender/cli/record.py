@@ -9,8 +9,6 @@ import click
 
 from lavender.cli.options import precision_option, recording_options, refuse_unused_recording
 
-__all__ = ["record"]
-
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))

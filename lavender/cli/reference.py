@@ -9,8 +9,6 @@ import click
 from lavender.base.errors import InputError, LavenderError
 from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
 
-__all__ = ["reference"]
-
 
 @click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILES | FOLDERS...")

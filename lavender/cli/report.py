@@ -31,8 +31,6 @@ from lavender.cli.options import (
 from lavender.io.stored import writable, write_text
 from lavender.lab.bench.record import file_name
 
-__all__ = ["report"]
-
 
 @click.command(cls=ManyValues)
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")

@@ -12,8 +12,6 @@ import click
 from lavender.base.errors import InputError
 from lavender.cli.options import going_on, parameters_of, refuse_unused
 
-__all__ = ["run"]
-
 FILES = ("trace", "plot", "film", "record")  # options that leave them
 
 

@@ -11,8 +11,6 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
 from lavender.io.stored import writable, write_atomically
 
-__all__ = ["solve"]
-
 
 @click.command()
 @click.argument("file")

@@ -6,8 +6,6 @@ import click
 
 from lavender.cli.options import console, plain
 
-__all__ = ["solvers"]
-
 
 @click.command()
 def solvers() -> None:

@@ -11,8 +11,6 @@ from lavender.cli.measuring import Progress, show_sheet
 from lavender.cli.options import one_thread, threshold_option, worlds_options
 from lavender.io.stored import writable
 
-__all__ = ["tune"]
-
 
 @click.command()
 @click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))

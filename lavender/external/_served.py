@@ -10,8 +10,6 @@ from lavender.base.apart import served as apart
 from lavender.external.apart import ARRAYS, WORDS
 from lavender.external.running import Answer, quiet
 
-__all__ = ["serve"]
-
 
 def serve(lifeline: int) -> None:
     """Answer the calls of `apart.call`, until they end."""

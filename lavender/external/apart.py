@@ -24,8 +24,6 @@ from lavender.external.backend import Backend
 from lavender.external.running import Answer, Failed, Limits
 from lavender.judge.solution import Status
 
-__all__ = ["ARRAYS", "Elsewhere", "call", "ready"]
-
 SERVED = "lavender.external._served"
 ARRAYS = ("x", "zeta", "xi", "direction", "contradiction")  # of an answer, in the order they are sent
 WORDS = 500  # characters of what a backend said

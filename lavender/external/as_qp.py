@@ -42,8 +42,6 @@ from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
 
-__all__ = ["FORMS", "QP", "bound_rows", "impulse_form", "pick_form", "target", "two_sided", "velocity_form"]
-
 FORMS = ("impulse", "velocity", "auto")
 IntpArray = npt.NDArray[np.intp]
 LARGEST = 1e20  # of a program's numbers: from there on backends read infinity, or break

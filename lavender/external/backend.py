@@ -19,8 +19,6 @@ from lavender.external.as_qp import QP, bound_rows
 from lavender.external.running import Answer, Call, Limits, proof, quiet
 from lavender.judge.solution import Status
 
-__all__ = ["Backend"]
-
 
 @dataclass(frozen=True)
 class Backend:

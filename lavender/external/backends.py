@@ -21,8 +21,6 @@ from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
 from lavender.external.running import Limits, at_least
 from lavender.solvers.registry import SolverSpec
 
-__all__ = ["BACKENDS", "SPECS"]
-
 # -- settings of those that go through qpsolvers -----------------------------------------------------
 
 

@@ -23,8 +23,6 @@ from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["Foreign"]
-
 
 class Foreign(Solver):
     """A solver of another package, of which `prepare`, `update` and `run` suffice."""

@@ -18,8 +18,6 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver
 
-__all__ = ["OPTIONS", "QPSolver", "refusal"]
-
 DENSE_LIMIT = 2**30  # bytes of one dense matrix; beyond, a dense backend is refused
 START, PROGRAM = 1e-3, 1.2e-7  # s, of a program, and for each entry of A: half as much again as measured
 OPTIONS = {

@@ -23,16 +23,6 @@ from lavender.judge.residuals import at_floor, quick
 from lavender.judge.solution import Claim, Status
 from lavender.problem import Problem
 
-__all__ = [
-    "Answer",
-    "Failed",
-    "Limits",
-    "ask",
-    "at_least",
-    "proof",
-    "quiet",
-]
-
 EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops there
 GAP_MIN = 1e-18
 # Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.

@@ -13,8 +13,6 @@ from time import perf_counter
 from typing import Any
 from unittest.mock import patch
 
-__all__ = ["OWN", "own_time"]
-
 SETUP = ("setup", "init")  # methods of such classes that take the data
 
 #: module:class.method or module:function, as the calls in this package and in qpsolvers look them up.

@@ -18,8 +18,6 @@ from lavender.problem.derived import cached_property
 from lavender.solving.many import Solutions
 from lavender_ext.derivative.linear import Linears
 
-__all__ = ["Derivatives", "Gradients", "derivatives"]
-
 
 class _Each(Sequence[Any]):
     """One thing of each of many problems, made when it is first asked for."""

@@ -12,8 +12,6 @@ from lavender.base.later import sparse as sp
 from lavender.gradient.result import BODIES, Gradient
 from lavender.problem import Problem
 
-__all__ = ["Bodies", "Parts"]
-
 
 class Parts:
     """Where the coefficients of contacts stand: first row of what slides, spin or second side, and what rolls."""

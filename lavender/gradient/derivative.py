@@ -21,8 +21,6 @@ from lavender.problem.derived import cached_property
 from lavender_ext.core.problem import rows_velocity
 from lavender_ext.derivative.linear import CASES, Linear, wrench
 
-__all__ = ["Derivative", "Tangent", "Unique", "derivative"]
-
 ACCEPTED = 1e-8  # relative residual of an answer that is differentiated, or its floor
 UNMOVED = 1e-6  # of the largest entry of a probe, up to which one is rounding
 CONTRADICTS = 1e-3  # of the lengths of a change and of a probe: what the two have in common

@@ -19,8 +19,6 @@ from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.solving.many import solve_many
 
-__all__ = ["Step", "shapes", "step"]
-
 NAMES = ("J", "M", "v_free", "mu", "target", "compliance")
 SIZES = (2, 2, 1, 1, 1, 1)  # axes of each that are no batch
 

@@ -13,8 +13,6 @@ from lavender.base.later import sparse as sp
 from lavender.problem import OPERATORS
 from lavender.problem.derived import cached_property
 
-__all__ = ["BODIES", "INPUTS", "MATRICES", "Gradient"]
-
 MATRICES = ("A", "J", "M")
 BODIES = ("jac", "normal", "tangent", "arm_a", "arm_b", "inv_mass", "inv_inertia")
 # What can be differentiated by, and how the problems are given that have it; of `jvp` mu= stands for coefficients, too.

@@ -17,8 +17,6 @@ from lavender.solvers.newton_systems.systems import is_full
 from lavender_ext.derivative.linear import Linear
 from lavender_ext.factor.sparse import SparsePanels, free_part
 
-__all__ = ["SMALL", "System", "prepared"]
-
 SINGULAR = 1e-12  # least pivot over the largest, from which on rows count as repeating others
 SHIFT = 1e-11  # eps of (6)
 TURNS = 8  # of (6): what is 1e-11 of the diagonal is off by 2^-8 then, what is 1e-9 by 1e-16

@@ -12,8 +12,6 @@ from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 from lavender.io.stored import Budget
 
-__all__ = ["ENTRY", "condensed", "most_entries"]
-
 CHUNK = 2**23  # numbers of M^-1 J^T, or of A, held dense at a time: 64 MiB
 ENTRY = 16  # bytes of an entry of a sparse matrix: number and index
 

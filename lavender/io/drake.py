@@ -30,8 +30,6 @@ from lavender.io.pinocchio import closing_speed, told
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-__all__ = ["from_drake", "impulse"]
-
 REACH = 4.0  # steps at the present speed within which a joint limit may push
 UNSEEN = 1e-6  # -, of |A| |v+ - v*| + |J|^T |lambda| in SAP's own norm: above what its tolerance leaves of its momentum
 

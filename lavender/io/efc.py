@@ -26,8 +26,6 @@ from lavender.problem.batch import Batch, check_errors
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["Imported", "from_efc", "from_mujoco_many"]
-
 EQUALITY, FRICTION, ELLIPTIC = 0, (1, 2), 7  # numbers of mjtConstraint; all others push only
 # What is read of each row, beside efc_J, and of each contact: type and shape.
 OF_ROWS: dict[str, Any] = dict.fromkeys(

@@ -30,8 +30,6 @@ from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 
-__all__ = ["Contents", "contents", "read", "read_contents", "write", "write_contents"]
-
 LOCAL, GLOBAL = "fclib_local", "fclib_global"
 ROLLING = "_rolling"  # behind either
 ROLLING_ROWS = 5  # normal, two tangents, two that roll

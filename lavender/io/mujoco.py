@@ -61,8 +61,6 @@ from lavender.problem.operators import USUAL
 from lavender_ext.core.generalized import lower_of_dense
 from lavender_ext.generalized import export
 
-__all__ = ["acceleration", "from_mujoco", "impulse", "jacobian", "scaling"]
-
 ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
 SAME = 1e-9  # -, R D - 1
 SUMMED = (

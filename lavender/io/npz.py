@@ -32,8 +32,6 @@ from lavender.problem.cones import Cones, kinds_of
 from lavender.problem.generalized import Generalized
 from lavender.problem.rows import Rows
 
-__all__ = ["VERSION", "Archive", "read", "write"]
-
 VERSION = 1
 MAX_HEADER = 10_000  # bytes of a .npy header: 100 are usual
 MAX_ENTRIES = 1000  # of an archive: a problem has at most 30

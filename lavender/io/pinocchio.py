@@ -26,8 +26,6 @@ from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.problem import Problem
 from lavender.problem.cones import Cones
 
-__all__ = ["from_pinocchio"]
-
 OTHER_MODEL = "A model was changed, or the data are of another one: give data made from this model"
 UNIT = 1e-6  # -, by which quaternions may be off: J of another is no velocity's
 UNSEEN = 1e-9  # -, of |M| |a| + |tau - h|: M a must be what aba solved for
@@ -280,5 +278,5 @@ def _constraint(model: Any, data: Any, n: int, dt: float, correction: float) -> 
 
 
 def closing_speed(gap: Any, dt: float, correction: float) -> Any:
-    # What is apart may come as near as it is in one step; what is too near moves apart by a share.
+    """What is apart may come as near as it is in one step; what is too near moves apart by a share."""
     return -np.where(gap > 0.0, 1.0, correction) * gap / dt

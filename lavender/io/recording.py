@@ -22,8 +22,6 @@ from lavender.io.stored import ENGINE, as_path, first_bytes, folder_for_steps, w
 from lavender.judge.residuals import AT_FLOOR, EARLY, ENOUGH, WRONG, residual
 from lavender.problem import PRECISIONS, Problem
 
-__all__ = ["Recording", "record", "record_file"]
-
 CONTROLS = ("zero", "random")
 Control = str | Callable[[Any, Any, int], Any] | Any
 

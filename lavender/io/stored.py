@@ -23,8 +23,6 @@ from lavender.base.arrays import FloatArray, flag, whole_number
 from lavender.base.errors import InputError
 from lavender.problem import Problem
 
-__all__ = ["MAX_BYTES", "SUFFIXES", "Stored", "folder_for_steps"]
-
 HDF5 = (".hdf5", ".h5", ".hdf")
 SUFFIXES = (".npz", *HDF5)  # of problem files
 ENGINE = "engine.jsonl"  # beside recorded problems: what the engine itself said of each

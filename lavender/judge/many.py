@@ -22,8 +22,6 @@ from lavender.problem.batch import Batch, check_errors
 from lavender.problem.derived import cached_property
 from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
 
-__all__ = ["Many", "Residuals", "given_problems", "of_each", "residual_many"]
-
 DONE_ALL = -1  # of `Hand`: there are no more worlds
 
 

@@ -49,8 +49,6 @@ from lavender.base.errors import InputError
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender_ext.judge import measure
 
-__all__ = ["Residual", "Rounding", "nothing_to_do", "residual"]
-
 FLOOR_MOST = 1e-5  # relative residual above which `at_floor` takes no floor of float64 for a reason
 AT_REST = 1e-9  # m/s, V0 below which doing nothing counts as a solution
 UNIT32 = 2.0**-24  # u of float32: half its spacing at 1

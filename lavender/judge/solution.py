@@ -19,8 +19,6 @@ from lavender.problem import Problem
 if TYPE_CHECKING:
     from lavender.judge.states import State, States
 
-__all__ = ["Claim", "History", "Solution", "SolverRun", "Status", "Turn", "counted"]
-
 
 class Status(str, Enum):
     """The solver's claim about how a solve ended; the value is its meaning in words."""

@@ -16,8 +16,6 @@ from lavender.judge.residuals import Residual, reference
 from lavender.problem import Problem
 from lavender_ext.derivative.linear import CASES, Linear, Linears
 
-__all__ = ["State", "States", "linear_of"]
-
 NAMES = ("open", "closed", "sticks", "slides", "free", "at a bound", "at a bound")  # by the kernels' numbers
 assert tuple(CASES.values()) == tuple(range(len(NAMES)))
 

@@ -40,8 +40,6 @@ from lavender.lab.worlds import ENGINES, Runs, fields_of, frames, states_of
 from lavender.problem import PRECISIONS, Problem
 from lavender.problem.batch import Batch
 
-__all__ = ["Audit", "Worst", "audit"]
-
 VERDICTS = (AT_FLOOR, CLOSE, EARLY, WRONG, "not finite")
 NUMBERS = ("velocity", "impulse", "relative", "floor")  # m/s, N s, -, - of the worst row
 QUANTILES = (0.5, 0.9, 0.99, 0.999, 1.0)

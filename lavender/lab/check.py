@@ -26,8 +26,6 @@ from lavender.problem import Problem, check_problem
 from lavender.solvers.registry import available, get, known, specs
 from lavender.solving.solve import solve
 
-__all__ = ["REFERENCES", "CrossCheck", "CrossCheckRow", "cross_check", "distance"]
-
 REFERENCES = ("osqp", "clarabel", "piqp", "direct")
 CONE_REFERENCES = ("clarabel_cone", "block_gauss_seidel")  # of relaxed friction, which is no QP
 REFERENCE_TOL = 1e-9  # relative residual that a reference must reach, or 10 times the floor
@@ -261,6 +259,7 @@ def _reference(
 
 
 def compare(problem: Problem, name: str, solution: Solution, optimum: Solution | None) -> CrossCheckRow:
+    """A row of one solver's solution beside the optimum."""
     r = solution.residual
     note = "; ".join(
         x for x in (solution.solver.form and f"{solution.solver.form} form", solution.message) if x

@@ -31,22 +31,6 @@ from lavender.lab.proof import prove
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
-__all__ = [
-    "MANIFEST",
-    "RECORDED",
-    "Entry",
-    "certified",
-    "changed",
-    "difficulty",
-    "entries",
-    "hidden",
-    "load",
-    "makeable",
-    "page",
-    "save",
-    "told",
-]
-
 MANIFEST = Path(__file__).with_name("manifest.json")
 RECORDED = MANIFEST.with_name("recorded.json")  # of files of other projects, which are not part of this one
 SEARCHED = 60  # rows under Coulomb's law up to which other motions are looked for

@@ -27,8 +27,6 @@ from lavender.problem.operators import semidefinite
 from lavender.problem.ordering import rows_of_each
 from lavender_ext.pivot.direct import Pivoting
 
-__all__ = ["Redundancy", "redundancy"]
-
 DENSE = 1200  # rows of an island up to which it is decomposed as a dense matrix
 # Larger islands: LDL^T of A + SHIFT D. A zero pivot becomes at most rows SHIFT d: ten times that counts as zero.
 SHIFT = 1e-13

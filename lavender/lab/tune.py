@@ -41,8 +41,6 @@ from lavender.lab.report.text import seconds, size, times
 from lavender.lab.worlds import Runs, flew_apart, states_of
 from lavender.problem.derived import cached_property
 
-__all__ = ["Measured", "Setting", "Stage", "Tuning", "around", "grid", "tune"]
-
 WORST = 0.99  # quantile of the error by which settings are compared
 EQUAL = 0.05  # share of a time by which two may differ and be called equal: noise is a few per cent
 SLOW = 2.0  # times the time now, above which a setting is timed no more

@@ -23,8 +23,6 @@ from lavender.io.efc import from_efc
 from lavender.io.recording import Control, control_of, drive_of, model_of
 from lavender.problem.batch import Batch
 
-__all__ = ["ENGINES", "Frame", "Runs", "fields_of", "frames", "states_of"]
-
 ENGINES = ("mujoco", "mjx", "mujoco_warp")
 FIELDS = ("qpos", "qvel", "act", "ctrl", "qacc_warmstart")  # what a step is made of
 KIND = {0: "equality", 1: "friction loss", 2: "friction loss", 3: "limit of a joint", 4: "limit of a tendon"}

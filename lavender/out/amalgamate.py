@@ -11,8 +11,6 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FRONT", "MODULES", "CutFailed", "amalgamate", "source_hash"]
-
 HERE = Path(__file__).resolve().parent
 CUT: dict[str, Any] = runpy.run_path(str(HERE.parent / "sim" / "web" / "cut.py"))
 CutFailed: type[Exception] = CUT["CutFailed"]

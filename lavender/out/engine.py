@@ -6,8 +6,6 @@ import numpy as np
 
 from lavender.sim.engine.simulation import Simulation
 
-__all__ = ["engine_image"]
-
 MAGIC = b"LAVIMG1\0"
 
 

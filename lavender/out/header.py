@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["STRUCTS", "constants", "functions", "javascript", "struct_fields"]
-
 STRUCTS = ("lav_problem", "lav_options", "lav_budget", "lav_verdict", "lav_motion", "lav_result")
 
 

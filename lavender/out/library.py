@@ -15,8 +15,6 @@ from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
 from lavender.out.header import functions, javascript
 from lavender.sim.web import compile as wasm
 
-__all__ = ["HEADER", "source", "write"]
-
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 HEADER = HERE / "c" / "lavender.h"

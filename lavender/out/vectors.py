@@ -32,8 +32,6 @@ from lavender.solvers.steps import METHODS as CANDIDATES
 from lavender_ext.core.method import OUTCOMES
 from lavender_ext.driver.driver import Driver
 
-__all__ = ["Step", "driven", "file_of", "made", "pack", "pack_problem", "steps_of"]
-
 MAGIC = b"LAVVEC3\0"
 COUNTED = ("sweeps", "factorisations", "solves")  # what the library counts as iterations
 

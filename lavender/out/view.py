@@ -14,8 +14,6 @@ from lavender.out.library import HEADER
 from lavender.problem import Problem
 from lavender.solvers import registry
 
-__all__ = ["ARRAYS", "METHODS", "NotTaken", "View", "choices", "takes", "view"]
-
 _HEADER = HEADER.read_text(encoding="utf-8")
 #: Arrays in the order of the struct, with what they hold.
 ARRAYS: dict[str, Any] = {

@@ -14,8 +14,6 @@ from lavender.base.arrays import FloatArray, IntArray, as_array
 from lavender.base.errors import InputError
 from lavender.problem.cones import Cones, kinds_of
 
-__all__ = ["arrays_of", "blocks_of", "order_of"]
-
 
 def order_of(findex: Any, count: int | None = None) -> IntArray:
     """(m,) row of the arrays for each row of the problem: every normal, then those that follow it."""

@@ -9,8 +9,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray, as_array, check_sizes
 from lavender.base.errors import InputError, UnknownName
 
-__all__ = ["LEAST_SHARE", "SHAPES", "axes_of", "check_parts", "check_shape", "sides_of", "sizes_of"]
-
 # What bounds two tangents: their norm, or each by itself.
 SHAPES = ("disk", "box")
 # mu_1 = 0 beside mu_2 > 0 stands as this share of mu_2 in a box: its impulses vanish in any sum with those of mu_2.

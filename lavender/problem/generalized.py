@@ -34,8 +34,6 @@ from lavender_ext.core.assemble import dense_to_csr, stacked
 from lavender_ext.core.checks import LEAST, plain
 from lavender_ext.factor.graph import least_degree
 
-__all__ = ["Generalized"]
-
 ASYMMETRY = 1e-12  # -, of sqrt(M_ii M_jj): above any rounding of sums over bodies, below anything meant
 ASYMMETRY32 = 2.0**-16  # the same of an M in float32, of which the lower triangle is taken
 MESH = 400  # velocities from which on the order of trees is looked for: below, a factor costs less than the search

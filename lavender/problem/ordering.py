@@ -32,19 +32,6 @@ from lavender_ext.core.order import (
 )
 from lavender_ext.factor.graph import matrix_components
 
-__all__ = [
-    "ENGINE_ORDERS",
-    "ORDERS",
-    "Order",
-    "block_order",
-    "blocks_of_each",
-    "body_ranks",
-    "colors",
-    "levels",
-    "local_order",
-    "rows_of_each",
-]
-
 # The engine makes its contacts in the order of its bodies; "local" is for problems from elsewhere.
 ENGINE_ORDERS = ("given", "reverse", "symmetric", "random", "colored", "bottom_up", "top_down")
 ORDERS = (*ENGINE_ORDERS, "local")

@@ -45,8 +45,6 @@ from lavender_ext.judge.measure import all_finite, program_residuals
 
 IntpArray = npt.NDArray[np.intp]
 
-__all__ = ["QPSolution", "QuadraticProgram"]
-
 PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding

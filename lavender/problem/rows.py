@@ -22,8 +22,6 @@ from lavender.base.later import sparse as sp
 from lavender.problem.cones import Cones
 from lavender_ext.core import checks
 
-__all__ = ["Rows"]
-
 EXACT = 1e-9  # above rounding of what was normalised in float64
 UNITS = {
     "inv_mass": "1/kg", "inv_inertia": "1/(kg m^2)", "v_free": "m/s, rad/s", "jac": "-", "normal": "-", "tangent": "-",

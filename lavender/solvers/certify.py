@@ -36,8 +36,6 @@ from lavender.solvers.setup_times import loading
 from lavender.solvers.solve_log import SolveLog
 from lavender_ext.core.checks import LEAST, MOST
 
-__all__ = ["Conflict", "certify", "conflict_of", "least_violation"]
-
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
 )

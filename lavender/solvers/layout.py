@@ -17,8 +17,6 @@ from lavender.problem.ordering import Order, body_ranks
 from lavender_ext.core.blocks import Blocks
 from lavender_ext.core.problem import Data
 
-__all__ = ["Layout", "lay_out"]
-
 # Contacts from which the copy pays: their arrays exceed the second-level cache (measured: 1.0 to 1.1 times as
 # fast at 10,000, twice at 100,000).
 LARGE = 8_000

@@ -34,8 +34,6 @@ from lavender.solvers.registry import Solver
 # Of (1) and (2): times that they have the problem's rows, and s of making them for each of those.
 FEW, ROW_TIME = 3.0, 2e-5
 
-__all__ = ["AsRows", "ThroughRows", "as_rows", "count_rows"]
-
 
 @dataclass(frozen=True)
 class AsRows:

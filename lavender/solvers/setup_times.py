@@ -14,23 +14,6 @@ from lavender.problem import Problem
 from lavender.solvers.registry import SMALL_ROWS
 from lavender_ext.factor.sparse import bandwidth
 
-__all__ = [
-    "analysed",
-    "compared",
-    "dense_work",
-    "factored",
-    "first_factor",
-    "forming",
-    "loading",
-    "ordered",
-    "over_bodies",
-    "over_rows",
-    "over_velocities",
-    "sparse_work",
-    "summed",
-    "sweeping",
-]
-
 START = 5e-5  # s, of each
 EACH, FORMED, PRODUCT = 1.2e-7, 1.2e-8, 2.5e-9  # of A: each row and entry of bodies, each product of J and M
 # s for each entry of A: laid out for a factor by Python, all of them at once where there are no others; row sums.

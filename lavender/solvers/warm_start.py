@@ -18,8 +18,6 @@ from lavender_ext.warm.start import (
     from_guess,
 )
 
-__all__ = ["claim_of", "warm_start"]
-
 NOTHING = UNDECIDED, 0, 0
 
 #: How the kernel says that it ended; None where nothing was decided.

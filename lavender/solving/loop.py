@@ -22,8 +22,6 @@ from lavender.solvers.registry import Solver, State
 from lavender.solving.outcome import MAX_ITERATIONS, NUMERICAL_ERROR, STALLED, TIME_LIMIT
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["INTERRUPTED", "LEAST", "Callback", "Loop", "Record", "best_of"]
-
 LEAST = 1e-6  # s, what is left of a limit for a solver that is called at all
 SHARE = 0.7  # of what is left, for a chunk at the pace of the last
 FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows

@@ -15,8 +15,6 @@ from lavender.solvers.auto import Stage, Tree, words
 from lavender.solvers.registry import get
 from lavender.solvers.small import who
 
-__all__ = ["Plan", "explain"]
-
 LINES = 6  # of the tree, that are told: then the work is doubled
 
 

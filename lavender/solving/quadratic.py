@@ -27,8 +27,6 @@ from lavender.solvers.registry import SMALL_ROWS, get
 from lavender.solvers.solve_log import SolveLog
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
-__all__ = ["solve_qp"]
-
 STEPS = 50  # proximal steps
 SLOW = 0.1  # where a step leaves more than this of the error, the next has
 SOFTER = 0.1  # this share of D, as long as

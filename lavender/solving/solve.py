@@ -40,8 +40,6 @@ from lavender.solving.outcome import (
 )
 from lavender_ext.judge.measure import all_finite
 
-__all__ = ["Prepared", "prepare", "solve"]
-
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
          "contradicted", "sweeps_per_decade", "turns")  # fmt: skip
 COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of its limit

@@ -11,8 +11,6 @@ import subprocess
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["Lines"]
-
 
 class Lines:
     """`ask` it, and `end` it; OSError where the system does not start it."""

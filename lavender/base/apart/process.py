@@ -19,8 +19,6 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import IO, Any
 
-__all__ = ["Ended", "Process"]
-
 START_TIME = 60.0  # s, to import everything on a loaded machine
 WORDS = 2**20  # bytes of the words of one answer
 PIECE = 2**20  # bytes read at once

@@ -13,8 +13,6 @@ import time
 from collections.abc import Callable
 from typing import IO, Any
 
-__all__ = ["answer", "begin", "limit_cpu", "receive", "serve"]
-
 WORDS = 500  # characters of an error
 Handler = Callable[[Any], tuple[dict[str, Any], bytes] | None]
 

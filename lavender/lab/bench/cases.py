@@ -26,8 +26,6 @@ from lavender.lab.suspicions import diagnose
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-__all__ = ["Item", "describe", "is_path", "resolve", "sequence", "steps_in", "structure_of"]
-
 RANK_ROWS = 300  # rows up to which the rank of A is computed, a fraction of a second
 SINGULAR = 1e-12  # of the largest singular value: far below any condition number met in practice
 MANIFOLD = 8  # blocks between one pair of bodies, at most

@@ -21,8 +21,6 @@ from lavender.solvers.registry import get, known, specs
 from lavender.solving.solve import solve
 from lavender_ext.sweep import serial
 
-__all__ = ["HASHES", "examine", "self_test"]
-
 #: Hash of what each part of the self-test made, on any machine: starts are exact numbers, kernels round alike.
 HASHES = {
     "pgs, coulomb": "4d51c4d5ba92212c",
@@ -97,6 +95,7 @@ def version_of(solver: str) -> str:
 
 
 def steps_of(scene: str, n: int) -> Any:
+    """Positions of all bodies after n steps of a scene."""
     simulation = Simulation(scene)
     for _ in range(n):
         positions = simulation.step()[0]["positions"]

@@ -7,8 +7,6 @@ from typing import Any
 from lavender.lab.bench.record import Record, level_name
 from lavender.solvers import registry
 
-__all__ = ["asked_of", "code_of", "needs_more"]
-
 COLD = "dataclasses.replace({}, guess=None)"  # a problem without the start that came with it
 CARRIED = (
     "before, impulse = problems[0], None",

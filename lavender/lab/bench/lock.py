@@ -18,8 +18,6 @@ from typing import Any
 from lavender.base.errors import InputError
 from lavender.lab.bench.record import printable
 
-__all__ = ["Lock"]
-
 TRIES = 100  # a holder that leaves takes its file with it; so often in a row nobody leaves
 HEAD = 64  # bytes left free for Windows, where a locked byte cannot be read
 _held: set[tuple[int, int]] = set()  # locks of POSIX are of a process: within one, this set

@@ -20,19 +20,6 @@ from typing import Any
 from lavender._version import __version__
 from lavender.lab.bench.record import Run
 
-__all__ = [
-    "build_facts",
-    "build_of",
-    "clock",
-    "cpu_name",
-    "describe",
-    "load",
-    "memory",
-    "memory_share",
-    "running",
-    "versions",
-]
-
 SHARE = 0.5  # of the machine's memory, which the processes of backends may take together
 LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
 

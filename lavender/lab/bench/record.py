@@ -9,24 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-__all__ = [
-    "KINDS",
-    "CaseInfo",
-    "Done",
-    "Entry",
-    "Record",
-    "Run",
-    "Skip",
-    "asked_of",
-    "file_name",
-    "from_json",
-    "level_name",
-    "plain",
-    "printable",
-    "to_json",
-    "values_in",
-]
-
 # Beside the statuses of a solve: what can happen to a run that brings no solution back.
 ERROR, KILLED, CRASHED = "ERROR", "KILLED", "CRASHED"
 

@@ -22,8 +22,6 @@ from lavender.io.stored import MAX_BYTES, as_path, destination, write_atomically
 from lavender.lab.bench.lock import Lock
 from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 
-__all__ = ["Records", "Store", "opened", "read", "write_csv", "write_json"]
-
 MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
 BLOCK = 2**16  # bytes that are looked through at once for the end of a line
 SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none

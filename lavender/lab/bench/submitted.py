@@ -22,8 +22,6 @@ from lavender.lab.bench.running.runner import run
 from lavender.lab.bench.store import Records
 from lavender.solvers.registry import known
 
-__all__ = ["Submission", "Verified", "verdict_of", "verify"]
-
 SAME = 2.0  # residuals of a budget: other BLAS kernels change their last digits, another method changes much more
 ROUNDED = 10.0  # floors, below which two residuals are rounding both
 

@@ -41,8 +41,6 @@ from lavender.lab.motion.operator import Operator, Size, U
 from lavender.problem import Problem
 from lavender_ext.judge import measure
 
-__all__ = ["Witness", "difference", "witness"]
-
 
 @dataclass(frozen=True, eq=False)
 class Witness:

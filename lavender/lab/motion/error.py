@@ -23,8 +23,6 @@ NUMBERS = (
     "kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved",
 )  # fmt: skip
 
-__all__ = ["MotionError", "measure", "told"]
-
 
 @dataclass(frozen=True, eq=False)
 class MotionError:

@@ -20,8 +20,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.problem import Problem
 
-__all__ = ["CONTACTS", "enumerated"]
-
 CONTACTS = 8
 MOST = 4**CONTACTS  # modes
 AT_ONCE = 4096  # systems in memory

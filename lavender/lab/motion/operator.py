@@ -20,8 +20,6 @@ from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.problem import Problem
 
-__all__ = ["Operator", "Size", "make"]
-
 U = 2.0**-53
 SHIFT = (
     1e-12  # -, of the largest eigenvalue of an inverse inertia: by what rounding may have made one negative

@@ -16,8 +16,6 @@ from lavender.lab.motion.bound import Witness, witness
 from lavender.problem import Problem
 from lavender.solving.solve import solve
 
-__all__ = ["Reference", "adopt", "reference"]
-
 SOLVER = "auto"
 ASKED = 1e-15  # relative residual asked of it: it stops at the floor by itself
 ACCEPTED = 1e-10  # relative residual that makes a reference, as does the floor

@@ -30,18 +30,6 @@ from lavender.problem.cones import project
 from lavender.solvers.registry import available, get
 from lavender.solving.solve import solve
 
-__all__ = [
-    "CHOICES",
-    "Motion",
-    "Motions",
-    "Pick",
-    "branch",
-    "motion_error",
-    "motions",
-    "motions_of",
-    "nearest",
-]
-
 RUNS = 12  # of a search, after `auto` itself
 SOLVERS = ("anderson", "newton", "sequential_impulses", "block_gauss_seidel", "admm", "nncg")
 ORDERS = ("given", "reverse", "random")

@@ -16,8 +16,6 @@ from lavender.io.stored import writable, write_bytes
 from lavender.lab.motion.reference import Reference, judged, kept, reference
 from lavender.problem import Problem
 
-__all__ = ["SUFFIX", "load_reference", "save_reference"]
-
 SUFFIX = ".reference"
 
 

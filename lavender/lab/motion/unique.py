@@ -51,8 +51,6 @@ from lavender.problem import Problem
 from lavender.problem.cones import Cones
 from lavender.problem.ordering import rows_of_each
 
-__all__ = ["Uniqueness", "uniqueness"]
-
 LARGEST = 600  # rows of an island up to which (1) is looked for, dense
 UNCOUPLED = 1e-14  # of sqrt(d_t d_n): A_tn that is nothing but rounding
 MARGIN = 1e-6  # of (1) and (3), for rounding of eigenvalues

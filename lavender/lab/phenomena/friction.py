@@ -11,8 +11,6 @@ import numpy as np
 from lavender.lab.phenomena.parts import GRAVITY, Parameter, Phenomenon, Quantity, Track, Values, crossing
 from lavender.sim.scene import Scene
 
-__all__ = ["FRICTION"]
-
 MU = Parameter(0.5, 0.05, 2.0, "coefficient of friction [-]")
 SPEED = Parameter(3.0, 0.1, 10.0, "of the start [m/s]")
 SIZE = (1.0, 1.0, 0.2)  # m, of the block: low, so that it cannot tip below friction 5

@@ -14,8 +14,6 @@ from lavender.lab.phenomena.truths import flip_period, pendulum_period
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 
-__all__ = ["JOINTS"]
-
 ROD = (0.1, 0.1, 1.0)  # m
 BLOCK = (0.2, 0.6, 1.0)  # m, of the free body
 TURNS = 3  # periods of it
@@ -38,6 +36,7 @@ def _pendulum(p: Values, more: Mapping[str, Any]) -> Scene:
 
 
 def period_of(p: Values) -> float:
+    """Of a rod on a hinge, from its angle at rest [s]."""
     about = (ROD[0] ** 2 + ROD[2] ** 2) / 12 + ROD[2] ** 2 / 4
     return pendulum_period(about, 0.5 * GRAVITY * ROD[2], p["angle"])
 
@@ -64,15 +63,18 @@ def _free(p: Values, more: Mapping[str, Any]) -> Scene:
 
 
 def spin_of(p: Values) -> tuple[float, float, float]:
+    """First angular velocity of the free body."""
     return (p["aside"] * p["spin"], p["spin"], 0.0)
 
 
 def moments_of_inertia() -> FloatArray:
+    """Of the free body, of mass 1, about its axes."""
     x, y, z = (s * s for s in BLOCK)
     return np.array([y + z, x + z, x + y]) / 12.0
 
 
 def flip_of(p: Values) -> float:
+    """Period in which the free body turns over and back [s]."""
     return flip_period(moments_of_inertia(), np.array(spin_of(p)))
 
 

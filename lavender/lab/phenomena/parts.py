@@ -12,8 +12,6 @@ from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.errors import InputError, UnknownName
 from lavender.sim.scene import Scene
 
-__all__ = ["GRAVITY", "Parameter", "Phenomenon", "Quantity", "Record", "Track", "crossing"]
-
 GRAVITY = 9.81  # m/s^2
 Values = Mapping[str, float]
 

@@ -17,8 +17,6 @@ from lavender.lab.phenomena.parts import Phenomenon, Record, Track, judged
 from lavender.lab.phenomena.stacks import STACKS
 from lavender.sim.scene import Scene
 
-__all__ = ["PHENOMENA", "chosen", "run", "ways"]
-
 #: Name -> phenomenon, in the order of the table.
 PHENOMENA: dict[str, Phenomenon] = {p.name: p for p in (*FRICTION, *JOINTS, *STACKS)}
 MODULE = "lavender.lab.phenomena.engines.served"

@@ -13,8 +13,6 @@ from lavender.lab.phenomena.truths import thinnest_arch, tipping_time
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import quaternion
 
-__all__ = ["STACKS"]
-
 TIPPED = 0.5  # rad
 BRICK = (1.0, 0.5, 0.25)  # m
 FELL = 0.1  # m

@@ -9,8 +9,6 @@ from lavender.lab.phenomena.engines import WAYS
 from lavender.lab.phenomena.parts import Phenomenon, Record
 from lavender.lab.phenomena.running import PHENOMENA
 
-__all__ = ["described", "line", "losses", "notes", "table"]
-
 
 def _number(x: float, unit: str) -> str:
     if math.isinf(x):

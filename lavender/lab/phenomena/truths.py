@@ -9,8 +9,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.parts import GRAVITY
 
-__all__ = ["arch_thrust", "elliptic", "flip_period", "pendulum_period", "thinnest_arch", "tipping_time"]
-
 
 def elliptic(k2: float) -> float:
     """Complete elliptic integral K of modulus k, k^2 given: pi/2 over the arithmetic-geometric mean of 1 and k'.

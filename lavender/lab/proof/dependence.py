@@ -12,8 +12,6 @@ from lavender.base.later import lapack
 from lavender.base.later import sparse as sp
 from lavender.base.lu import sparse_lu
 
-__all__ = ["EXACT", "PRIME", "Tangled", "dependencies", "pivots"]
-
 
 class Tangled(Exception):
     """Rows that depend on each other, too many to tell from rounding."""

@@ -23,8 +23,6 @@ from lavender.base.lu import sparse_lu
 from lavender.lab.proof.numbers import UNIT, largest, upper_end
 from lavender.lab.proof.operator import DENSE, Part, Rounded, wider
 
-__all__ = ["EXTENT", "PRECISE", "BallInverse", "FloatInverse", "Island", "NoZero", "Sticks"]
-
 PRECISE = 200  # unknowns up to which an inverse in more than float64 is tried
 
 PORTION = 4_000_000  # numbers of the inverse that are held at once

@@ -10,19 +10,6 @@ import numpy as np
 
 from lavender.base.errors import SolverUnavailable
 
-__all__ = [
-    "UNIT",
-    "Balls",
-    "Rationals",
-    "balls",
-    "largest",
-    "matrix",
-    "sign_of",
-    "squared",
-    "times",
-    "upper_end",
-]
-
 UNIT = 2.0**-53
 
 

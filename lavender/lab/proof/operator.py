@@ -14,8 +14,6 @@ from lavender.lab.proof.numbers import UNIT, Balls, matrix, times, upper_end
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-__all__ = ["DENSE", "LARGEST", "Operator", "Part", "Rounded", "wider"]
-
 LARGEST = 2000  # coupled unknowns of J and M, whose M^-1 is dense, in balls: a minute, 0.3 GB
 
 SMALL = 64  # rows up to which A is dense balls

@@ -17,8 +17,6 @@ from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, squared,
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 
-__all__ = ["NAMED", "RATIONAL", "ROUNDS", "SMALL", "Enclosure", "Search"]
-
 RATIONAL = 100  # unknowns up to which borders are decided in rational numbers, where nothing slides
 
 NAMED = 2000  # unknowns up to which a singular direction is looked for

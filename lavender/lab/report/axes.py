@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from lavender.lab.bench.record import level_name
 from lavender.lab.report.curves import Curve, Figure
 
-__all__ = ["Axis", "Shown", "shown"]
-
 LEAST_DECADES = 1.0  # a logarithmic axis spans so much, at least
 UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))
 

@@ -18,8 +18,6 @@ from lavender.lab.report.tables import Advice
 from lavender.lab.report.tables.finals import Final, in_time, lines
 from lavender.solvers.registry import specs
 
-__all__ = ["QUICKER", "Subject", "contenders", "subjects", "time_lines"]
-
 NEAR = 1.6  # times the best's, within which a rerun may put another first
 MOST = 4  # solvers for a level, and for a time
 SHARES = (0.5, 0.8)  # of a time that a time limit asks for: set-up and judge take the rest

@@ -20,31 +20,6 @@ from lavender.lab.report.table import WORDS, Cell, Table
 from lavender.lab.report.tables import Advice, Line
 from lavender.lab.report.text import NONE, count, percent, residual, seconds, share, times, who, without
 
-__all__ = [
-    "DIFFICULTY",
-    "Section",
-    "advice_table",
-    "backend_table",
-    "case_table",
-    "change_table",
-    "claim_table",
-    "difficulty_table",
-    "engine_table",
-    "failure_table",
-    "idle_table",
-    "mean_table",
-    "moved_table",
-    "pass_table",
-    "reach_table",
-    "robustness_table",
-    "sections",
-    "short_table",
-    "skip_table",
-    "speed_table",
-    "spread_table",
-    "sweeps_table",
-]
-
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")
 SHOWN_TIES = 2

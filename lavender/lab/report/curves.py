@@ -14,18 +14,6 @@ from lavender.lab.report import tables
 from lavender.lab.report.moved import by_speed, speed_levels
 from lavender.lab.report.text import count, who
 
-__all__ = [
-    "Curve",
-    "Figure",
-    "Figures",
-    "budget_figure",
-    "figures",
-    "overall_figure",
-    "pass_figure",
-    "profile_figure",
-    "work_precision",
-]
-
 TINY = 1e-17  # where a residual of exactly zero is drawn
 
 

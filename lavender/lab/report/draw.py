@@ -13,9 +13,6 @@ from lavender.lab.report.axes import shown
 from lavender.lab.report.curves import Figure
 from lavender.lab.report.style import Look
 
-__all__ = ["matplotlib_figure", "matplotlib_panels", "save"]
-
-
 COLUMNS = 3  # of a legend over the axes
 MANY = 60  # points of a curve, above which marks would cover it
 

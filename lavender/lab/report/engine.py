@@ -19,8 +19,6 @@ from lavender.judge.residuals import AT_FLOOR, EARLY, WRONG
 from lavender.lab.bench.record import Record, printable
 from lavender.lab.bench.store import Records
 
-__all__ = ["Contestant", "contestants"]
-
 _NUMBERS = ("rows", "seconds", "relative")
 
 

@@ -14,8 +14,6 @@ from lavender.lab.report.text import count
 from lavender.lab.report.verdict import Verdict, verdict
 from lavender.problem.derived import cached_property
 
-__all__ = ["Report"]
-
 
 @dataclass(frozen=True, eq=False)
 class Report:

@@ -8,8 +8,6 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.table import markdown, plain
 from lavender.lab.report.text import left_out
 
-__all__ = ["summary"]
-
 
 def summary(report: Report) -> str:
     """Markdown: recommendations, then every case and solver, then what failed."""

@@ -8,15 +8,6 @@ from dataclasses import dataclass, replace
 from lavender.lab.bench.record import Record, level_name
 from lavender.lab.bench.store import Records
 
-__all__ = [
-    "Idle",
-    "by_speed",
-    "idle",
-    "speed_levels",
-    "speed_name",
-    "working",
-]
-
 USUAL = (1e-2, 1e-3)  # m/s, where the plan names none
 
 

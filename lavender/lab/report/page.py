@@ -17,8 +17,6 @@ from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import count, left_out, residual, seconds, suspicions, without
 from lavender.lab.report.verdict import Verdict
 
-__all__ = ["page"]
-
 MOST = 500  # failures on a page, for its weight: 200 problems are to fit into 3 MB
 MOST_SPREADS = 100  # widest spreads of sweep orders on a page
 

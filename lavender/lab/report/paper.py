@@ -31,8 +31,6 @@ from lavender.lab.report.table import Cell, Table, latex, tex
 from lavender.lab.report.tables.advice import NOISE
 from lavender.lab.report.text import count, seconds, without
 
-__all__ = ["write_paper"]
-
 INCH = (5.5, 3.4)  # of a figure: a page's width of text
 
 

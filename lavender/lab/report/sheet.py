@@ -21,8 +21,6 @@ from lavender.lab.report.table import Table, print_table
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Part", "Sheet"]
-
 
 @dataclass(frozen=True)
 class Part:

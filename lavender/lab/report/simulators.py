@@ -10,8 +10,6 @@ import numpy as np
 from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
 from lavender.lab.report.table import Table, markdown
 
-__all__ = ["table", "warm_table"]
-
 S = TypeVar("S", bound=WarmStep)
 OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
 CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows

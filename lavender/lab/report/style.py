@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-__all__ = ["Look", "looks"]
-
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D31", "#7F7F7F")
 LINES = ("-", "--", ":", "-.")  # dashes and marks of matplotlib
 MARKERS = ("o", "s", "^", "D", "X", "*", "v")

@@ -14,8 +14,6 @@ from html import escape
 from lavender.lab.report.axes import Axis, shown
 from lavender.lab.report.curves import Curve, Figure
 
-__all__ = ["svg"]
-
 WIDTH, HEIGHT = 1000, 640  # units, twice the pixels of a phone's width
 LEFT, RIGHT, TOP, BOTTOM = 118, 256, 62, 92  # margins: labels of the axis; names at the ends of curves
 GAP = 30  # units between two names, at least

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Cell", "Table", "latex", "markdown", "print_table", "tex"]
-
 #: Heads of columns that hold words; what stands under any other is a number.
 WORDS = frozenset({
     "case", "solver", "status", "claim", "form", "structure", "law", "change", "asked", "hardest", "sequence",

@@ -18,8 +18,6 @@ from lavender.lab.report.text import count, left_out, residual, suspicions
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["print_report"]
-
 LINES = 25  # of a report in short, with those that a command adds
 ADDED = 5  # of them: a blank one, where the page is, what was reused, what a paper has, what did not load
 MOST = 20  # notes of a kind, where all is printed

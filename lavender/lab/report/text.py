@@ -6,11 +6,6 @@ import math
 
 from lavender.lab.bench.store import Records
 
-__all__ = [
-    "NONE", "count", "left_out", "percent", "residual", "seconds", "share", "size", "suspicions", "times", "who",
-    "without",
-]  # fmt: skip
-
 NONE = "–"  # where there is no number
 
 

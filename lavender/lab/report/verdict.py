@@ -22,8 +22,6 @@ from lavender.lab.report.text import times as times_of
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
 
-__all__ = ["Told", "Verdict", "verdict"]
-
 SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
 
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from lavender.lab.report.curves import Figures
     from lavender.lab.report.findings import Report
 
-__all__ = ["write"]
-
 
 def write(found: Records | Report, folder: str | Path, *, figures: bool = True) -> Path:
     """Write `records.csv`, `records.json`, `figures/*.svg`, `figures/*.png`, `summary.md` and `index.html`.

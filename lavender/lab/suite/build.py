@@ -14,21 +14,6 @@ from lavender.base.errors import InputError
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-__all__ = [
-    "GRAVITY",
-    "STEP",
-    "Bodies",
-    "Contacts",
-    "contact_problem",
-    "each",
-    "joint_problem",
-    "manifold",
-    "sideways",
-    "static_loads",
-    "tenfold",
-    "tower",
-]
-
 GRAVITY = 9.81  # m/s^2, along -z
 STEP = 0.01  # s
 FALL = GRAVITY * STEP  # m/s, speed that one step of gravity adds

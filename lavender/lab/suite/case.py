@@ -15,8 +15,6 @@ from lavender.base.errors import InputError, UnknownName
 from lavender.problem import Problem
 from lavender.problem.derived import cached_property
 
-__all__ = ["Case", "Draft", "Reference", "family", "parse"]
-
 P = ParamSpec("P")
 MAX_SIZE = 10**7  # of a whole-number parameter: larger ones are typing errors that would fill the memory
 
@@ -73,6 +71,7 @@ class Family:
     summary: str
 
     def case(self, **given: Any) -> Case:
+        """The case of these parameters; the others take their defaults."""
         known = [name for name in self.signature.parameters if name not in self.preset]
         for name in given:
             if name not in known:

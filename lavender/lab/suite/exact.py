@@ -23,8 +23,6 @@ from lavender.base.lu import sparse_lu
 from lavender.problem import Problem
 from lavender_ext.core.checks import LEAST
 
-__all__ = ["Wide", "at_rest", "solve_boxed", "solve_linear"]
-
 SPLIT = 2.0**27 + 1.0
 DENSE_ROWS = 2000  # up to here singular rows are found by a singular value decomposition
 MAX_STEPS = 40

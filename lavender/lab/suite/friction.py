@@ -238,15 +238,3 @@ def card_house(levels: int = 3, mu: float = 0.7) -> Draft:
     a, b, point, normal = zip(*contacts, strict=True)
     problem = contact_problem(bodies, Contacts(np.stack([a, b], 1), point, normal), "coulomb", mu)
     return Draft(problem, "stands by friction only, over several levels", rest_reference(problem), EXACT)
-
-
-__all__ = [
-    "anisotropic",
-    "arch",
-    "card_house",
-    "painleve",
-    "painleve_solutions",
-    "ramp",
-    "slider",
-    "threshold",
-]

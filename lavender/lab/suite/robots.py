@@ -11,8 +11,6 @@ import numpy as np
 from lavender.base.errors import SolverUnavailable, UnknownName
 from lavender.lab.suite.case import Draft, family, parse
 
-__all__ = ["LICENCES", "missing", "package_of", "robot", "versions"]
-
 #: Licence of each package's models.
 LICENCES = {"gymnasium": "MIT", "dm_control": "Apache-2.0"}
 FOLDERS = {"gymnasium": "envs/mujoco/assets", "dm_control": "suite"}

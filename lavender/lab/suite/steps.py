@@ -11,8 +11,6 @@ from lavender.lab.suite.case import Draft, family
 from lavender.lab.suite.families import at_least, positive, product
 from lavender.problem import Problem
 
-__all__ = ["engine_step", "walking"]
-
 GRAVITY = 9.81  # m/s^2
 
 

@@ -13,14 +13,13 @@ from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.solvers.certify import conflict_of
 
-__all__ = ["CHECKS", "conflict", "wrong_impulses"]
-
 MU = 10.0  # -, beyond any pair of materials
 CONFLICT = 1000  # rows up to which a proof is asked for that there is no solution
 CONFLICT_TOL = 1e-6  # relative residual that it rules out
 
 
 def friction(p: Problem) -> Iterator[Suspicion]:
+    """Coefficients beyond those of materials."""
     c = p.cones
     mu = c.coefficients.max(axis=1)
     wild = np.flatnonzero(mu > MU)
@@ -30,6 +29,7 @@ def friction(p: Problem) -> Iterator[Suspicion]:
 
 
 def keys(p: Problem) -> Iterator[Suspicion]:
+    """Keys that stand more than once."""
     if p.key is None:
         return
     values, first, count = np.unique(p.key, return_index=True, return_counts=True)
@@ -41,6 +41,7 @@ def keys(p: Problem) -> Iterator[Suspicion]:
 
 
 def order_of_rows(p: Problem) -> Iterator[Suspicion]:
+    """Rows of contacts that do not stand as normal, tangent, tangent."""
     c = p.cones
     full = np.flatnonzero(c.n_tangents == 2)
     if p.rows is not None or len(full) < 2:
@@ -75,7 +76,7 @@ def order_of_rows(p: Problem) -> Iterator[Suspicion]:
 
 
 def twins(p: Problem) -> Iterator[Suspicion]:
-    # Blocks of the same rows, or of opposed ones that cannot both hold.
+    """Blocks of the same rows, or of opposed ones that cannot both hold."""
     c = p.cones
     contacts = np.flatnonzero(c.is_contact)
     if p.rows is not None or len(contacts) < 2:

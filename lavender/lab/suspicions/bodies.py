@@ -14,8 +14,6 @@ from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-__all__ = ["CHECKS", "LARGE", "are_grouped", "bodies_of", "free_bodies"]
-
 LARGE = 600  # velocities up to which an inverse of M is looked at
 GIVEN_FOR = (  # of bodies, and of M
     ("mass for inverse mass", "inertia for inverse inertia", "mass and inertia for their inverses"),
@@ -84,6 +82,7 @@ def are_grouped(p: Problem) -> bool:
 
 
 def geometry(p: Problem) -> Iterator[Suspicion]:
+    """Normals, arms and centres that do not fit each other."""
     r = bodies_of(p)
     if r is None or not r.n_contacts:
         return
@@ -178,6 +177,7 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
 
 
 def masses(p: Problem) -> Iterator[Suspicion]:
+    """Masses and inertias that no body has."""
     r = bodies_of(p)
     if r is None or not r.n_bodies:
         return
@@ -234,6 +234,7 @@ def _sizes(r: Any) -> FloatArray:
 
 
 def inverse(p: Problem) -> Iterator[Suspicion]:
+    """M or J that is the inverse or the transpose of what is meant."""
     g = p.generalized
     if g is None or not 3 <= g.nv <= LARGE:
         return

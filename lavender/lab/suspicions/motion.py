@@ -14,8 +14,6 @@ from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
 
-__all__ = ["CHECKS", "state_before", "stepped"]
-
 G = 9.81  # m/s^2
 PUSHED = 30.0  # m/s, of a target that moves bodies apart: 6 cm in a step of 2 ms
 LET = 1000.0  # m/s, of one that lets them approach: over a gap of 2 m in such a step
@@ -38,6 +36,7 @@ def motion_of(p: Problem) -> tuple[FloatArray, FloatArray, FloatArray] | None:
 
 
 def targets(p: Problem) -> Iterator[Suspicion]:
+    """Targets that no contact has."""
     c = p.cones
     motion = motion_of(p)
     contact = c.is_contact
@@ -81,6 +80,7 @@ def targets(p: Problem) -> Iterator[Suspicion]:
 
 
 def speeds(p: Problem) -> Iterator[Suspicion]:
+    """Speeds that are accelerations."""
     motion, r = motion_of(p), bodies_of(p)
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
@@ -99,7 +99,7 @@ def speeds(p: Problem) -> Iterator[Suspicion]:
 
 
 def above(p: Problem) -> Iterator[Suspicion]:
-    # Most bodies have one velocity v*, that of a step of gravity; what stands still holds some of them from below.
+    """Most bodies have one velocity v*, that of a step of gravity; what stands still holds some of them from below."""
     r = bodies_of(p)
     if r is None or np.count_nonzero(r.inv_mass) < 2:
         return

@@ -9,8 +9,6 @@ import numpy as np
 
 from lavender.problem import Problem
 
-__all__ = ["Suspicion", "suspect"]
-
 
 @dataclass(frozen=True)
 class Suspicion:

@@ -2,7 +2,8 @@
 
 from lavender.sim.engine.film import Film
 from lavender.sim.engine.run import Trace, run, run_scene
-from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.sim.engine.simulation import Simulation
 from lavender.sim.engine.snapshot import Snapshot
+from lavender.sim.engine.stepping import SOLVER_FIELDS
 
 __all__ = ["SOLVER_FIELDS", "Film", "Simulation", "Snapshot", "Trace", "run", "run_scene"]

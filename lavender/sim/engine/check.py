@@ -22,8 +22,6 @@ from lavender.sim.engine.layout import HEAD, SETTING, SIZE
 from lavender.sim.engine.state import KEPT, State
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, N_SIZES
 
-__all__ = ["same_scene", "whole_state"]
-
 CARRIED = (
     "x", "q", "v", "fat", "joint_impulse", "inv_inertia", "cache_impulse", "cache_local", "cache_roll", "cache_key"
 )  # fmt: skip

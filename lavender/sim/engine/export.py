@@ -14,8 +14,6 @@ from lavender.sim.engine.layout import HEAD, SIZE
 from lavender.sim.engine.state import State
 from lavender.sim.scene.arithmetic import norm
 
-__all__ = ["problem_of"]
-
 
 def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name: str) -> Problem:
     """The velocity problem of a substep after `kernel.prepare()`, with names of bodies and joints, in copies."""

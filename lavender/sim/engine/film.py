@@ -20,8 +20,6 @@ from lavender.sim.engine.layout import HEAD, JOINT
 from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 
-__all__ = ["Film"]
-
 MAGIC = b"LAVENDER-FILM\n"
 VERSION = 1
 LEAD = 9  # numbers of a frame before the poses: time and the solver values

@@ -12,8 +12,6 @@ from lavender.base.later import above
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
 
-__all__ = ["judged", "moved"]
-
 motion = above("lavender.lab.motion")
 
 PARTS = ("joint", "normal", "disk", "spin", "rolling")

@@ -2,8 +2,6 @@
 
 from lavender_ext.engine import arrays
 
-__all__ = ["HEAD", "JOINT", "JOINT_KINDS", "ORDER_NUMBER", "SETTING", "SIZE"]
-
 
 def _numbers(prefix: str) -> dict[str, int]:
     return {

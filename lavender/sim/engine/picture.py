@@ -21,8 +21,6 @@ from lavender.sim.engine.film import Film
 from lavender.sim.scene.parts import rotation
 from lavender_ext.engine.arrays import BOX, PLANE, SPHERE
 
-__all__ = ["PICTURES", "picture_suffix", "save_picture"]
-
 PICTURES = (".gif", ".mp4", ".png", ".svg", ".pdf")
 DPI = 160  # of an animation: 480 pixels at the width that is the default
 
@@ -113,9 +111,11 @@ class Stage:
         return float(np.clip((high - low) / (right - left), 0.3, 2.5))
 
     def project(self, points: FloatArray) -> FloatArray:
+        """Places in the picture of points in the world."""
         return np.stack([points @ self.right, points @ self.top], axis=-1)
 
     def paint(self, axes: Any, frame: int) -> None:
+        """Draw a frame of the film."""
         from matplotlib.colors import to_rgb
         from matplotlib.patches import Circle, Polygon
 

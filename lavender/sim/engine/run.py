@@ -15,11 +15,10 @@ import numpy as np
 from lavender.base.arrays import FloatArray, whole_number
 from lavender.io.stored import check_figure, folder_for_steps, writable, write_figure, write_text
 from lavender.sim.engine.picture import PICTURES, picture_suffix, save_picture
-from lavender.sim.engine.simulation import SOLVER_FIELDS, Simulation
+from lavender.sim.engine.simulation import Simulation
+from lavender.sim.engine.stepping import SOLVER_FIELDS
 from lavender.sim.scene import Scene
 from lavender.solvers.registry import get
-
-__all__ = ["Trace", "run", "run_scene"]
 
 
 @dataclass(frozen=True, eq=False)

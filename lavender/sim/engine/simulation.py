@@ -18,11 +18,9 @@ from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.picture import save_picture
 from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.engine.state import State
-from lavender.sim.engine.stepping import HALF, SOLVER_FIELDS, Stepping, alone, make_pairs_anew
+from lavender.sim.engine.stepping import HALF, Stepping, alone, make_pairs_anew
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import NEED_ROOM, lengths
-
-__all__ = ["SOLVER_FIELDS", "Simulation"]
 
 
 class Simulation(Stepping):

@@ -20,8 +20,6 @@ from lavender.io.stored import framed, unframed, whole_file, write_atomically
 from lavender.sim.engine.check import well_formed
 from lavender_ext.engine.arrays import lengths
 
-__all__ = ["Snapshot"]
-
 MAGIC = b"LAVENDER-SNAPSHOT\n"
 VERSION = 1
 MOST_HEADER = 2**20  # bytes

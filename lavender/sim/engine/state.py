@@ -30,8 +30,6 @@ from lavender_ext.engine.arrays import (
 from lavender_ext.host import memory
 from lavender_ext.warm.substep import Substep
 
-__all__ = ["State"]
-
 Copy = Callable[[], np.ndarray]
 
 assert set(ORDER_NUMBER) == set(SCENE_ORDERS)

@@ -32,8 +32,6 @@ from lavender.solving.outcome import finish
 from lavender.solving.solve import solve
 from lavender_ext.engine.arrays import NEED_ROOM, OK
 
-__all__ = ["SOLVER_FIELDS", "Stepping", "alone", "make_pairs_anew"]
-
 #: The eight values of `observation["solver"]`, of the final substep: sweep budget, warm-start mode (0 or 1),
 #: contacts, contacts found in the cache, max |e_n| [N s] before the first sweep and after the last, and
 #: max(0, -w_n) [m/s] likewise.

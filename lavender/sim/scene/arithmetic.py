@@ -14,8 +14,6 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 
-__all__ = ["frame_quaternion", "inverse", "norm", "sine_cosine", "turned", "turned_back"]
-
 #: Numbers of sine_cosine are whole multiples of 2^-BITS.
 BITS = 256
 #: Largest angle [rad]; as many bits of PI go into telling its turns.

@@ -12,9 +12,6 @@ from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import norm, sine_cosine, turned_back
 from lavender_ext.core.checks import LEAST, MOST
 
-__all__ = ["BALL", "DISTANCE", "HINGE", "Body", "Box", "Joint", "Plane", "Sphere"]
-
-
 _put = object.__setattr__  # of a frozen shape, what was given as it is kept
 
 

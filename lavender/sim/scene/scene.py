@@ -34,8 +34,6 @@ from lavender.sim.scene.parts import (
 from lavender.sim.scene.steppers import StepperSpec, get_stepper
 from lavender.solvers.registry import SolverSpec, get
 
-__all__ = ["ON_FAILURE", "SCENES", "Parameters", "Scene", "named_scene"]
-
 SCENE_ORDERS = (*ENGINE_ORDERS, "alternating")  # alternating: contacts turned round every substep
 ON_FAILURE = ("use", "keep", "damp", "raise")
 RANGES: dict[str, dict[str, float]] = {  # of plain numbers

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-__all__ = ["view", "web"]
-
 PORT = click.option(
     "--port", type=click.IntRange(0, 65535), default=0, help="Of the page's server; 0 takes a free one."
 )

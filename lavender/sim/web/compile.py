@@ -37,23 +37,6 @@ from pathlib import Path
 from threading import get_native_id
 from typing import Any
 
-__all__ = [
-    "LARGEST",
-    "MODULES",
-    "PARTS",
-    "SECTION",
-    "BuildFailed",
-    "Built",
-    "Part",
-    "build",
-    "build_library",
-    "is_current",
-    "put",
-    "section",
-    "source_hash",
-    "why_not",
-]
-
 #: Modules of lavender_ext that the page uses.
 MODULES = ("engine.arrays", "engine.substep", "host.memory")
 #: Largest size of a finished module [bytes].

@@ -29,8 +29,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
-__all__ = ["CutFailed", "Item", "core_functions", "cut", "path_of", "read", "source_hash", "translate"]
-
 PUBLIC = re.compile(r"^cdef public [^(\n]*?\b(lav_\w+)\(", re.MULTILINE)
 CIMPORT = re.compile(r"^from lavender_ext\.([\w.]+) cimport", re.MULTILINE)
 
@@ -110,6 +108,8 @@ class Item:
 
 
 class Token(NamedTuple):
+    """A word of C and what stands before it."""
+
     kind: str
     text: str
     before: str  # white space

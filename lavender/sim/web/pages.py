@@ -21,8 +21,6 @@ from lavender.io.stored import writable, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import page_scenes
 
-__all__ = ["build_module", "check", "module", "server", "write_page"]
-
 HERE = Path(__file__).resolve().parent
 ROOT = Path(lavender_ext.__file__).resolve().parent.parent  # the folder that holds lavender_ext
 SHIPPED = HERE  # the folder of the modules that come with the package
@@ -111,7 +109,8 @@ def _copy(source: str, target: str) -> None:
 
 
 class Handler(SimpleHTTPRequestHandler):
-    # Types are said here, since a machine's own table may lack or miscall them.
+    """Types are said here, since a machine's own table may lack or miscall them."""
+
     extensions_map = {  # noqa: RUF012 - as the base class has it
         "": "application/octet-stream",
         ".css": "text/css",
@@ -123,6 +122,7 @@ class Handler(SimpleHTTPRequestHandler):
     }
 
     def end_headers(self) -> None:
+        """Nothing is kept by a browser."""
         self.send_header("Cache-Control", "no-cache")
         super().end_headers()
 

@@ -12,8 +12,6 @@ from lavender.sim.engine.snapshot import Snapshot
 from lavender.sim.scene import Scene
 from lavender_ext.engine.arrays import CAP_CONTACT, CAP_PAIR, SHAPES, offsets
 
-__all__ = ["EXPERIMENTS", "PAGE", "PRESETS", "describe", "layout", "page_scenes"]
-
 #: Scenes of the page, the whole gallery: name, title, what to look for, what the caption measures of each side:
 #: "lean" (how far sideways of its start, or below it, a body is), "gap" (how far the ends of a joint are apart),
 #: "apart" (how far a body of B is from the same of A).

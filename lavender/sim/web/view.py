@@ -13,8 +13,6 @@ from urllib.parse import parse_qs, urlsplit
 from lavender.sim.engine.film import Film
 from lavender.sim.web.pages import HERE, Handler, bound
 
-__all__ = ["Viewer"]
-
 MOST_FRAMES = 2000  # of one answer
 
 

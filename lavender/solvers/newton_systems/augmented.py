@@ -26,8 +26,6 @@ from lavender.base.lu import sparse_lu
 from lavender.solvers.setup_times import CALLS, SPARSE, loading, sparse_work
 from lavender_ext.newton.solve import WHATS, Layout, Solve
 
-__all__ = ["Augmented"]
-
 
 class Augmented:
     """Who factors (1) and (2) for `Solve`; K is made when it is first asked for."""

@@ -22,8 +22,6 @@ from lavender_ext.factor.sparse import is_mirrored
 from lavender_ext.newton.coupled import coupled, coupled_entries, coupled_rows, element_graph
 from lavender_ext.newton.solve import WHATS, Solve
 
-__all__ = ["SparseRows"]
-
 BACKWARD = 1e-12  # (1): thousands of roundings
 
 

@@ -34,8 +34,6 @@ from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
-__all__ = ["CampaignPlan", "campaign", "seeds"]
-
 MOST_SEEDS = 1_000_000  # of a family in one run: a case's name and place take a kilobyte
 MOST_WORKERS = 4096  # processes: more than any machine has cores for
 ATTEMPTS = 5  # times that the remaining pairs are handed out again after workers were lost

@@ -22,8 +22,6 @@ from lavender.lab.bench.running.worker import Worker
 from lavender.lab.bench.store import Records, Store, opened
 from lavender.solving.many import solve_many
 
-__all__ = ["ROUNDS", "finals"]
-
 ROUNDS, LEAST_ROUNDS, MOST_ROUNDS = 7, 3, 41
 SPARE = 3.0  # s, for more repetitions than usual where they are cheap
 STAGE = 20.0  # time limits, that all repetitions may take together once there were the least

@@ -16,8 +16,6 @@ from lavender.problem import Problem
 from lavender.problem.ordering import ORDERS
 from lavender.solvers.registry import SolverSpec
 
-__all__ = ["Plan", "passes"]
-
 # A speed level: the residual that is asked for first, the tightest, and how often a tighter one is tried.
 FIRST_TOL, LAST_TOL, SPEED_TRIES = 1e-2, 1e-13, 6
 PASS_LIMIT = 5.0  # s, of one pass over a sequence

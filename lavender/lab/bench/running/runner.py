@@ -30,8 +30,6 @@ from lavender.problem import Problem
 from lavender.solvers import registry
 from lavender.solvers.registry import SolverSpec
 
-__all__ = ["Event", "run", "solver_names"]
-
 SEARCH = 6  # runs of the search for several motions, once for each Coulomb problem
 QUICK = 0.05  # of the time limit: after a step that took less, the next is solved without a guard
 SHORT_SEQUENCE = 20  # up to which the steps of a sequence are repeated; the sum over more evens out by itself
@@ -196,11 +194,13 @@ class Runner:
             self.skipped = {(s.case, s.solver) for s in store.records.skips if s.run == this.run}
 
     def keep(self, entry: Run | CaseInfo | Skip | Record) -> None:
+        """Add an entry to what is returned and to what is stored."""
         self.out.add(entry)
         if self.store is not None:
             self.store.add(entry)
 
     def tell(self, case: str, solver: str, record: Record | None = None, reused: bool = False) -> None:
+        """Tell whoever watches how far it is."""
         if self.watch is not None:
             self.watch(
                 Event(
@@ -209,6 +209,7 @@ class Runner:
             )
 
     def run(self, items: list[Item]) -> Records:
+        """Measure every case and sequence."""
         self.total = len(items) * len(self.names)
         self.keep(self.this)
         for name, group in _sequences(items):
@@ -239,6 +240,7 @@ class Runner:
         return info
 
     def single(self, item: Item) -> None:
+        """Every solver on a case that is no step of a sequence."""
         info = self.look(item)
         if info is None:
             return
@@ -332,6 +334,7 @@ class Runner:
         return other
 
     def pair(self, info: CaseInfo, problem: Problem, name: str) -> None:
+        """One solver on one case, at every budget and level."""
         spec = self.taking(info.case, name, [problem])
         if spec is None:
             return

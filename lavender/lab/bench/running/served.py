@@ -11,8 +11,6 @@ from lavender.lab.bench.record import plain
 if TYPE_CHECKING:
     from lavender.lab.bench.running.timing import Outcome
 
-__all__ = ["serve"]
-
 ORPHAN = 60.0  # s of CPU, beyond what any task may take
 
 

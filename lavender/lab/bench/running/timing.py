@@ -33,8 +33,6 @@ from lavender.solvers import registry
 from lavender.solving.outcome import finish
 from lavender.solving.solve import prepare, solve
 
-__all__ = ["Ask", "Outcome", "Task", "attempt", "judged", "just_written", "measure", "one_thread", "pace"]
-
 SHORT = 5e-3  # s: what took longer is not called once more for warmth
 CLAIMS = (Status.CONVERGED, Status.FLOOR, Status.INFEASIBLE)
 

@@ -24,8 +24,6 @@ from lavender.lab.bench.record import CRASHED, KILLED, Record, values_in
 from lavender.lab.bench.running.timing import Outcome, Task, judged
 from lavender.problem import Problem
 
-__all__ = ["Worker", "outcome_in"]
-
 _SERVED = "lavender.lab.bench.running.served"
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging

@@ -15,8 +15,6 @@ from lavender.sim.scene.parts import rotation
 with quiet(noisy=True):  # it greets
     import pybullet
 
-__all__ = ["Engine"]
-
 
 class Engine(Stepping):
     """`stepSimulation`, by default of 1/240 s.

@@ -38,8 +38,6 @@ from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import parents, relative
 from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
 
-__all__ = ["Engine"]
-
 MODULUS = 1e8  # Pa, of compliant bodies
 DISSIPATION = 10.0  # s/m
 

@@ -13,8 +13,6 @@ from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import frame_quaternion
 from lavender.sim.scene.parts import rotation
 
-__all__ = ["Engine"]
-
 WIDE = (200.0, 20.0, 200.0)  # m, of a box in the place of a plane, its second axis up
 
 

@@ -17,8 +17,6 @@ from lavender.problem import Problem
 from lavender.sim.scene import Box, Joint, Plane, Scene, Sphere
 from lavender.sim.scene.parts import rotation
 
-__all__ = ["Engine"]
-
 
 def _text(x: Any) -> str:
     return " ".join(repr(float(v)) for v in x)

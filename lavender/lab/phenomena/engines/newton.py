@@ -12,8 +12,6 @@ from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import parents, relative, xyzw
 from lavender.sim.scene import Box, Plane, Scene, Sphere
 
-__all__ = ["Engine"]
-
 SUBSTEPS = 4
 
 

@@ -14,8 +14,6 @@ from lavender.lab.phenomena.engines import PACKAGES_OF_NODE, Stepping, missing_i
 from lavender.lab.phenomena.engines.tree import parents
 from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
 
-__all__ = ["Engine"]
-
 SCRIPT = Path(__file__).with_name("served.mjs")
 
 

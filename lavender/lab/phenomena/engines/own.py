@@ -9,8 +9,6 @@ from lavender.lab.phenomena.engines import Stepping
 from lavender.sim.engine import Simulation
 from lavender.sim.scene import Scene
 
-__all__ = ["Engine"]
-
 
 class Engine(Stepping):
     """`Simulation.step` with its observation."""

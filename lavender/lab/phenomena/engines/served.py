@@ -8,8 +8,6 @@ import numpy as np
 
 from lavender.base.apart import served as apart
 
-__all__ = ["serve"]
-
 
 def serve(lifeline: int) -> None:
     """Answer the tasks of `running.Apart`, until they end."""

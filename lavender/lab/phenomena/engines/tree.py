@@ -9,8 +9,6 @@ from lavender.base.errors import CapabilityError
 from lavender.sim.scene import Scene
 from lavender.sim.scene.parts import Body, Joint, rotation
 
-__all__ = ["parents", "relative", "xyzw"]
-
 
 def parents(scene: Scene, engine: str) -> dict[int, Joint]:
     """Body -> joint to its parent, which stands before it.

@@ -15,20 +15,6 @@ from lavender.lab.report.tables.groups import families, levels_of
 from lavender.lab.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
 from lavender.lab.report.tables.sequences import by_sequence
 
-__all__ = [
-    "Advice",
-    "Choice",
-    "Line",
-    "advice",
-    "counts_sweeps",
-    "quantile",
-    "steps_of",
-    "time_budgets",
-    "to_level",
-    "within",
-]
-
-
 #: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
 #: one run more or less within a time does to a mean residual.
 NOISE, RESIDUAL_NOISE = 1.25, 2.0

@@ -11,8 +11,6 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.advice import quantile
 from lavender.lab.report.tables.groups import DIED, families, levels_of, pairs
 
-__all__ = ["Robustness", "robustness"]
-
 
 @dataclass(frozen=True)
 class Robustness:

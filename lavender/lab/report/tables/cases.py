@@ -16,19 +16,6 @@ from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.groups import DIED, levels_of, pairs
 
-__all__ = [
-    "Claims",
-    "Difficulty",
-    "Reach",
-    "Spread",
-    "budgets",
-    "claims",
-    "difficulties",
-    "failures",
-    "reaches",
-    "spreads",
-]
-
 EASY = 1e-3  # relative residual to which sweeps are counted
 
 

@@ -11,8 +11,6 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.cases import reaches
 from lavender.lab.report.tables.groups import levels_of, pairs
 
-__all__ = ["NOISE", "Change", "changes", "drift"]
-
 
 @dataclass(frozen=True)
 class Change:

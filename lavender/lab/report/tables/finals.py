@@ -20,8 +20,6 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.advice import FIRST, HALF, QUANTILE, Choice, counts_sweeps
 from lavender.lab.report.tables.means import SHIFT, limit_of
 
-__all__ = ["STARTS", "Final", "Race", "in_time", "lines", "serves_in", "to_level"]
-
 SAMPLES = 500
 AT_ONCE = 1_000_000  # numbers of a few samples
 SURE = 0.8  # share of resamplings below which a second name is told

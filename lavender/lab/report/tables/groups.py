@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
 
-__all__ = ["DIED", "families", "is_campaign", "levels_of", "pairs"]
-
 
 def levels_of(records: Records) -> tuple[float, ...]:
     """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""

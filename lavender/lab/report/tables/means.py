@@ -12,19 +12,6 @@ from lavender.lab.bench.store import Records
 from lavender.lab.report.tables.cases import reaches
 from lavender.lab.report.tables.groups import levels_of
 
-__all__ = [
-    "SHIFT",
-    "Backend",
-    "Profile",
-    "backends",
-    "geometric_mean",
-    "geometric_means",
-    "limit_of",
-    "profiles",
-    "times_to",
-]
-
-
 #: s, of the geometric means, whoever takes part: what is quicker than that differs by Python's share of a call.
 SHIFT = 1e-5
 

@@ -11,8 +11,6 @@ from statistics import median
 from lavender.lab.bench.record import Record, asked_of
 from lavender.lab.bench.store import Records
 
-__all__ = ["Pass", "by_sequence", "passes"]
-
 
 @dataclass(frozen=True)
 class Pass:

@@ -9,8 +9,6 @@ from typing import Any
 from lavender.base.arrays import number, whole_number
 from lavender.base.errors import InputError, UnknownName
 
-__all__ = ["Option", "StepperSpec"]
-
 
 @dataclass(frozen=True)
 class Option:
