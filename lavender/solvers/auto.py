@@ -16,7 +16,7 @@
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost, of bounded rows that failed in the compiled call over rows
+                                SURE times that cost; over rows, of bounded ones that failed in the compiled call
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE), `admm`, `nncg`, and sweeps as long as these
                                 gain; all together LAST times Newton's cost, and no longer than LONG
