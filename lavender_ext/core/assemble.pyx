@@ -13,7 +13,7 @@ from lavender_ext.core.csr cimport by_columns
 from lavender_ext.core.door cimport is_number
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
 from lavender_ext.core.problem cimport Data
-from lavender_ext.core.rows cimport contact_jacobian, minv_times, rows_t
+from lavender_ext.core.rows cimport contact_jacobian, dot6, minv_times, rows_t
 
 cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32)
 
@@ -22,10 +22,6 @@ cdef inline int32_t body_of(const rows_t* r, int32_t block, int32_t side) noexce
     if block < r.n_joints:
         return r.joint_body[2 * block + side]
     return r.contact_body[2 * (block - r.n_joints) + side]
-
-
-cdef inline double dot6(const double* x, const double* y) noexcept nogil:
-    return ((x[0] * y[0] + x[1] * y[1]) + (x[2] * y[2] + x[3] * y[3])) + (x[4] * y[4] + x[5] * y[5])
 
 
 cdef public void lav_expand_rows(const blocks_t* p, const rows_t* r, double* jac, double* minv_jac) noexcept nogil:

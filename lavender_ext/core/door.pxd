@@ -62,6 +62,22 @@ cdef inline double largest(const double* x, int64_t n) noexcept nogil:
     return s
 
 
+cdef inline bint all_finite(const double* x, int64_t n) noexcept nogil:
+    """Whether x holds neither NaN nor infinity."""
+    cdef double s = 0.0, t = 0.0, u = 0.0, v = 0.0      # stay 0, or become NaN
+    cdef int64_t i = 0
+    while i + 4 <= n:
+        s += 0.0 * x[i]
+        t += 0.0 * x[i + 1]
+        u += 0.0 * x[i + 2]
+        v += 0.0 * x[i + 3]
+        i += 4
+    while i < n:
+        s += 0.0 * x[i]
+        i += 1
+    return (s + t) + (u + v) == 0.0
+
+
 cdef inline bint is_frame(const double* n, const double* t, double off) noexcept nogil:
     """Whether two vectors are orthogonal and their squares 1, all to `off`."""
     cdef double nn = n[0] * n[0] + n[1] * n[1] + n[2] * n[2], tt = t[0] * t[0] + t[1] * t[1] + t[2] * t[2]

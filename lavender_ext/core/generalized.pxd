@@ -424,4 +424,3 @@ cdef class Operator:
     cdef const int32_t* midx
 
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx)
-    cdef tuple find_pattern(self, const int32_t* mptr, const int32_t* midx)

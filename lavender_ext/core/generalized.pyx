@@ -20,6 +20,19 @@ cdef public int32_t lav_tree_factor(int32_t n, const int32_t* mptr, const int32_
     return tree_factor(n, mptr, midx, mval, lptr, lidx, lval, pivot, inv_pivot)
 
 
+cdef object pattern_of(int32_t n, const int32_t* mptr, const int32_t* midx):
+    """L's columns by the elimination of M, in one array: lptr (n + 1), parent (n), scratch (3 n), then lidx."""
+    cdef int32_t count = -1, room = mptr[n] + 1
+    cdef int32_t[::1] whole
+    while count < 0:                                    # again where M's pattern is no tree's: L has more entries
+        marks = new(5 * n + 1 + room, I4)
+        whole = marks
+        count = tree_pattern(n, mptr, midx, room, &whole[0], &whole[5 * n + 1], &whole[n + 1], &whole[2 * n + 1],
+                             &whole[3 * n + 1], &whole[4 * n + 1])
+        room = min(2 * room, n * n // 2 + 1)
+    return marks
+
+
 cdef class Operator:
     """J in compressed rows and M by its lower triangle, diagonal included, with M = L^T D L.
 
@@ -42,15 +55,18 @@ cdef class Operator:
         self.g.jidx = ints(jidx_, len(jidx_))
         self.g.jval = doubles(jval_, len(jval_))
         if like is not None and like.has_pattern(n, mptr, midx):
-            marks, entries = like.keep[0], like.keep[1]
+            marks = like.keep[0]
             self.g.lptr = like.g.lptr
             self.g.lidx = like.g.lidx
             self.g.parent = like.g.parent
         else:
-            marks, entries = self.find_pattern(mptr, midx)
+            marks = pattern_of(n, mptr, midx)
+            self.g.lptr = ints(marks, len(marks))
+            self.g.parent = self.g.lptr + n + 1
+            self.g.lidx = self.g.parent + 4 * n
         factor = new(2 * n + self.g.lptr[n] + 1)
         numbers = doubles(factor, 2 * n + self.g.lptr[n] + 1)
-        self.keep = [marks, entries, factor]
+        self.keep = [marks, factor]
         self.g.lval = numbers + 2 * n
         self.g.inv_pivot = numbers
         self.g.root = numbers + n                       # the factor's pivots, until it is there
@@ -64,28 +80,6 @@ cdef class Operator:
     cdef bint has_pattern(self, int32_t n, const int32_t* mptr, const int32_t* midx):
         return self.g.n == n and (self.mptr == mptr or memcmp(self.mptr, mptr, (n + 1) * sizeof(int32_t)) == 0) and (
             self.midx == midx or memcmp(self.midx, midx, mptr[n] * sizeof(int32_t)) == 0)
-
-    cdef tuple find_pattern(self, const int32_t* mptr, const int32_t* midx):
-        # L's columns by the elimination of M; the arrays that hold them.
-        cdef int32_t n = self.g.n, count, room = mptr[n] + 1
-        cdef int32_t[::1] whole, indices
-        marks = new(5 * n + 2 + room, I4)
-        whole = marks
-        # lptr, parent, scratch, then the columns of L
-        count = tree_pattern(n, mptr, midx, room, &whole[0], &whole[5 * n + 1], &whole[n + 1],
-                             &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
-        entries = marks
-        self.g.lidx = &whole[5 * n + 1]
-        while count < 0:                                # M's pattern is no tree's: L has more entries
-            room = min(2 * room, n * n // 2 + 1)
-            entries = new(room, I4)
-            indices = entries
-            self.g.lidx = &indices[0]
-            count = tree_pattern(n, mptr, midx, room, &whole[0], &indices[0], &whole[n + 1],
-                                 &whole[2 * n + 1], &whole[3 * n + 1], &whole[4 * n + 1])
-        self.g.lptr = &whole[0]
-        self.g.parent = &whole[n + 1]
-        return marks, entries
 
     @property
     def n(self):
@@ -294,13 +288,5 @@ def lower_of_rows(const int32_t[::1] ptr, const int32_t[::1] idx, const double[:
 
 def pattern_fill(const int32_t[::1] mptr, const int32_t[::1] midx):
     """Entries that the factor of a matrix with this lower triangle has beyond it."""
-    cdef int32_t n = <int32_t>mptr.shape[0] - 1, count, room = <int32_t>midx.shape[0] + 1
-    cdef int32_t[::1] scratch = np.empty(5 * n + 1, np.int32)
-    cdef int32_t[::1] indices
-    while True:
-        indices = np.empty(room, np.int32)
-        count = tree_pattern(n, &mptr[0], &midx[0], room, &scratch[0], &indices[0], &scratch[n + 1],
-                             &scratch[2 * n + 1], &scratch[3 * n + 1], &scratch[4 * n + 1])
-        if count >= 0:
-            return count - (midx.shape[0] - n)
-        room = min(2 * room, n * n // 2 + 1)
+    cdef int32_t n = <int32_t>mptr.shape[0] - 1
+    return int(pattern_of(n, &mptr[0], &midx[0] if midx.shape[0] else NULL)[n]) - (midx.shape[0] - n)

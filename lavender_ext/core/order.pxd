@@ -96,20 +96,22 @@ cdef inline void block_levels(int32_t n_blocks, const int32_t* body, const int32
 
 cdef inline void sort_by_level(int32_t n_blocks, const int32_t* level, int32_t n_levels, int32_t* start,
                                int32_t* order) noexcept nogil:
-    # Stable counting sort; start has n_levels + 1 entries and ends as the first place of each level.
+    # Stable counting sort, without what has level -1; start has n_levels + 1 entries and ends as the first place of each level.
     cdef int32_t i, s, t
     for i in range(n_levels + 1):
         start[i] = 0
     for i in range(n_blocks):
-        start[level[i]] += 1
+        if level[i] >= 0:
+            start[level[i]] += 1
     s = 0
     for i in range(n_levels + 1):
         t = start[i]
         start[i] = s
         s += t
     for i in range(n_blocks):
-        order[start[level[i]]] = i
-        start[level[i]] += 1
+        if level[i] >= 0:
+            order[start[level[i]]] = i
+            start[level[i]] += 1
     i = n_levels
     while i > 0:
         start[i] = start[i - 1]

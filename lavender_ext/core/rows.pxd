@@ -459,6 +459,10 @@ cdef inline double largest_eigenvalue(double a, double b, double c) noexcept nog
     return 0.5 * (a + c) + sqrt(h * h + b * b)
 
 
+cdef inline double dot6(const double* x, const double* y) noexcept nogil:
+    return ((x[0] * y[0] + x[1] * y[1]) + (x[2] * y[2] + x[3] * y[3])) + (x[4] * y[4] + x[5] * y[5])
+
+
 cdef inline double dot12(const double* x, const double* y) noexcept nogil:
     cdef double s = 0.0
     cdef int32_t k

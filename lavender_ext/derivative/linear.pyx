@@ -16,7 +16,7 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-from lavender_ext.core.door cimport first_outside
+from lavender_ext.core.door cimport all_finite, first_outside
 from lavender_ext.core.generalized cimport generalized_t, jac_push, whitened_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows
 from lavender_ext.core.problem cimport Data, Room, room_for
@@ -129,14 +129,6 @@ cdef bint is_plain(given, Py_ssize_t n, Py_buffer* view, const double** to):
     return True
 
 
-cdef bint is_finite(const double* x, Py_ssize_t n) noexcept nogil:
-    cdef double nought = 0.0                            # or becomes NaN
-    cdef Py_ssize_t i
-    for i in range(n if x != NULL else 0):
-        nought += 0.0 * x[i]
-    return nought == 0.0
-
-
 cdef void form(const linear_t* a, const view_t* v, double shift, double* g, double* h) noexcept nogil:
     # G of H + shift, A of J and M or in rows; h (rows, rows + n) is scratch
     cdef int32_t i, n = a.rows
@@ -235,7 +227,8 @@ cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out)
         if not (is_plain(velocity, a.n, &views[0], &y) and is_plain(impulse, m, &views[1], &c)
                 and is_plain(slack, m, &views[2], &x)):
             return False
-        if not (is_finite(y, a.n) and is_finite(c, m) and is_finite(x, m)):
+        if not (all_finite(y, 0 if y == NULL else a.n) and all_finite(c, 0 if c == NULL else m)
+                and all_finite(x, 0 if x == NULL else m)):
             return False
         with nogil:
             lav_adjoint(a, y, c, x, out, out + m, out + 2 * m)

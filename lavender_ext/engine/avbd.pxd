@@ -25,11 +25,12 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip
+from lavender_ext.core.order cimport sort_by_level
 from lavender_ext.core.rows cimport cross, dot3, joint_velocity
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_ITERATIONS, H_WARM_START, N_DYNAMIC, N_FRAME, N_JOINT,
                                          N_JOINT_ROW, S_H, S_HERTZ, S_RATIO, S_SLOP, engine_t)
 from lavender_ext.engine.bodies cimport world_tensor
-from lavender_ext.engine.projection cimport rigid_row
+from lavender_ext.engine.projection cimport displacement, rigid_row
 from lavender_ext.engine.vectors cimport scale3
 
 cdef enum:
@@ -42,19 +43,6 @@ cdef inline double fading() noexcept nogil:
 
 cdef inline double normal_error(const engine_t* e, int32_t c) noexcept nogil:
     return e.gap[c] if e.gap[c] > 0.0 else (1.0 - e.setting[S_HERTZ]) * e.gap[c]
-
-
-cdef inline double displacement(const engine_t* e, int32_t c, const double* z, const double* axis, double* turn) noexcept nogil:
-    """J z of a contact along an axis; turn (2, 3): arm x axis on a, then on b."""
-    cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
-    cdef double s = 0.0
-    cross(e.arm_a + 3 * c, axis, turn)
-    cross(e.arm_b + 3 * c, axis, turn + 3)
-    if b >= 0:
-        s = dot3(z + 6 * b, axis) + dot3(z + 6 * b + 3, turn + 3)
-    if a >= 0:
-        s -= dot3(z + 6 * a, axis) + dot3(z + 6 * a + 3, turn)
-    return s
 
 
 cdef inline int32_t contact_impulse(const engine_t* e, int32_t c, const double* z, double* p, double* t2, double* turn,
@@ -284,23 +272,10 @@ cdef inline void start_stiffness(engine_t* e, double gamma) noexcept nogil:
 
 cdef inline void descend_all(engine_t* e) noexcept nogil:
     """The whole substep on the prepared rows; dv = z/h - v*."""
-    cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, k, _pass
+    cdef int32_t nd = e.size[N_DYNAMIC], n = e.size[N_JOINT] + e.head[H_CONTACTS], i, _pass
     cdef int32_t* first = e.order_scratch               # (nd + 1), then two entries a block
     cdef int32_t* rows = first + nd + 1
-    for i in range(nd + 1):
-        first[i] = 0
-    for k in range(2 * n):
-        if e.joint_body[k] >= 0:
-            first[e.joint_body[k] + 1] += 1
-    for i in range(nd):
-        first[i + 1] += first[i]
-    for k in range(2 * n):
-        if e.joint_body[k] >= 0:
-            rows[first[e.joint_body[k]]] = k
-            first[e.joint_body[k]] += 1
-    for i in range(nd, 0, -1):
-        first[i] = first[i - 1]
-    first[0] = 0
+    sort_by_level(2 * n, e.joint_body, nd, first, rows)
     start_stiffness(e, fading())
     for i in range(6 * nd):
         e.shift[i] = e.setting[S_H] * e.v_free[i]

@@ -13,7 +13,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport clip, relax_normal
-from lavender_ext.core.rows cimport dot3, joint_push, joint_velocity, push_bodies, relative_velocity
+from lavender_ext.core.rows cimport cross, dot3, joint_push, joint_velocity, push_bodies, relative_velocity
 from lavender_ext.engine.arrays cimport (H_CONTACTS, H_POSITION_ITERATIONS, H_PROJECTED, J_HERTZ, N_DYNAMIC,
                                          N_JOINT, N_JOINT_REAL, N_JOINT_ROW, S_BETA, S_DEPTH, S_H,
                                          S_JOINT_ERROR, S_MAX_PUSH, S_SLOP, engine_t)
@@ -31,6 +31,19 @@ cdef inline double normal_speed(const engine_t* e, const double* v, int32_t c) n
     relative_velocity(v, e.contact_body[2 * c], e.contact_body[2 * c + 1], e.arm_a + 3 * c, e.arm_b + 3 * c,
                       u, s)
     return dot3(e.normal + 3 * c, u)
+
+
+cdef inline double displacement(const engine_t* e, int32_t c, const double* z, const double* axis, double* turn) noexcept nogil:
+    """J z of a contact along an axis, a speed where z is velocities; turn (2, 3): arm x axis on a, then on b."""
+    cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
+    cdef double s = 0.0
+    cross(e.arm_a + 3 * c, axis, turn)
+    cross(e.arm_b + 3 * c, axis, turn + 3)
+    if b >= 0:
+        s = dot3(z + 6 * b, axis) + dot3(z + 6 * b + 3, turn + 3)
+    if a >= 0:
+        s -= dot3(z + 6 * a, axis) + dot3(z + 6 * a + 3, turn)
+    return s
 
 
 cdef inline void push_contact(const engine_t* e, double* v, int32_t c, const double* impulse) noexcept nogil:

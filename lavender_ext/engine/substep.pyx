@@ -18,6 +18,7 @@ import numpy as np
 from lavender_ext.engine.arrays import views
 
 from lavender_ext.core.block cimport row_error
+from lavender_ext.core.door cimport all_finite
 from lavender_ext.core.order cimport (RANDOM, SYMMETRIC, advance_order, block_levels, body_levels,
                                       color_by_bodies, reverse, sort_by_level)
 from lavender_ext.core.parts cimport blocks_t
@@ -208,14 +209,6 @@ cdef inline void solve(engine_t* e, int32_t sweeps, double* room, double* curve,
     measure(e, out + 5, out + 7)
 
 
-cdef inline int32_t finite(const double* x, int32_t n) noexcept nogil:
-    cdef double total = 0.0
-    cdef int32_t i
-    for i in range(n):
-        total += x[i] - x[i]
-    return total == 0.0
-
-
 cdef inline int32_t moving_body(const engine_t* e, const int32_t* pair) noexcept nogil:
     return pair[0] if pair[0] >= 0 and e.dyn[pair[0]] >= 0 else pair[1]
 
@@ -224,15 +217,15 @@ cdef inline int32_t unsolved_body(const engine_t* e) noexcept nogil:
     """A moving body of the first block whose impulses are not finite, or the solver's measures; -1 if all are."""
     cdef int32_t i, kj = e.size[N_JOINT], c = e.head[H_CONTACTS]
     cdef int32_t known = 4 if e.head[H_STEPPER] == XPBD or e.head[H_STEPPER] == AVBD else 8
-    if (finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and finite(e.gap, c)
-            and finite(e.setting + S_OUT, known)):
+    if (all_finite(e.impulse, e.size[N_JOINT_ROW] + e.head[H_CONTACT_ROWS]) and all_finite(e.gap, c)
+            and all_finite(e.setting + S_OUT, known)):
         return -1
     for i in range(kj):
-        if not finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
+        if not all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]):
             return moving_body(e, e.joint_bodies + 2 * i)
     for i in range(kj, kj + c):
-        if not (finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]) and finite(e.b + e.ptr[i], 1)
-                and finite(e.gap + (i - kj), 1)):
+        if not (all_finite(e.impulse + e.ptr[i], e.ptr[i + 1] - e.ptr[i]) and all_finite(e.b + e.ptr[i], 1)
+                and all_finite(e.gap + (i - kj), 1)):
             return moving_body(e, e.contact_pair + 2 * (i - kj))
     return moving_body(e, e.contact_pair) if c > 0 else e.body_of[0]
 

@@ -29,7 +29,7 @@ from lavender_ext.engine.arrays cimport (BOX, DISTANCE, HINGE, H_CONTACTS, H_ITE
                                          N_JOINT_REAL, S_BOUNCE, S_H, engine_t)
 from lavender_ext.engine.bodies cimport drift_rotation, rotation, to_world, turn
 from lavender_ext.engine.contacts cimport normal_velocity, restitution_of
-from lavender_ext.engine.projection cimport normal_speed, push_contact, push_normal
+from lavender_ext.engine.projection cimport displacement, normal_speed, push_contact, push_normal
 from lavender_ext.engine.vectors cimport copy3, minus3, normalise3, plus3, scale3, times3
 
 
@@ -264,20 +264,6 @@ cdef inline void take_velocities(engine_t* e) noexcept nogil:
             e.dv[6 * i + 3 + k] = by[k] / h - (0.0 if e.uneven[b] else e.v_free[6 * i + 3 + k])
 
 
-cdef inline double tangent_speed(const engine_t* e, const double* v, int32_t c, const double* t) noexcept nogil:
-    # of contact c along t
-    cdef double l[3]
-    cdef double s = 0.0
-    cdef int32_t a = e.contact_body[2 * c], b = e.contact_body[2 * c + 1]
-    if b >= 0:
-        cross(e.arm_b + 3 * c, t, l)
-        s = dot3(v + 6 * b, t) + dot3(v + 6 * b + 3, l)
-    if a >= 0:
-        cross(e.arm_a + 3 * c, t, l)
-        s -= dot3(v + 6 * a, t) + dot3(v + 6 * a + 3, l)
-    return s
-
-
 cdef inline void bounce_contact(engine_t* e, int32_t c) noexcept nogil:
     """Stage 4 of the normal; the multipliers of the contact become impulses [N s]."""
     cdef int32_t row = e.ptr[e.size[N_JOINT] + c], a = e.contact_pair[2 * c], b = e.contact_pair[2 * c + 1], k
@@ -298,6 +284,7 @@ cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
     cdef double s, t, x, left
     cdef double t2[3]
     cdef double p[3]
+    cdef double turn_[6]
     cdef const double* t1 = e.tangent + 3 * c
     cdef double* lam = e.impulse + row
     if e.mu[e.size[N_JOINT] + c] == 0.0:
@@ -306,8 +293,8 @@ cdef inline void brake_contact(engine_t* e, int32_t c) noexcept nogil:
     if left <= 0.0:
         return
     cross(e.normal + 3 * c, t1, t2)
-    s = tangent_speed(e, e.v_free, c, t1) + tangent_speed(e, e.dv, c, t1)
-    t = tangent_speed(e, e.v_free, c, t2) + tangent_speed(e, e.dv, c, t2)
+    s = displacement(e, c, e.v_free, t1, turn_) + displacement(e, c, e.dv, t1, turn_)
+    t = displacement(e, c, e.v_free, t2, turn_) + displacement(e, c, e.dv, t2, turn_)
     x = sqrt(s * s + t * t)
     if x == 0.0:
         return

@@ -27,7 +27,7 @@ cdef inline void no_pivots(pivots_t* out) noexcept nogil:
     out.first_small = -1
 
 
-cdef inline double pivot_2(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
+cdef inline double inverse_pivot(double p, double size, int32_t i, double tiny, pivots_t* out) noexcept nogil:
     # 1 / p, or 0 for a small pivot.
     if p < out.least * size:
         out.least = p / size
@@ -51,7 +51,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
     cdef double p = c[0], r = c[2 * (n - 1)], off
     while i < h or j > h:
         if i < h:
-            p = pivot_2(p, size[i], i, tiny, out)
+            p = inverse_pivot(p, size[i], i, tiny, out)
             c[2 * i] = p
             off = c[2 * i + 1]
             if x != NULL:
@@ -59,7 +59,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
             p = (c[2 * i + 2] if i + 1 < h else 0.0) - off * off * p
             i += 1
         if j > h:
-            r = pivot_2(r, size[j], j, tiny, out)
+            r = inverse_pivot(r, size[j], j, tiny, out)
             c[2 * j] = r
             off = c[2 * j - 1]
             if x != NULL:
@@ -72,7 +72,7 @@ cdef inline void ldl_factor_2(int32_t n, double* c, const double* size, double t
         off += p
     if h < n - 1:
         off += r
-    c[2 * h] = pivot_2(off, size[h], h, tiny, out)
+    c[2 * h] = inverse_pivot(off, size[h], h, tiny, out)
 
 
 cdef inline void ldl_back_2(int32_t n, const double* c, double* x) noexcept nogil:
@@ -105,25 +105,16 @@ cdef inline void ldl_columns(int32_t begin, int32_t end, int32_t width, int32_t 
     # (1) for columns begin, ... end - 1 of height reach; 0: they end with row end - 1. Where x is not NULL,
     # ldl_forward goes along.
     cdef int32_t i, s, t, last
-    cdef double p, inv, l
+    cdef double inv, l
     cdef double* col
     cdef double* to
     for i in range(begin, end):
         col = c + <int64_t>i * width
-        p = col[0]
-        if p < out.least * size[i]:
-            out.least = p / size[i]
-        if not p > tiny * size[i]:
-            if p * NEGATIVE_DIGITS < -size[i]:
-                out.negative += 1
-            else:
-                out.small += 1
-                if out.first_small < 0:
-                    out.first_small = i
-                for t in range(width):
-                    col[t] = 0.0
-                continue
-        inv = 1.0 / p
+        inv = inverse_pivot(col[0], size[i], i, tiny, out)
+        if inv == 0.0:
+            for t in range(width):
+                col[t] = 0.0
+            continue
         col[0] = inv
         last = reach if reach > 0 else end - i
         for s in range(1, last):

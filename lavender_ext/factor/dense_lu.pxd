@@ -3,12 +3,7 @@ from libc.math cimport fabs
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport dot
-
-
-cdef inline void take(double* x, const double* a, double f, int32_t n) noexcept nogil:
-    cdef int32_t i
-    for i in range(n):
-        x[i] -= f * a[i]
+from lavender_ext.factor.tiles cimport take
 
 
 cdef inline int32_t lu_factor(int32_t n, double* a, int32_t* swap) noexcept nogil:
@@ -40,7 +35,7 @@ cdef inline int32_t lu_factor(int32_t n, double* a, int32_t* swap) noexcept nogi
             other = a + <ssize_t>i * n
             if other[k] != 0.0:
                 other[k] *= inv
-                take(other + k + 1, row + k + 1, other[k], n - k - 1)
+                take(n - k - 1, other[k], row + k + 1, other + k + 1)
     return 1
 
 

@@ -12,6 +12,7 @@ to its bound, and falls behind that. In a cycle no row keeps its way, and infeas
 """
 from libc.math cimport fabs
 from libc.stdint cimport int32_t
+from libc.string cimport memcpy
 
 from lavender_ext.core.block cimport norm2
 from lavender_ext.core.parts cimport blocks_t, is_rows, parts_of, parts_t
@@ -48,13 +49,11 @@ cdef inline void see(progress_t* s, int32_t at, double r) noexcept nogil:
 
 cdef inline void keep(progress_t* s, int32_t at, const double* lam, int32_t m) noexcept nogil:
     cdef double* x = s.before
-    cdef int32_t i
     s.before = s.last
     s.before_at = s.last_at
     s.last = x
     s.last_at = at
-    for i in range(m):
-        x[i] = lam[i]
+    memcpy(x, lam, m * sizeof(double))
 
 
 cdef inline int32_t envelope(const progress_t* s, double* fall, double* low) noexcept nogil:

@@ -15,6 +15,7 @@ that eighth. The relative residual r decides:
 On the last three the best iterate is put back. A check costs about one sweep.
 """
 from libc.stdint cimport int32_t
+from libc.string cimport memcpy
 
 from lavender_ext.core.parts cimport blocks_t
 from lavender_ext.core.view cimport view_t
@@ -76,12 +77,6 @@ cdef inline double against_start(const watch_t* s, double energy, double velocit
     return relative(energy, velocity, s.start_energy, s.start_velocity)
 
 
-cdef inline void copy(const double* x, double* out, int32_t n) noexcept nogil:
-    cdef int32_t i
-    for i in range(n):
-        out[i] = x[i]
-
-
 cdef inline int32_t until_next(const watch_t* s, double now, double tol) noexcept nogil:
     """Sweeps until the next check."""
     cdef double least = s.total >> 3, most = s.total, n = 0.0, gap = s.total - s.last_at, fall, r = now
@@ -120,21 +115,21 @@ cdef inline int32_t check(watch_t* s, const view_t* v, double* lam, double tol) 
     if now < s.best_relative:
         s.best_relative = now
         s.best_at = s.total
-        copy(lam, s.best, p.n_rows)
+        memcpy(s.best, lam, p.n_rows * sizeof(double))
         keep(&s.progress, s.total, lam, p.n_rows)
         return RUNNING
     if not now < inf or now > 1e6 * (s.start if s.start > 1.0 else 1.0):
         if s.best_at >= 0:
-            copy(s.best, lam, p.n_rows)
+            memcpy(lam, s.best, p.n_rows * sizeof(double))
         return DIVERGED
     if s.best_at >= 0 and s.best_relative <= 1e-6:
         judge_view(v, s.best, s.w, s.e, s.v, True, &x)
         floor = against_start(s, x.floor_energy, x.floor_velocity)
         if is_at_floor(s.best_relative, floor):
-            copy(s.best, lam, p.n_rows)
+            memcpy(lam, s.best, p.n_rows * sizeof(double))
             return AT_FLOOR
     if s.total > 32 * <double>s.best_at + s.patience and rests(&s.progress, p, lam, s.total, s.best_relative):
-        copy(s.best, lam, p.n_rows)
+        memcpy(lam, s.best, p.n_rows * sizeof(double))
         return STALLED
     keep(&s.progress, s.total, lam, p.n_rows)
     return RUNNING

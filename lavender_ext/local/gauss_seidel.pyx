@@ -30,91 +30,73 @@ cdef double prepared_sizes(const blocks_t* p, int32_t* start) noexcept nogil:
     return n
 
 
-cdef inline void prepare_csr(const blocks_t* p, const csr_t* a, const int32_t* start, double* g) noexcept nogil:
-    cdef int32_t i, j, n, k, q, one
-    cdef double W[MAX_ROWS * MAX_ROWS]
-    for i in range(p.n_blocks):
-        if prepared_size(p, i) == 0:
-            continue
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        one = 1
-        for k in range(n):
-            for q in range(n):
-                W[n * k + q] = 0.0
-            if a.indptr[j + k + 1] - a.indptr[j + k] != a.indptr[j + 1] - a.indptr[j]:
-                one = 0
-            for q in range(a.indptr[j + k], a.indptr[j + k + 1]):
-                if j <= a.indices[q] < j + n:
-                    W[n * k + a.indices[q] - j] += a.data[q]
-                if one and a.indices[q] != a.indices[q - a.indptr[j + k] + a.indptr[j]]:
-                    one = 0
-        prepare_block(p, i, W, one, g + start[i])
+cdef inline bint part_of_csr(const blocks_t* p, const csr_t* a, int32_t i, double* W) noexcept nogil:
+    """The part W (n, n) of A that is block i's own; whether its rows share one pattern."""
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q
+    cdef bint one = True
+    for k in range(n):
+        for q in range(n):
+            W[n * k + q] = 0.0
+        if a.indptr[j + k + 1] - a.indptr[j + k] != a.indptr[j + 1] - a.indptr[j]:
+            one = False
+        for q in range(a.indptr[j + k], a.indptr[j + k + 1]):
+            if j <= a.indices[q] < j + n:
+                W[n * k + a.indices[q] - j] += a.data[q]
+            if one and a.indices[q] != a.indices[q - a.indptr[j + k] + a.indptr[j]]:
+                one = False
+    return one
 
 
-cdef inline void prepare_rows(const blocks_t* p, const rows_t* r, const int32_t* start, double* g) noexcept nogil:
+cdef inline void part_of_rows(const blocks_t* p, const rows_t* r, int32_t i, double* W) noexcept nogil:
     """The same from J and M^-1: the slack that each row's unit impulse makes on the block."""
-    cdef int32_t i, j, n, k, q, c
-    cdef double W[MAX_ROWS * MAX_ROWS]
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, c = i - r.n_joints
     cdef double jac[72]
     cdef double push[12]
-    cdef const double* row
+    cdef const double* row = r.jac + 12 * j
     cdef const double* change
-    for i in range(p.n_blocks):
-        if prepared_size(p, i) == 0:
-            continue
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        c = i - r.n_joints
+    if c >= 0:
+        contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
+        row = jac
+    for k in range(n):
+        change = r.minv_jac + 12 * (j + k)
         if c >= 0:
-            contact_jacobian(r, c, n_directions(p, i), n_turns(p, i), jac)
-            row = jac
-        else:
-            row = r.jac + 12 * j
-        for k in range(n):
-            change = r.minv_jac + 12 * (j + k)
-            if c >= 0:
-                minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c],
-                           r.contact_body[2 * c + 1], push)
-                change = push
-            for q in range(n):
-                W[n * q + k] = dot12(row + 12 * q, change)
-        for k in range(n):
-            W[(n + 1) * k] += r.compliance[j + k]
-        if c >= 0 and W[0] > 0.0:
-            W[0] = p.d[j]                               # the same number summed in another order
-        prepare_block(p, i, W, 0, g + start[i])
+            minv_times(row + 12 * k, r.inv_mass, r.inv_inertia, r.contact_body[2 * c], r.contact_body[2 * c + 1], push)
+            change = push
+        for q in range(n):
+            W[n * q + k] = dot12(row + 12 * q, change)
+    for k in range(n):
+        W[(n + 1) * k] += r.compliance[j + k]
+    if c >= 0 and W[0] > 0.0:
+        W[0] = p.d[j]                                   # the same number summed in another order
 
 
-cdef inline void prepare_general(const blocks_t* p, const generalized_t* o, const int32_t* start, double* g) noexcept nogil:
+cdef inline void part_of_general(const blocks_t* p, const generalized_t* o, int32_t i, double* W) noexcept nogil:
     """The same from the rows of Y."""
-    cdef int32_t i, j, n, k, q, b, nc
-    cdef double W[MAX_ROWS * MAX_ROWS]
-    cdef const double* y
-    for i in range(p.n_blocks):
-        if prepared_size(p, i) == 0:
-            continue
-        j = p.ptr[i]
-        n = p.ptr[i + 1] - j
-        b = o.home[i]
-        nc = o.pcol[b + 1] - o.pcol[b]
-        y = o.y + o.pval[b] + <ssize_t>(j - o.prow[b]) * nc
-        for k in range(n):
-            for q in range(n):
-                W[n * k + q] = dot(y + k * nc, y + q * nc, nc)
-        for k in range(n):
-            W[(n + 1) * k] += o.compliance[j + k]
-        prepare_block(p, i, W, 0, g + start[i])
+    cdef int32_t j = p.ptr[i], n = p.ptr[i + 1] - j, k, q, b = o.home[i], nc = o.pcol[b + 1] - o.pcol[b]
+    cdef const double* y = o.y + o.pval[b] + <ssize_t>(j - o.prow[b]) * nc
+    for k in range(n):
+        for q in range(n):
+            W[n * k + q] = dot(y + k * nc, y + q * nc, nc)
+    for k in range(n):
+        W[(n + 1) * k] += o.compliance[j + k]
 
 
 cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexcept nogil:
     """Each block's own part of A into g (`prepared_sizes`, zeroed)."""
-    if v.g != NULL:
-        prepare_general(&v.p, v.g, start, g)
-    elif v.r != NULL:
-        prepare_rows(&v.p, v.r, start, g)
-    else:
-        prepare_csr(&v.p, v.a, start, g)
+    cdef int32_t i
+    cdef bint one
+    cdef double W[MAX_ROWS * MAX_ROWS]
+    for i in range(v.p.n_blocks):
+        if prepared_size(&v.p, i) == 0:
+            continue
+        one = False
+        if v.g != NULL:
+            part_of_general(&v.p, v.g, i, W)
+        elif v.r != NULL:
+            part_of_rows(&v.p, v.r, i, W)
+        else:
+            one = part_of_csr(&v.p, v.a, i, W)
+        prepare_block(&v.p, i, W, one, g + start[i])
 
 
 def prepare(Data p):

@@ -15,7 +15,7 @@ by columns, h (nt).
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.core.block cimport round_error
+from lavender_ext.core.block cimport length, round_error
 from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK
 
 
@@ -139,10 +139,7 @@ cdef inline int32_t round_contact(int32_t n, const double* g, const double* q, c
     cdef double x[TANGENTS + 1]
     cdef double w[TANGENTS + 1]
     cdef double e[TANGENTS + 1]
-    cdef double low = 0.0, high, at_low, at_high, s, f, size = 0.0, wrong
-    for i in range(1, n):
-        size += q[i] * q[i]
-    size = sqrt(size)
+    cdef double low = 0.0, high, at_low, at_high, s, f, size = length(q + 1, nt), wrong
     if q[0] >= mu * size:
         for i in range(n):
             lam[i] = 0.0

@@ -2,6 +2,7 @@
 from libc.math cimport sqrt
 from libc.stdint cimport int32_t
 
+from lavender_ext.core.block cimport length
 from lavender_ext.newton.elements cimport elements_t
 
 
@@ -16,19 +17,11 @@ cdef enum:                      # what is kept of a cone, from w (n) on: T = eta
 
 cdef inline double cone_gap(const double* x, int32_t n) noexcept nogil:
     # x_0 - |x_1..|
-    cdef double t = 0.0
-    cdef int32_t i
-    for i in range(1, n):
-        t += x[i] * x[i]
-    return x[0] - sqrt(t)
+    return x[0] - length(x + 1, n - 1)
 
 
 cdef inline double cone_det(const double* x, int32_t n) noexcept nogil:
-    cdef double t = 0.0
-    cdef int32_t i
-    for i in range(1, n):
-        t += x[i] * x[i]
-    t = sqrt(t)
+    cdef double t = length(x + 1, n - 1)
     return (x[0] - t) * (x[0] + t)
 
 
@@ -184,16 +177,14 @@ cdef inline double cone_parts(const double* s, const double* u, int32_t n, doubl
     # T^-2 would lose the small ones. c and its square root are (n - 1, n - 1).
     # w (KEPT) keeps the scaling, and v.
     cdef double d[4]
-    cdef double eta, size = 0.0, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
+    cdef double eta, size, grow, shrink, across, along, x, gn = on_normal(a), gt = on_tangent(a)
     cdef int32_t k, l, nt = n - 1
     nt_scaling(s, u, n, w, &eta)
     w[KEPT_ETA] = eta
     w[KEPT_SHRINK] = 1.0 / eta
     w[KEPT_TURN] = 1.0 / (1.0 + w[0])
     scale_times(w, n, u, w + KEPT_V)
-    for k in range(1, n):
-        size += w[k] * w[k]
-    size = sqrt(size)
+    size = length(w + 1, nt)
     grow = eta * (w[0] + size)
     shrink = eta / (w[0] + size)
     grow = grow * grow

@@ -29,12 +29,13 @@ from libc.math cimport fabs, floor, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
+from lavender_ext.core.door cimport all_finite
 from lavender_ext.core.parts cimport COULOMB
 from lavender_ext.newton.cones cimport is_high, is_low
 from lavender_ext.newton.elements cimport elements_t, invert_small, is_row
 from lavender_ext.newton.phases cimport begin_rounds, enter_rounds
 from lavender_ext.newton.run cimport (N_PATH, PATH, done, enter, leave, newton_t, path_t, score, take, with_products)
-from lavender_ext.newton.system cimport (OF_NATURAL, all_finite, solve_natural, system_factor, system_sign, system_times)
+from lavender_ext.newton.system cimport OF_NATURAL, solve_natural, system_factor, system_sign, system_times
 
 
 cdef inline double exponential(double x) noexcept nogil:

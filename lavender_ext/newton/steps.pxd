@@ -26,12 +26,14 @@ from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 from libc.string cimport memset
 
+from lavender_ext.core.block cimport length
+from lavender_ext.core.door cimport all_finite
 from lavender_ext.newton.cones cimport is_high, is_low, load_dual, scatter
 from lavender_ext.newton.elements cimport elements_t, is_row
 from lavender_ext.newton.interior cimport ipm_affine, ipm_rhs, ipm_scale, ipm_start, ipm_update
 from lavender_ext.newton.natural_map cimport convex_error
 from lavender_ext.newton.run cimport newton_t, interior_t, take
-from lavender_ext.newton.system cimport (OF_BARRIER, OF_PAIR, all_finite, first_weights, system_factor, system_solve,
+from lavender_ext.newton.system cimport (OF_BARRIER, OF_PAIR, first_weights, system_factor, system_solve,
                                          system_t, system_times)
 
 
@@ -122,10 +124,7 @@ cdef inline double slip(const elements_t* e, int32_t i, const double* s, double 
             phi += a * fabs(s[first])
             psi[first] = share * a * (1.0 if s[first] > 0.0 else -1.0 if s[first] < 0.0 else 0.0)
             continue
-        t = 0.0
-        for k in range(first, first + n):
-            t += s[k] * s[k]
-        t = sqrt(t)
+        t = length(s + first, n)
         for k in range(first, first + n):
             psi[k] = share * (a * s[k] / t) if t > 0.0 else 0.0
         phi += a * t

@@ -359,14 +359,6 @@ cdef inline double largest(const double* x, int32_t n) noexcept nogil:
     return big
 
 
-cdef inline int32_t all_finite(const double* x, int32_t n) noexcept nogil:
-    cdef int32_t j
-    cdef double total = 0.0
-    for j in range(n):
-        total += x[j] * 0.0
-    return total == 0.0
-
-
 cdef inline void solve_refined(system_t* s, const double* rhs, double* x, double* r, double* dx) noexcept nogil:
     """(3) with its eps mostly refined away; the next Newton step does the rest. r, dx (m) are scratch."""
     cdef int32_t j, _, m = s.e.m

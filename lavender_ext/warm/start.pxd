@@ -14,7 +14,7 @@ from libc.stdint cimport int32_t, int64_t
 
 from lavender_ext.core.block cimport row_error
 from lavender_ext.core.parts cimport COULOMB, blocks_t, is_rows
-from lavender_ext.core.rows cimport relax_rows_block, rows_t
+from lavender_ext.core.rows cimport dot6, relax_rows_block, rows_t
 from lavender_ext.core.start cimport is_nothing
 from lavender_ext.core.velocity cimport rows_velocity
 from lavender_ext.factor.band cimport ldl_factor, ldl_solve, pivots_t
@@ -160,10 +160,6 @@ cdef inline int32_t band_width(const blocks_t* p, const rows_t* r, int32_t* last
             elif p.ptr[i + 1] - last[b] > width:
                 width = p.ptr[i + 1] - last[b]
     return width if width <= MOST_BAND else 0
-
-
-cdef inline double dot6(const double* x, const double* y) noexcept nogil:
-    return ((x[0] * y[0] + x[1] * y[1]) + (x[2] * y[2] + x[3] * y[3])) + (x[4] * y[4] + x[5] * y[5])
 
 
 cdef inline void fill_band(const blocks_t* p, const rows_t* r, warm_t* s) noexcept nogil:

@@ -6,9 +6,10 @@ from itertools import product
 
 import numpy as np
 import pytest
-from worked import after, energy
+from worked import after
 
 import lavender as lv
+from benchmarks.gallery import energy
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.scene import SCENES
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
