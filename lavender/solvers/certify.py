@@ -23,6 +23,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray, IntArray
 from lavender.base.deadline import Deadline
+from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.judge.certificates import Proof, fighting, prove
 from lavender.judge.residuals import quick, reference, residual
@@ -88,7 +89,11 @@ def conflict_of(problem: Problem, tol: float, deadline: Deadline | None = None) 
         for share in SOFT:
             more = np.zeros(problem.m)
             more[rows] = share * problem.d[rows]
-            if _newton(_softened(problem, more), SOFT_STEPS, tol, deadline)[0] <= tol:
+            try:
+                softened = _softened(problem, more)
+            except InputError:  # A or the compliance is at the most that the door lets in
+                continue
+            if _newton(softened, SOFT_STEPS, tol, deadline)[0] <= tol:
                 return Conflict(proof, joints + contacts, tuple(map(int, rows)), float(more.max()), told)
     return Conflict(proof, joints + contacts, (), 0.0, "")
 
