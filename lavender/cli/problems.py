@@ -8,7 +8,7 @@ import click
 
 from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused
-from lavender.io.stored import writable
+from lavender.io.stored import make_folder, writable, write_text
 
 
 @click.command()
@@ -87,7 +87,7 @@ def problems(
     else:
         found = [e for e in collection.load() if not names or e.group in names]
         if page is not None:
-            page.write_text(collection.page(found, collection.load(collection.RECORDED)), encoding="utf-8")
+            write_text(page, collection.page(found, collection.load(collection.RECORDED)))
         here, missing = collection.makeable(found)
         chosen = [e.name for e in here]
         for line in missing if check or out is not None else ():
@@ -101,7 +101,7 @@ def problems(
                 raise click.exceptions.Exit(EXIT_UNMET)
             return
     if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
+        make_folder(out)
         for name in chosen:
             (case,) = suite.cases(name)
             case.problem.save(out / f"{file_name(name)}.npz")

@@ -120,6 +120,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         if len(files) > 1:
             raise InputError("a records.jsonl is shown alone: give one, and no problems")
         done = Measured(bench.read(again[0]), False)
+        if not (done.records.records or done.records.skips):
+            raise InputError(f"{again[0]} holds no records: there is nothing to show")
     elif asked["campaign"]:
         done = run_campaign(asked, bench.seeds(files, len(asked["seeds"]), asked["seeds"].start), path)
     else:

@@ -62,7 +62,7 @@ def folder_for_steps(
     folder, replace = writable(path, folder=True), flag("replace", replace)
     with contextlib.ExitStack() as held:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
             _hold(folder, held)
             old = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
             if old and not replace and not continued:
@@ -73,7 +73,7 @@ def folder_for_steps(
             for file in () if continued else (*old, folder / ENGINE):
                 file.unlink(missing_ok=True)
         except OSError as error:
-            raise InputError(f"cannot make or clear the folder {str(folder)!r}: {error.strerror}") from None
+            raise InputError(f"cannot clear the folder {str(folder)!r}: {error.strerror}") from None
         yield folder
 
 
@@ -145,6 +145,18 @@ def writable(path: str | os.PathLike[str], folder: bool = False) -> Path:
     if not all(os.access(x, os.W_OK) for x in (place, *own)):
         raise InputError(f"cannot write {path}: you may not write there; give a path that you may write to")
     return path
+
+
+def make_folder(path: str | os.PathLike[str]) -> Path:
+    """The folder of that path, made with those above it where it is not there; InputError where it cannot be."""
+    folder = as_path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot make the folder {folder}: {error.strerror or error}; give another path"
+        ) from None
+    return folder
 
 
 def _why(error: OSError, place: Path) -> str:

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.errors import CapabilityError, InputError
-from lavender.io.stored import whole_file
+from lavender.io.stored import whole_file, write_text
 from lavender.judge.solution import Status
 from lavender.lab import suite
 from lavender.lab.bench.cases import condition, fingerprint, is_path, resolve
@@ -143,7 +143,7 @@ def save(found: Iterable[Entry], path: Path | str) -> None:
     usual = {f.name: f.default for f in fields(Entry)}
     lines = [{k: v for k, v in asdict(e).items() if v != usual[k]} for e in found]
     text = ",\n ".join(json.dumps(line, ensure_ascii=False) for line in lines)
-    Path(path).write_text(f"[{text}]\n", encoding="utf-8")
+    write_text(path, f"[{text}]\n")
 
 
 def load(path: Path | str = MANIFEST) -> list[Entry]:

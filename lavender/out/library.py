@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import writable, write_bytes, write_text
+from lavender.io.stored import make_folder, writable, write_bytes, write_text
 from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
 from lavender.out.header import functions, javascript
 from lavender.sim.web import compile as wasm
@@ -123,6 +123,6 @@ def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path
         if path.exists() and not replace and path.read_bytes() != data:
             raise InputError(f"{path} is there and is another: give --replace, or another folder")
     for path, data in files.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         write_bytes(path, data)
     return list(files)

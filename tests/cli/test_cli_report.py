@@ -255,6 +255,18 @@ def test_records_are_shown_again_without_solving(lavender, path, tmp_path, monke
     assert (tmp_path / "r.jsonl").read_bytes() == before
 
 
+def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
+    bench.run([path], ["pgs"], bench.Plan((1e-3,), (4,), repeats=1), tmp_path / "r.jsonl")
+    head = (
+        (tmp_path / "r.jsonl").read_bytes().splitlines(keepends=True)[0]
+    )  # of a run that was stopped at once
+    for left in (b"", b"\n", head):
+        (tmp_path / "r.jsonl").write_bytes(left)
+        code, _, said = lavender("report", tmp_path / "r.jsonl", "--out", tmp_path / "again")
+        assert (code, "holds no records" in said) == (2, True)
+        assert not (tmp_path / "again").exists()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     # A problem that nothing solves in the time: every run to a level takes its limit.

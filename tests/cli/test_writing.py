@@ -233,7 +233,34 @@ COMMANDS = [
     ("phenomena", "slide", "--steppers", "impulses", "--engines", "none", "--out", "phenomena.json"),
     ("export", "c", "c", "--for", "report"),
     ("web", "page", "page"),
+    ("problems", "@hard", "--page", "set.md"),
 ]  # fmt: skip
+INTO_FOLDERS = [
+    ("report", "stack(n=2)", "--solvers", "pgs", "--out"),
+    ("run", "stack", "--steps", "3", "--record"),
+    ("export", "c"),
+    ("web", "page"),
+    ("problems", "@hard", "--out"),
+]
+
+
+@pytest.mark.parametrize("words", INTO_FOLDERS, ids=lambda words: words[0])
+def test_a_folder_that_cannot_be_made_is_named_in_words(words, lavender, tmp_path, monkeypatch):
+    """Some file systems tell only when they are asked: /proc is writable to root, and makes nothing."""
+    if words[0] == "export":
+        pytest.importorskip("Cython", reason="the export translates the kernels (extra: test)")
+    make, folder = os.mkdir, tmp_path / "new"
+
+    def mkdir(path, *more, **others):
+        if os.fspath(path) == str(folder):
+            raise OSError(errno.ENOENT, os.strerror(errno.ENOENT), path)
+        make(path, *more, **others)
+
+    monkeypatch.setattr(os, "mkdir", mkdir)
+    code, _, said = lavender(*words, folder)
+    assert code == 2
+    why = f"cannot make the folder {folder}: {os.strerror(errno.ENOENT)}; give another path"
+    assert said.splitlines()[-1] == f"lavender: {why}"
 
 
 def test_every_command_writes_files_under_other_names_first(tmp_path):
@@ -270,6 +297,7 @@ def test_every_command_writes_files_under_other_names_first(tmp_path):
         "c",
         "page",
         "phenomena.json",
+        "set.md",
     }
     assert done.stdout.splitlines()[-1] == "OPENED ['report/records.jsonl', 'report/records.jsonl.lock']"
 

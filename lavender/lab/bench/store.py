@@ -18,7 +18,7 @@ from typing import Any
 
 from lavender.base.arrays import table_of
 from lavender.base.errors import InputError
-from lavender.io.stored import MAX_BYTES, as_path, destination, write_atomically, write_text
+from lavender.io.stored import MAX_BYTES, as_path, destination, make_folder, write_atomically, write_text
 from lavender.lab.bench.lock import Lock
 from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 
@@ -174,8 +174,8 @@ class Store:
 
     def __init__(self, path: str | Path) -> None:
         self.path, real = as_path(path), destination(path)
+        make_folder(self.path.parent)
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock = Lock(real)  # one for all names of a file
             try:
                 self.records = read(self.path) if self.path.exists() else Records()

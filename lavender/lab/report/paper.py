@@ -19,7 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lavender.base.errors import InputError
-from lavender.io.stored import SUFFIXES, write_figure, write_text
+from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench.record import file_name, level_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report import contents, tables
@@ -65,8 +65,8 @@ def write_paper(report: Report, folder: str | Path) -> Path:
         _leading(figure, report.verdict.leaders) for group in groups for fs in group.values() for figure in fs
     ]
     look = looks({c.solver for figure in some for c in figure.curves})
+    make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for figure in some:
             canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
             write_figure(canvas, folder / _file(figure), metadata={"CreationDate": None, "Producer": None})

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lavender.base.errors import InputError
-from lavender.io.stored import write_text
+from lavender.io.stored import make_folder, write_text
 from lavender.lab.report.curves import Figure
 from lavender.lab.report.draw import save
 from lavender.lab.report.page import environment
@@ -53,9 +53,9 @@ class Sheet:
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """`index.html`, `numbers.json` and `figures/*.svg, *.png`; the path of the page."""
         folder = Path(folder)
+        make_folder(folder / "figures")
         drawn = [f for part in self.parts for f in part.figures if f.curves]
         try:
-            (folder / "figures").mkdir(parents=True, exist_ok=True)
             write_text(folder / "index.html", self.html())
             write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
             for figure in drawn:

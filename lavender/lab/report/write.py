@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lavender.base.errors import InputError
-from lavender.io.stored import write_text
+from lavender.io.stored import make_folder, write_text
 from lavender.lab.bench.store import Records, write_csv, write_json
 
 if TYPE_CHECKING:
@@ -46,10 +46,9 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
         raise InputError(
             f"found is a {type(found).__name__}; Records, as lavender.lab.bench.run returns them, or a Report"
         )
-    folder = Path(folder)
     drawn = figures_of(report.records)
+    folder = make_folder(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         write_csv(report.given, folder / "records.csv")
         write_json(report.given, folder / "records.json")
         index = folder / "index.html"
@@ -71,7 +70,7 @@ def _save(drawn: Figures, solvers: set[str], folder: Path) -> None:
     from lavender.lab.report.draw import save
     from lavender.lab.report.style import looks
 
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     look = looks(solvers | {c.solver for figure in drawn for c in figure.curves})
     for figure in drawn:
         save(figure, look, folder)

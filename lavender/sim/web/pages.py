@@ -17,7 +17,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import writable, write_bytes, write_text
+from lavender.io.stored import make_folder, writable, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import page_scenes
 
@@ -63,7 +63,7 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
     """Write the page into a folder for any file server; nothing in it needs Python or a network. Returns index.html."""
-    writable(folder, folder=True)
+    make_folder(writable(folder, folder=True))
     modules = {name: module(say, name) for name in wasm.PARTS}
     try:
         shutil.copytree(HERE / "page", folder, copy_function=_copy, dirs_exist_ok=True)
