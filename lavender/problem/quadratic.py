@@ -53,6 +53,8 @@ FAR = 1e3  # v* over the size of x that right-hand sides, or else q, let one exp
 # over velocities; and of more than MANY variables than that call; variables up to which it does not.
 FILLED, WHOLLY, MANY, FEW = 1.0, 3.0, 300, 100
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where q is zero: all of them may vanish
+TINY = 1e-300  # beside x = 0
+BALANCED = 10  # passes by which units of variables without a P_ii are found: factors of 1e4 are left at 1.01
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
@@ -75,7 +77,8 @@ class QPSolution:
     solution : Solution or None
         Of the constraint problem: status, work, certificate.
     ray : (n,), or None
-        A direction in which the objective falls for ever, |ray| = 1 in its largest entry: the program is unbounded.
+        A direction in which the objective falls for ever, |ray| = 1 in its largest entry, where a point that fulfils
+        the constraints was found: the program is unbounded.
     tol : float
         The error that was asked for.
     """
@@ -111,12 +114,23 @@ class QPSolution:
         if largest(qp.target) == 0.0:  # x = 0 may be the solution
             least = FLAT * largest(of.velocity_of(of.v_free))
         if largest(qp.q) == 0.0:  # all forces may vanish; with q an x that runs away must not excuse it
-            curved = FLAT * largest(of.operator.mass[2])
+            curved = FLAT * min(largest(of.operator.mass[2]), self._unseen / max(largest(self.x), TINY))
         found: tuple[float, ...] = program_residuals(
             self.x, qp.q, self._curvature, of.force(self.impulse), of.velocity_of(self.x), qp.target, self.impulse,
             qp.free, least, curved,
         )  # fmt: skip
         return found
+
+    @property
+    def _unseen(self) -> float:
+        """max_i sum_j |P_ij| X_j (force): a share of X_j more of x_j is no more than that share in any row of J."""
+        of, x = self.qp.generalized, np.abs(self.x)
+        jac = abs(of.jac).tocoo()
+        row = np.maximum(abs(of.jac) @ x, np.abs(self.qp.target))
+        far = np.full(len(x), np.inf)
+        np.minimum.at(far, jac.coords[1], row[jac.coords[0]] / jac.data)
+        far = np.where(far < np.inf, far, x.max(initial=0.0))  # of variables in no row
+        return float((abs(of.mass) @ far).max(initial=0.0))
 
     @property
     def objective(self) -> float:
@@ -143,8 +157,9 @@ class QPSolution:
         """The largest of the three, each relative to what it is the sum of; 0 is a solution.
 
         The primal residual over the largest of |J x| and |target|, where all targets are 0 of 1e-3 |J v*| too; the dual
-        one over the largest of |q|, |P x| and |J^T lambda|, where q is 0 of 1e-3 max |P_ij| max |x_i| too; the gap over
-        these two times the sums of |lambda| and |x|.
+        one over the largest of |q|, |P x| and |J^T lambda|; the gap over these two times the sums of |lambda| and |x|.
+        Where q is 0 all forces may vanish: then the dual one is over 1e-3 of the largest force of an x as large as rows
+        let one expect, too, or over 1e-3 max |P_ij| max |x_i| if that is less.
         """
         return self._residuals[3]
 
@@ -175,6 +190,8 @@ class QuadraticProgram:
         Variables of the rows of bounds.
     proximal : (n,) or None
         D, where P is singular.
+    unit : (n,) or None
+        P_ii, or what stands for it where it is 0, where P is singular: 1 / sqrt(unit) is a unit of each variable.
     """
 
     generalized: Generalized
@@ -188,6 +205,7 @@ class QuadraticProgram:
     lower: IntpArray | None
     upper: IntpArray | None
     proximal: FloatArray | None
+    unit: FloatArray | None
 
     @property
     def cones(self) -> Cones:
@@ -302,21 +320,22 @@ class QuadraticProgram:
 
     def ray(self, direction: FloatArray, tol: float) -> FloatArray | None:
         """A direction (n,) in unit length, if the objective falls along it for ever, to `tol`; else None."""
-        size = np.abs(direction).max(initial=0.0)
-        if self.proximal is None or not 0.0 < size < np.inf or not self.q @ direction < 0.0:
+        if self.proximal is None or self.unit is None or not self.q @ direction < 0.0:
             return None
-        d = direction / size
-        of, along = self.generalized, self.generalized.velocity_of(d)
+        root = np.sqrt(self.unit)
+        size = np.abs(root * direction).max()
+        if not size < np.inf:
+            return None
+        d = direction / size  # at most a unit of each variable
+        of = self.generalized
+        along = of.velocity_of(d)
         curved = np.abs(of.momentum_of(d) - self.proximal * d)
         short = np.concatenate([np.abs(along[: self.free]), -along[self.free :]])
-        heavy, rows = largest(of.operator.mass[2]), largest(of.operator.jac[2])
-        steep = -float(self.q @ d) > tol * largest(self.q)
-        if not steep or curved.max() > tol * heavy or short.max(initial=0.0) > tol * rows:
-            return None
-        # Each row by its own largest entry: units of rows do not matter.
-        each = tuple(abs(matrix).max(axis=1).toarray().ravel() for matrix in (of.mass, of.jac))
-        falls = (curved <= tol * each[0]).all() and (short <= tol * each[1]).all()
-        return read_only(d) if falls else None
+        # Each row by the most that a unit of one variable does in it: units of rows and variables do not matter.
+        each = _largest_of_rows((of.jac.indptr, of.jac.indices, of.jac.data), root)
+        steep = -float(self.q @ d) > tol * np.abs(self.q / root).max()
+        falls = steep and (curved <= tol * root).all() and (short <= tol * each).all()
+        return read_only(d / np.abs(d).max()) if falls else None
 
 
 @lru_cache(maxsize=8)  # programs of one controller have the same
@@ -350,10 +369,10 @@ def quadratic(given: Given) -> QuadraticProgram:
         rows.bounds(low, lb, 1.0)
         rows.bounds(up, ub, -1.0)
     jac, target = rows.stacked
-    generalized, proximal = _definite(lower, jac, q, read_only(target))
+    generalized, proximal, unit = _definite(lower, jac, q, read_only(target))
     return QuadraticProgram(
         generalized=generalized, q=q, target=target, free=free, n_equalities=n_a, n_inequalities=n_g, kept=kept,
-        fixed=fixed, lower=low, upper=up, proximal=proximal,
+        fixed=fixed, lower=low, upper=up, proximal=proximal, unit=unit,
     )  # fmt: skip
 
 
@@ -464,15 +483,15 @@ def _check_bounds(lb: FloatArray, ub: FloatArray) -> None:
 
 def _definite(
     lower: Compressed, jac: Compressed, q: FloatArray, target: FloatArray
-) -> tuple[Generalized, FloatArray | None]:
-    """J, M = P + D and D, None where P is positive definite."""
+) -> tuple[Generalized, FloatArray | None, FloatArray | None]:
+    """J, M = P + D, D and the units of variables, None where P is positive definite."""
     momentum = -q
     plain = _shifted(lower, jac, None, momentum)
     if plain is not None and plain.operator.least_pivot > SINGULAR:
-        return plain, None
+        return plain, None, None
     diagonal = lower[2][lower[0][1:] - 1]
     zero = diagonal == 0.0
-    unit = np.where(zero, diagonal.max(initial=0.0) or 1.0, diagonal)
+    unit = _units(jac, diagonal) if zero.any() else diagonal
     d = np.where(zero, PROXIMAL * unit, 0.0)
     made = _shifted(lower, jac, d, momentum) if zero.any() and _rows_are_empty(lower, zero) else None
     if made is None:
@@ -481,14 +500,45 @@ def _definite(
         d = PROXIMAL * unit
         made = _shifted(lower, jac, d, momentum)
         assert made is not None  # as with less
-    size, asked = np.abs(jac[2]).max(initial=0.0), np.abs(target).max(initial=0.0)
-    expected = asked / size if size > 0.0 < asked else np.abs(momentum / unit).max(initial=0.0)
-    far = np.abs(made.v_free).max() / (FAR * expected) if expected > 0.0 else 0.0
+    root = np.sqrt(unit)
+    size = _largest_of_rows(jac, root)
+    expected = np.abs(target[size > 0.0] / size[size > 0.0]).max(initial=0.0) or np.abs(momentum / root).max(
+        initial=0.0
+    )
+    far = np.abs(root * made.v_free).max(initial=0.0) / (FAR * expected) if expected > 0.0 else 0.0
     if far > 1.0:
         d = far * d
         made = _shifted(lower, jac, d, momentum)
         assert made is not None
-    return made, read_only(d)
+    return made, read_only(d), read_only(unit)
+
+
+def _units(jac: Compressed, diagonal: FloatArray) -> FloatArray:
+    """P_ii, and where it is 0 what rows of J say of x_i beside other variables: entries J_ki / (r_k c_i) near 1.
+
+    c = sqrt(unit) and r are found as Ruiz (2001, A scaling algorithm to equilibrate both rows and columns norms in
+    matrices) does, with c kept where P_ii > 0.
+    """
+    ptr, idx, val = jac
+    c = np.sqrt(np.where(diagonal > 0.0, diagonal, diagonal.max(initial=0.0) or 1.0))
+    row = np.repeat(np.arange(len(ptr) - 1), np.diff(ptr))
+    r, held, size = np.ones(len(ptr) - 1), diagonal > 0.0, np.abs(val)
+    for _ in range(BALANCED):
+        entry = size / (r[row] * c[idx])
+        for scale, at in ((r, row), (c, idx)):
+            most = np.zeros(len(scale))
+            np.maximum.at(most, at, entry)
+            scale *= np.sqrt(np.where(most > 0.0, most, 1.0))
+        c[held] = np.sqrt(diagonal[held])
+    return c * c
+
+
+def _largest_of_rows(jac: Compressed, root: FloatArray) -> FloatArray:
+    """max_i |J_ki| / root_i of each row k."""
+    ptr, idx, val = jac
+    most = np.zeros(len(ptr) - 1)
+    np.maximum.at(most, np.repeat(np.arange(len(ptr) - 1), np.diff(ptr)), np.abs(val) / root[idx])
+    return most
 
 
 def _shifted(

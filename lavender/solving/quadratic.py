@@ -20,8 +20,11 @@ import numpy as np
 from lavender.base.arrays import FloatArray, number, read_only
 from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.errors import InputError
+from lavender.base.later import sparse as sp
 from lavender.judge.solution import Claim, Solution, Status
 from lavender.problem import Problem, QPSolution
+from lavender.problem.generalized import Generalized
+from lavender.problem.quadratic import QuadraticProgram
 from lavender.solvers.certify import least_violation
 from lavender.solvers.registry import SMALL_ROWS, get
 from lavender.solvers.solve_log import SolveLog
@@ -31,7 +34,7 @@ STEPS = 50  # proximal steps
 SLOW = 0.1  # where a step leaves more than this of the error, the next has
 SOFTER = 0.1  # this share of D, as long as
 ROUNDING = 1e-13  # of v*, over |x|, is less than the error; where it is more, the next step has more of D
-SOFTEST = 1e-10  # of the largest entry of M, up to which D is made softer: M stays definite
+SOFTEST = 1e-10  # of the unit of each variable, up to which D is made softer: M stays definite
 IDLE = 10  # steps in a row without a smaller error, after which no other is made,
 FAILED = 3  # and so many that stall
 TIGHTEST = 1e-15  # tol of a step
@@ -41,7 +44,9 @@ HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 # Nothing better comes of the same problem; of another centre something may.
 ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
-UNBOUNDED = 1e-7  # relative: a direction along which x ran away, and the objective falls
+UNBOUNDED = (
+    1e-7  # relative: a direction along which x ran away, and the objective falls; a point where it may begin
+)
 
 
 def solve_qp(
@@ -99,22 +104,28 @@ def solve_qp(
     step = _over_rows if sparse else _over_velocities
     solution, x = step(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)
-    centre, tightest, before, idle, failed = None, tol, np.inf, 0, 0
+    centre, tightest, before, idle, failed, point = None, tol, np.inf, 0, 0, None
     if answer.error <= tol and qp.proximal is None:
         return answer
     for _ in range(STEPS):
         if solution.status in ENDS:
             return answer
         ray = qp.ray(answer.x if centre is None else answer.x - centre, UNBOUNDED)
-        if ray is not None:
-            return replace(answer, ray=ray)
         left = end - perf_counter()
+        if ray is not None and point is None and left > 0.0:
+            limit = None if time_limit is None else left
+            point = solve(_nearest(problem, qp), solver, tol=UNBOUNDED, time_limit=limit, **options)
+            if point.status is Status.INFEASIBLE:
+                return replace(answer, solution=point)
+            if point.success or point.residual.at_floor:
+                return replace(answer, ray=ray)
+            left = end - perf_counter()
         if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH[qp.proximal is not None]:
             break
         if qp.proximal is not None:
             slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
             rough = solution.status in HARD or ROUNDING * _distance(answer) > answer.error
-            soft = slow and qp.proximal.max() > SOFTEST * np.abs(qp.generalized.operator.mass[2]).max()
+            soft = slow and (qp.proximal / qp.unit).max() > SOFTEST
             qp = qp.around(centre, 1.0 / SOFTER if rough else SOFTER if soft else 1.0)
             general = qp.generalized
             problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
@@ -132,6 +143,13 @@ def solve_qp(
         if idle == IDLE or failed == FAILED:
             break
     return best
+
+
+def _nearest(problem: Problem, qp: QuadraticProgram) -> Problem:
+    """min sum unit_i x_i^2 under the same constraints: a solution is a feasible point, a certificate the program's."""
+    assert qp.unit is not None
+    general = Generalized(qp.generalized.jac, sp.diags_array(qp.unit), np.zeros(len(qp.q)))
+    return replace(problem, generalized=general, b=qp.target, qp=None, guess=None, copy=False)
 
 
 Step = tuple[Solution, FloatArray | None]  # and x, where it is known better than by the impulses

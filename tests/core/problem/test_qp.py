@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import scipy.sparse as sp
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from random_problems import seeds
 
 import lavender as lv
@@ -270,6 +270,48 @@ def test_a_program_without_a_feasible_point_is_infeasible_though_its_objective_f
     assert answer.solution.status is lv.Status.INFEASIBLE
     assert answer.ray is None
     assert str(answer).startswith("not solved")
+
+
+@pytest.mark.parametrize("solver", ["auto", "newton", "pgs", "nncg", "admm", "osqp"])
+@pytest.mark.parametrize("tol", [1e-3, 1e-9])
+def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, tol):
+    """x_0 falls for ever; rows ask x_1 + x_2 <= -1 and >= 1, and x_2 <= 1 + x_0 for a coupling."""
+    rows = np.array([[0.0, 1.0, 1.0], [0.0, -1.0, -1.0], [-1.0, 0.0, 1.0]])
+    program = {"P": np.diag([0.0, 1.0, 0.0]), "q": [-1.0, 0.5, 0.0], "G": rows}
+    none, some = (
+        lv.solve_qp(lv.Problem.from_qp(**program, h=[-1.0, side, 1.0]), solver, tol=tol)
+        for side in (-1.0, 1.0)
+    )
+    assert none.ray is None and not none.found
+    assert some.ray is not None and not some.found
+
+
+@given(seed=seeds)
+@example(seed=187)  # found, and a ray in other units
+@example(seed=287)  # a proximal step whose M was not definite
+@example(seed=319)
+def test_units_of_variables_and_rows_change_neither_verdict_nor_objective(seed):
+    """Where q = 0 an objective 40 times the least was found; a curvature that is small in one unit was no curvature."""
+    qp, rng = drawn(seed, singular=True), np.random.default_rng(seed)
+    n = len(qp["q"])
+    if rng.random() < 0.3:
+        qp["q"] = np.zeros(n)
+    for bound, far in (("lb", -np.inf), ("ub", np.inf)):  # so that some are unbounded
+        qp[bound] = np.where(rng.random(n) < 0.3, far, qp[bound])
+    units, other = 10.0 ** rng.uniform(-4.0, 4.0, n), dict(qp)
+    other["P"], other["q"] = units * (qp["P"] * units).T, units * qp["q"]
+    other["lb"], other["ub"] = qp["lb"] / units, qp["ub"] / units
+    for matrix, side in (("A", "b"), ("G", "h")):
+        if qp[matrix] is not None:
+            of_rows = 10.0 ** rng.uniform(-4.0, 4.0, len(qp[side]))
+            other[matrix], other[side] = of_rows[:, None] * qp[matrix] * units, of_rows * qp[side]
+    one, two = (lv.solve_qp(lv.Problem.from_qp(**each)) for each in (qp, other))
+    assert not (one.found and two.ray is not None) and not (two.found and one.ray is not None)
+    if one.found and two.found:
+        x = np.abs(one.x)
+        size = 1.0 + x @ np.abs(qp["P"]) @ x + np.abs(qp["q"]) @ x
+        # Errors of 1e-9 are relative to the largest force: of one in a unit 1e8 times as small they are more.
+        assert abs(one.objective - two.objective) <= 1e-3 * size
 
 
 @pytest.mark.parametrize("tol", [1e-2, 1e-3, 1e-4, 1e-9])
