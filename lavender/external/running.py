@@ -27,6 +27,7 @@ EPS_MIN = 1e-14  # asked of a backend at the least: its own arithmetic stops the
 GAP_MIN = 1e-18
 # Of the objective: what the sums of a gap lose to rounding at a large mass ratio; and when asked again.
 GAP_RELATIVE, GAP_RELATIVE_MIN = 1e-13, 1e-16
+LEFT = 1e-8  # relative residual that a gap of GAP_RELATIVE_MIN may leave, as its root
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,17 @@ def ask(
         status = Status.STALLED
     if tol == 0.0 and status is Status.CONVERGED:
         status, words = Status.STALLED, f"{words}; tol=0: ran at its tightest tolerance"
-    return replace(claim, status=status, message=words, work=work, iterations=work.get("iterations", 0))
+    elif status is Status.CONVERGED and relative > tol and not at_floor(relative, floor):
+        # Its tests are of other norms: it says nothing false where it could not be asked more closely.
+        if limits:
+            status = Status.TIME_LIMIT if deadline.passed() else Status.MAX_ITERATIONS
+            words = f"{words}; nothing was left to ask more closely"
+        elif relative <= LEFT:
+            status, words = Status.STALLED, f"{words}; its own tests were met at their tightest"
+    done = work.get("iterations", 0)
+    if done > max_iter:
+        words = f"{words}; {done} iterations, where {max_iter} were asked for at most"
+    return replace(claim, status=status, message=words, work=work, iterations=done)
 
 
 def _levels(problem: Problem, tol: float, max_iter: int, time_limit: float | None) -> list[Limits]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from threading import Lock
 from time import perf_counter
@@ -46,6 +47,9 @@ COUNTED = 0.9e9  # ns that a small call may be counted for, for each second of i
 SET_UP_LATE = "what has to be set up first takes longer than the time limit"
 NO_TURN = "the time limit was over before its turn: the start"
 JUDGE_LATE = "what the judge reads takes longer than the time limit: the start, unjudged"
+WITHOUT_SCIPY = (
+    "without SciPy, which this process has not loaded: import scipy.linalg.lapack, scipy.sparse before"
+)
 FRONT_DOOR = ("impulse", "tol", "max_iter", "time_limit", "history", "callback")
 
 
@@ -322,6 +326,8 @@ class Prepared:
             claim = loop.run(max_iter) if spec.resumable else loop.run_once(max_iter)
             if claim.status is TIME_LIMIT:
                 loop.not_worse(start)
+                if spec.delegates and problem.m > SMALL_ROWS and loading(*SCIPY):
+                    claim = replace(claim, message=f"{claim.message}; {WITHOUT_SCIPY}")
         solution = finish(
             problem, spec, self.options, loop.impulse, claim, loop.tol, setup_time, loop.time, loop.recorded(),
             float(getattr(self.state, "sweeps_per_decade", math.nan)),

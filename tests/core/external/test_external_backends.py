@@ -401,6 +401,26 @@ def test_a_claim_that_the_judge_does_not_find_is_asked_again_then_marked(registe
     assert "above tol" in solution.contradicted
 
 
+@pytest.mark.parametrize(
+    ("off", "max_iter", "status", "words"),
+    [
+        (0.0, 100, lv.Status.CONVERGED, "solved"),
+        (1e-4, 7, lv.Status.MAX_ITERATIONS, "nothing was left to ask more closely"),
+        (1e-9, 100, lv.Status.STALLED, "its own tests were met at their tightest"),
+    ],
+)
+def test_tests_of_other_norms_are_no_false_claim(off, max_iter, status, words, register):
+    def call(qp, impulse, limit, extra):  # A is the unit matrix: the solution is -q
+        x = -(1.0 + off) * qp.q
+        return Answer(lv.Status.CONVERGED, "solved", x, np.zeros(0), np.zeros(qp.n), work={"iterations": 7})
+
+    replaced(register, "osqp", call)
+    solution = lv.solve(lv.Problem.lcp(np.eye(3), np.ones(3)), "osqp", tol=1e-12, max_iter=max_iter)
+    assert solution.status is status and words in solution.message
+    assert not solution.contradicted and solution.success == (off == 0.0)
+    assert solution.iterations == 7 * solution.work["backend_calls"]
+
+
 def test_the_best_of_several_answers_is_returned(register):
     problem = lv.Problem.lcp(np.eye(3), np.ones(3))
     answers = iter([1.5, 1.001, 1.2])

@@ -295,6 +295,41 @@ print(*(lv.solve(problem, {name!r}, time_limit=0.2).success for _ in range(3)))
     assert "True" in python("-c", code).stdout
 
 
+def test_auto_says_what_it_went_without():
+    code = """
+import numpy as np
+import lavender as lv
+
+half = np.random.default_rng(0).normal(size=(200, 100)) * 0.9 ** np.arange(100)  # no sweeps solve it in 0.2 s
+problem = lv.Problem.lcp(half @ half.T, half[:, 0])
+print(lv.solve(problem, tol=1e-13, time_limit=0.2))
+import scipy.linalg.lapack, scipy.sparse
+print(lv.solve(problem, tol=1e-13, time_limit=0.2))
+"""
+    before, after = python("-c", code).stdout.splitlines()
+    assert "import scipy.linalg.lapack, scipy.sparse before" in before
+    assert "scipy" not in after
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_limit_shorter_than_any_call_gives_a_solution_or_the_better_of_start_and_nothing(form):
+    solved = []
+    problems = [
+        FORMS[form](random_contact_problem(seed, law, 2, False))
+        for seed, law in enumerate(("coulomb", "cone"))
+    ]
+    for problem in (*problems, lv.Problem.lcp(np.eye(2), [1.0, 2.0])):
+        for name in lv.available(problem):
+            for start in (None, np.full(problem.m, 0.1)):
+                if not registry.get(name).external:
+                    made = lv.solve(fresh(problem), name, impulse=start, time_limit=1e-9)
+                    began = lv.residual(problem, problem.start() if start is None else start).relative
+                    assert made.success or made.status is lv.Status.TIME_LIMIT
+                    assert made.residual.relative <= began and not made.contradicted
+                    solved.append(made.success)
+    assert any(solved) and not all(solved)
+
+
 def test_the_package_loads_what_auto_needs_and_a_name_its_own_file():
     """Files of the others, and what nobody needs, are a quarter of what `import lavender` adds to NumPy."""
     code = """
