@@ -53,8 +53,8 @@ def as_array(
 ) -> np.ndarray:
     """`value` as a private read-only C-contiguous array of the given shape (None: any length).
 
-    A scalar fills a one-dimensional shape of known length. With `copy=False` an array that already
-    fits is adopted and marked read-only.
+    A scalar fills a one-dimensional shape of known length; an empty list is no rows of any length. With `copy=False`
+    an array that already fits is adopted and marked read-only.
 
     Raises
     ------
@@ -92,6 +92,9 @@ def as_array(
     if given.ndim == 0 and len(shape) == 1 and shape[0] is not None:
         given = np.full(shape[0], given)
         copy = False
+    rest = shape[1:]
+    if given.shape == (0,) and rest and not shape[0] and None not in rest:
+        given = given.reshape(0, *rest)  # an empty list, of rows as of numbers
     if not _fits(given.shape, shape):
         sizes = ", ".join("any" if n is None else str(n) for n in shape)
         wanted = f"({sizes}{',' * (len(shape) == 1)})"

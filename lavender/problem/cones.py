@@ -20,12 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from lavender.base.arrays import (
+    ArrayLike,
     FloatArray,
     IntArray,
     as_array,
@@ -131,6 +132,13 @@ class Cones:
     rolling: FloatArray = field(default_factory=tuple)  # type: ignore[arg-type]  # (k,) m, read on CONTACT_ROLLING; (): 0
     _blocks: ClassVar[kernels.Blocks]  # of an instance: the same arrays, as kernels read them
 
+    if TYPE_CHECKING:  # what may be given; fields are arrays
+
+        def __init__(
+            self, ptr: ArrayLike, kind: ArrayLike, lower: ArrayLike, upper: ArrayLike, mu: ArrayLike,
+            patch_radius: ArrayLike, rolling: ArrayLike = ...,
+        ) -> None: ...  # fmt: skip
+
     def __post_init__(self) -> None:
         given: Any = self.rolling
         if isinstance(given, tuple) and not given:
@@ -220,16 +228,16 @@ class Cones:
         return kernels.Blocks(ptr, kind, lower, upper, mu, radius, rolling)
 
     @classmethod
-    def bounded(cls, lower: FloatArray, upper: FloatArray | float) -> Cones:
+    def bounded(cls, lower: ArrayLike, upper: ArrayLike) -> Cones:
         """One ROW block for each pair of bounds, lower <= lambda <= upper: arrays (m,) [N s], or upper inf for all."""
         made = kernels.bounded_rows(lower, upper)
         if made is not None:
             return cls._of(made)
-        lower = as_array("lower", lower, (None,), finite=False, unit="N s")
-        m = len(lower)
-        upper = as_array("upper", upper, (m,), finite=False, unit="N s")
+        low = as_array("lower", lower, (None,), finite=False, unit="N s")
+        m = len(low)
+        high = as_array("upper", upper, (m,), finite=False, unit="N s")
         return cls(
-            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), lower, upper, np.zeros(m), np.zeros(m)
+            np.arange(m + 1, dtype=np.int32), np.zeros(m, np.int32), low, high, np.zeros(m), np.zeros(m)
         )
 
     @classmethod

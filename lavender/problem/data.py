@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -88,6 +88,15 @@ class ProblemData:
     precision: str = ""
     qp: Any = field(default=None, repr=False, compare=False)
     derived: Derived = field(init=False, repr=False)
+
+    if TYPE_CHECKING:  # what may be given; fields are arrays
+
+        def __init__(
+            self, b: ArrayLike, cones: Cones, matrix: Any = ..., rows: Rows | None = ..., friction: str = ...,
+            compliance: ArrayLike | None = ..., guess: ArrayLike | None = ..., key: Any = ...,
+            names: Sequence[str] | None = ..., name: str = ..., copy: bool = ..., generalized: Generalized | None = ...,
+            precision: str = ..., qp: Any = ...,
+        ) -> None: ...  # fmt: skip
 
     def __post_init__(self) -> None:
         put = object.__setattr__

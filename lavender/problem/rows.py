@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lavender.base.arrays import (
+    ArrayLike,
     FloatArray,
     IntArray,
     as_array,
@@ -70,9 +71,10 @@ class Rows:
         True copies the arrays. False uses arrays without a copy if their type fits; they are then shared with the
         caller and marked read-only, and inertias are not symmetrised.
 
-    float32 arrays are converted to float64. Normals and tangents that differ from orthogonal unit vectors by up to 1e-5
-    are corrected, and so are inertias that are asymmetric by as much. If all arrays of numbers are float32, the
-    `precision` of the rows and of their problems is "float32".
+    An empty list stands for no joints, contacts or bodies. float32 arrays are converted to float64. Normals and
+    tangents that differ from orthogonal unit vectors by up to 1e-5 are corrected, and so are inertias that are
+    asymmetric by as much. If all arrays of numbers are float32, the `precision` of the rows and of their problems is
+    "float32".
 
     Raises
     ------
@@ -126,9 +128,17 @@ class Rows:
     copy: bool = field(default=True, repr=False)  # False: adopt arrays that fit, and mark them read-only
     precision = "float64"  # of the numbers given, no field; an instance of float32 has its own
 
+    if TYPE_CHECKING:  # what may be given; fields are arrays
+
+        def __init__(
+            self, inv_mass: ArrayLike, inv_inertia: ArrayLike, v_free: ArrayLike, jac: ArrayLike = ...,
+            joint_ptr: ArrayLike = ..., joint_body: ArrayLike = ..., normal: ArrayLike = ..., tangent: ArrayLike = ...,
+            arm_a: ArrayLike = ..., arm_b: ArrayLike = ..., contact_body: ArrayLike = ..., copy: bool = ...,
+        ) -> None: ...  # fmt: skip
+
     def __post_init__(self) -> None:
         masses, normals = shape_of("inv_mass", self.inv_mass), shape_of("normal", self.normal)
-        n, c = masses[0] if len(masses) == 1 else None, normals[0] if len(normals) == 2 else None
+        n, c = masses[0] if len(masses) == 1 else None, normals[0] if normals else None
         ptr = as_array("joint_ptr", self.joint_ptr, (None,), dtype=np.int32, copy=self.copy)
         if not checks.counts_up(ptr):
             raise InputError(

@@ -136,7 +136,8 @@ class SolverSpec:
     """
 
     name: str
-    factory: str | Callable[..., Solver]  # "module:attribute" is imported at first use
+    # Of a Solver, or of an object with its methods; "module:attribute" is imported at first use.
+    factory: str | Callable[..., Any]
     laws: frozenset[str]  # of LAWS: "linear", "lcp", "coulomb", "cone"
     summary: str
     reference: str = ""  # paper or manual

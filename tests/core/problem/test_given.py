@@ -1,0 +1,101 @@
+"""Lists and whole numbers are taken as arrays are, at run time and by mypy, which reads this file as a user's."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import lavender as lv
+
+NONE: list[float] = []
+
+
+def test_rows_of_lists_are_rows_of_arrays() -> None:
+    up, side, none = (0.0, 0.0, 1.0), [1, 0, 0], (0, 0, 0)
+    lists = lv.Rows(
+        inv_mass=[0.5],
+        inv_inertia=[np.eye(3) / 0.008],
+        v_free=[[0, 0, -0.16, 0, 0, 0]],
+        contact_body=[(-1, 0)],
+        normal=[up],
+        tangent=[side],
+        arm_a=[none],
+        arm_b=[(0.0, 0.0, -0.09)],
+    )
+    arrays = lv.Rows(
+        np.array([0.5]),
+        np.eye(3)[None] / 0.008,
+        np.array([[0.0, 0.0, -0.16, 0.0, 0.0, 0.0]]),
+        contact_body=np.array([[-1, 0]], np.int32),
+        normal=np.array([up]),
+        tangent=np.array([side], float),
+        arm_a=np.zeros((1, 3)),
+        arm_b=np.array([[0.0, 0.0, -0.09]]),
+    )
+    assert lists == arrays
+    problem = lv.Problem.from_rows(lists, target=0.6, mu=[0.5], key=[7])
+    solution: lv.Solution = lv.solve(problem, tol=1e-9, impulse=[0, 0, 0])
+    impulse: npt.NDArray[np.float64] = solution.impulse
+    assert lv.residual(problem, impulse.tolist()).relative == solution.residual.relative
+
+
+def test_cones_and_problems_of_lists_are_those_of_arrays() -> None:
+    cones = lv.Cones(ptr=[0, 1], kind=[0], lower=[0.0], upper=[1], mu=[0.0], patch_radius=[0.0])
+    assert cones == lv.Cones.bounded([0], [1.0]) == lv.Cones.bounded(np.zeros(1), 1.0)
+    problem = lv.Problem([1], cones, [[2.0]], guess=[0.5], key=[3], names=["a"])
+    assert problem == lv.Problem(
+        np.ones(1), cones, np.full((1, 1), 2.0), guess=np.array([0.5]), key=np.array([3]), names=("a",)
+    )
+    assert lv.Problem.lcp([[2.0]], [1], [0], [1]).cones == cones
+    general = lv.Problem.from_jacobian([[1.0]], [[0.5]], [-1], cones=cones, target=[0], compliance=[0.1])
+    assert general.b.tolist() == [1.0]
+
+
+class Halves:
+    """A solver of two methods."""
+
+    def prepare(self, problem: lv.Problem) -> lv.Problem:
+        return problem
+
+    def run(
+        self,
+        state: lv.Problem,
+        impulse: npt.NDArray[np.float64],
+        n: int,
+        tol: float,
+        time_limit: float | None,
+    ) -> lv.Claim:
+        impulse *= 0.5**n
+        return lv.Claim(lv.Status.MAX_ITERATIONS, n)
+
+
+def test_a_solver_that_derives_from_nothing_is_one(register: Any) -> None:
+    register(lv.SolverSpec(name="halves", factory=Halves, laws=frozenset({"lcp"}), summary=""))
+    solution = lv.solve(lv.Problem.lcp([[1.0]], [1.0]), "halves", impulse=[8.0], tol=0.0, max_iter=3)
+    assert solution.impulse.tolist() == [1.0]
+
+
+@pytest.mark.parametrize("bodies", [0, 2])
+def test_empty_lists_are_no_contacts_joints_or_bodies(bodies: int) -> None:
+    """What a loop over the contacts of a step leaves where there are none."""
+    mass, inertia, free = [1.0] * bodies, [np.eye(3)] * bodies, [np.ones(6)] * bodies
+    rows = lv.Rows(
+        mass,
+        inertia,
+        free,
+        jac=NONE,
+        joint_body=NONE,
+        contact_body=NONE,
+        normal=NONE,
+        tangent=NONE,
+        arm_a=NONE,
+        arm_b=NONE,
+    )
+    assert rows == lv.Rows(np.ones(bodies), np.tile(np.eye(3), (bodies, 1, 1)), np.ones((bodies, 6)))
+    problem = lv.Problem.from_rows(rows, target=NONE, mu=NONE)
+    assert problem.m == 0 and lv.solve(problem).success
+    with pytest.raises(lv.InputError, match=r"contact_body has shape \(1, 2\); \(0, 2\) is needed"):
+        lv.Rows(
+            mass, inertia, free, contact_body=[(-1, 0)], normal=NONE, tangent=NONE, arm_a=NONE, arm_b=NONE
+        )
