@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only
+from lavender.base.arrays import FloatArray, number, read_only
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError
 from lavender.judge.residuals import reference, residual
@@ -42,7 +42,8 @@ class Foreign(Solver):
 
     def setup_time(self, problem: Problem) -> float:
         """What its `prepare` takes [s]; 0 where it does not say."""
-        return self._if_there("setup_time", problem) or 0.0
+        counted = self._if_there("setup_time", problem)
+        return 0.0 if counted is None else number(f"setup_time of solver {self.name!r}", counted, low=0.0)
 
     def ready(self, held: Held, time_limit: float) -> None:
         """Start processes."""
@@ -63,15 +64,14 @@ class Foreign(Solver):
     def run(
         self, held: Held, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        """`max_iter` more iterations on a copy of the impulse; the result is copied back."""
+        """`max_iter` more iterations on a copy of the impulse; what it has come to is copied back."""
         handed = impulse.copy()
-        kept = False
         try:
             claim = self.solver.run(held.state, handed, max_iter, tol, time_limit)
-        finally:  # Ctrl-C: what it has come to is the result
-            kept = handed.shape == impulse.shape and handed.dtype == impulse.dtype
-            if kept:
-                impulse[:] = handed
+        except KeyboardInterrupt:
+            _copy_back(handed, impulse)
+            raise
+        kept = _copy_back(handed, impulse)
         wrong = (
             "" if kept else f"made of the impulse an array of shape {handed.shape} and dtype {handed.dtype}"
         )
@@ -140,6 +140,14 @@ class Held:
         """Its `sweeps_per_decade`; NaN if that is not a number."""
         found = getattr(self.state, "sweeps_per_decade", math.nan)
         return float(found) if isinstance(found, (int, float, np.number)) and found > 0.0 else math.nan
+
+
+def _copy_back(handed: FloatArray, impulse: FloatArray) -> bool:
+    """Whether what a solver had in its hands is an array of the same kind still."""
+    kept = handed.shape == impulse.shape and handed.dtype == impulse.dtype
+    if kept:
+        impulse[:] = handed
+    return kept
 
 
 def _counts(n: Any) -> bool:

@@ -94,6 +94,35 @@ def test_what_a_plug_in_says_stands_on_one_line(plug_in):
     assert lv.solve(TINY, plug_in(fails)).message == "ArithmeticError: two lines"
 
 
+@pytest.mark.parametrize("resumable", [True, False])
+def test_what_breaks_down_keeps_the_iterate_of_the_last_call_that_returned(resumable, plug_in):
+    def fails(problem, impulse):
+        impulse[:] = 1e3
+        raise np.linalg.LinAlgError("singular")
+
+    start = 0.5 * np.ones(TINY.m)
+    solution = lv.solve(TINY, plug_in(fails, resumable=resumable), impulse=start)
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert solution.impulse.tolist() == start.tolist()
+
+
+@pytest.mark.parametrize("counted", ["long", -1.0, float("nan")])
+def test_a_set_up_time_that_is_none_is_refused_by_the_solver_s_name(counted, register):
+    class Wrong:
+        def prepare(self, problem):
+            return problem
+
+        def run(self, state, impulse, n, tol, time_limit):
+            return lv.Claim(lv.Status.MAX_ITERATIONS, n)
+
+        def setup_time(self, problem):
+            return counted
+
+    register(named("wrong", factory=Wrong))
+    with pytest.raises(lv.InputError, match="setup_time of solver 'wrong' is"):
+        lv.solve(TINY, "wrong", time_limit=10.0)
+
+
 def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.MAX_ITERATIONS, 7, {}))
     solution = lv.solve(TINY, name, max_iter=5)
