@@ -94,8 +94,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     and its steps are recorded in the folder of the report. A records.jsonl is shown again
     without solving. After an interruption, the same command continues where it stopped.
 
-    Exit code 1: a file in a folder cannot be read, or a step could not be recorded. Exit code 2: a named file cannot
-    be read, or another report is writing to the folder.
+    Exit code 1: a file in a folder cannot be read, a step could not be recorded, or nothing was measured. Exit code 2:
+    a named file cannot be read, or another report is writing to the folder.
     """
     from lavender.lab import bench
     from lavender.lab.report.engine import contestants
@@ -145,6 +145,10 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
     if done.stopped:
         console().print("[yellow]Stopped; the same command continues from here.[/]")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
+    if not (again or done.records.records):
+        why = "; ".join(dict.fromkeys(skip.reason for skip in done.records.skips))
+        _say(f"nothing was measured: {why}", style="yellow")
+        raise click.exceptions.Exit(EXIT_UNMET)
     if done.lost and not again:
         _say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -95,6 +95,8 @@ def ask(
     start, best = impulse.copy(), None
     work: dict[str, int] = {"backend_calls": 0}
     w, e = np.empty(problem.m), np.empty(problem.m)
+    if tol > 0.0 and quick(problem, impulse, w, e)[0] == 0.0:
+        return Claim(Status.CONVERGED, 0, work, "the start is a solution", qp.form)
     limits = _levels(problem, tol, max_iter, time_limit)
     while limits:
         last = _once(qp, impulse, call, limits.pop(0), settings, noisy)

@@ -267,6 +267,13 @@ def test_a_file_without_a_record_is_refused(lavender, path, tmp_path):
         assert not (tmp_path / "again").exists()
 
 
+def test_a_report_that_measured_nothing_says_why(lavender, tmp_path):
+    lv.Problem.contact(np.eye(3), [1.0, 2.0, 0.0], mu=[0.5]).save(tmp_path / "friction.npz")
+    code, out, _ = lavender("report", tmp_path / "friction.npz", "--solvers", "direct")
+    assert code == 1
+    assert "nothing was measured: takes laws linear, lcp, not 'coulomb'" in out
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 def test_ctrl_c_keeps_the_records_and_writes_the_page(tmp_path):
     # A problem that nothing solves in the time: every run to a level takes its limit.

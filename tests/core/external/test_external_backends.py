@@ -146,6 +146,14 @@ def test_asymmetric_and_negative_diagonals_are_refused_with_the_reason(name):
 
 
 @pytest.mark.parametrize("name", BACKENDS)
+@pytest.mark.parametrize("b", [[0.0, 0.0], [0.0, -1.0]])
+def test_where_doing_nothing_is_right_no_rounding_of_a_backend_is_a_false_claim(name, b):
+    """Nothing is left to be relative to: an impulse of 1e-12 has an infinite residual."""
+    solution = lv.solve(lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], b), name)
+    assert solution.success and not solution.contradicted and not solution.impulse.any()
+
+
+@pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("linear", [True, False])
 def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
     a, b = np.array([[1.0, -1.0], [-1.0, 1.0]]), np.array([1.0, 1.0])
