@@ -169,6 +169,7 @@ class SolverSpec:
     small: SmallCall | None = (
         None  # problems of few rows with default options, in one compiled call; asked of our own alone
     )
+    plugged = False  # found by its entry point, as another process finds it
     own = False  # of this package; other solvers get copies, and what they return is checked (`external/foreign.py`)
 
     def __post_init__(self) -> None:
@@ -334,6 +335,7 @@ def fill() -> None:
             spec = entry.load()
             spec = spec if isinstance(spec, SolverSpec) else spec()
             _add(spec, replace=False)
+            object.__setattr__(spec, "plugged", True)
         except Exception as error:  # a plug-in may fail in any way; it must not take lavender with it
             warnings.warn(
                 f"solver plug-in {entry.name!r} ({entry.value}) was left out: {error}", stacklevel=4

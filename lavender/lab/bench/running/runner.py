@@ -95,6 +95,7 @@ def is_foreign(spec: SolverSpec) -> bool:
     """Code that other packages brought, which a process of its own can import."""
     return (
         spec.external
+        or spec.plugged
         or bool(spec.requires)
         or (isinstance(spec.factory, str) and not spec.factory.startswith("lavender."))
     )
