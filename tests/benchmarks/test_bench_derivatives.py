@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from click.testing import CliRunner
 
 import lavender as lv
@@ -49,9 +48,3 @@ def test_the_command_prints_both_tables():
     assert "| source | rows | problems | `newton` [us] |" in found.output
     line = derivatives.cost("made", suite.case("stack(n=6)").problem, repeats=1)
     assert min(line.solve, line.first, line.more) > 0.0
-
-
-@pytest.mark.parametrize("rows", [(0,), (40, 200)])
-def test_costs_are_put_by_size(rows):
-    lines = [derivatives.Cost("made", "lcp", "rows", n, 1.0, 0.5, 0.1) for n in rows]
-    assert derivatives.costs(lines).count("| made |") == len(rows)

@@ -1,19 +1,17 @@
 """Kernels and steps timed: bare loops do the same work, figures are consistent, commands print and write them."""
 
-import shutil
 import time
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import lavender as lv
 from benchmarks import engine, made
 from benchmarks.clock import least
-from benchmarks.kernels import command, microbenchmarks, problems
+from benchmarks.kernels import microbenchmarks, problems
 from benchmarks.kernels.cases import job, run
 from benchmarks.kernels.command import table
-from benchmarks.kernels.instructions import COUNTED, instructions
+from benchmarks.kernels.instructions import COUNTED
 
 
 @pytest.mark.parametrize("shuffle", [False, True])
@@ -66,27 +64,6 @@ def test_cases_give_time_work_and_residual(case):
     assert any(np.isfinite(r.residual) for r in rows)
     text = table(rows)
     assert all(r.case in text for r in rows)
-
-
-def test_a_wrong_case_is_named():
-    with pytest.raises(lv.InputError, match="'nosuch'"):
-        list(run(["nosuch"]))
-
-
-def test_command_prints():
-    done = CliRunner().invoke(command, ["solve-8", "--seconds", "0.01"])
-    assert done.exit_code == 0, done.output
-    assert "lv.solve" in done.output and "kernel alone" in done.output
-    (row,) = run(["solve-8"], seconds=0.01)
-    assert row.share < 1.0  # a whole call takes longer than its kernel
-
-
-def test_counting_says_what_is_missing(monkeypatch):
-    with pytest.raises(lv.InputError, match="not counted"):
-        instructions("impulses-1m")
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    with pytest.raises(lv.SolverUnavailable, match="valgrind"):
-        instructions("pgs")
 
 
 @pytest.mark.parametrize("name", COUNTED)

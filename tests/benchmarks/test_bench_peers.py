@@ -16,7 +16,6 @@ from benchmarks.peers import adapters, engines, race
 from benchmarks.peers import tables as comparison
 from benchmarks.peers.adapters import Contestant, Result, ours
 from benchmarks.peers.command import command
-from benchmarks.peers.problems import problems
 from lavender import suite
 
 SMALL = {  # laws and kinds of bounds that adapters must translate
@@ -55,13 +54,6 @@ def test_every_adapter_solves_the_same_problem(kind):
         least = reached(contestant, problem)
         # 1e-4: all get there at their tightest setting, some interior points no further with friction.
         assert least is None or least < 1e-4, f"{contestant.name} on {SMALL[kind]}: {least:.1e}"
-
-
-def test_quadprog_takes_a_definite_matrix_with_and_without_constraints():
-    pytest.importorskip("quadprog", reason="needs quadprog: pip install 'lavender-contact[qp]'")
-    contestant = by_name("quadprog, own interface (impulse)")
-    for name in ("stack(n=4)", "chain(n=4)"):
-        assert reached(contestant, suite.case(name).problem) < 1e-9
 
 
 def test_own_time_is_a_part_of_the_whole(monkeypatch):
@@ -167,20 +159,6 @@ def test_ratios_means_and_losses():
     assert "- small at 1e-09: daqp against -, only the peer" in text
 
 
-def test_names_of_problems():
-    (found,) = problems(["scene:stack6"])
-    assert found[0] == "scene:stack6" and found[1].law == "coulomb" and found[1].n_blocks == 24
-    with pytest.raises(lv.UnknownName, match="stack6"):
-        list(problems(["scene:stack7"]))
-    with pytest.raises(lv.InputError, match="elliptic"):
-        list(problems(["mujoco:stack6"]))
-
-
-def test_another_interpreter_without_siconos_is_named():
-    with pytest.raises(lv.InputError, match="cannot be run"):
-        adapters.check_siconos("/no/such/python")
-
-
 def test_siconos_solves_the_same_problems():
     python = os.environ.get("LAVENDER_SICONOS", "")
     if not python:
@@ -219,20 +197,6 @@ def test_mujoco_carries_the_same_weight():
     # The stack of 16 sweeps still moves a little; a box more or less would be a sixth.
     assert normals[ground].sum() == pytest.approx(9.81 * mass * engines.DT, rel=0.1)
     assert np.all(problem.cones.mu == 0.5)
-
-
-def test_unknown_scenes_and_engines_are_named():
-    with pytest.raises(lv.UnknownName, match="stack6"):
-        engines.measure_scene("stack")
-    with pytest.raises(lv.UnknownName, match="mujoco"):
-        engines.measure_scene("stack6", engines=["mujoko"])
-
-
-def test_an_engine_that_does_not_settle_is_left_out_and_said(monkeypatch):
-    monkeypatch.setattr(engines, "SETTLE_LIMIT", 0.0)
-    steps = engines.measure_scene("stack6", engines=["lavender"], rounds=1)
-    assert all("did not settle" in s.note and math.isnan(s.time) for s in steps)
-    assert "did not settle" in comparison.engines_table(steps).splitlines()[2]
 
 
 def test_command(tmp_path):

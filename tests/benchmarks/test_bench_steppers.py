@@ -57,23 +57,3 @@ def test_a_reference_is_known_to_its_floor_and_steppers_come_nearer_with_substep
         far, near = (p.distance for p in points if p.stepper == stepper)
         assert near < 0.2 * far
     assert [p.sweeps for p in points if p.stepper == "soft_step"] == [5, 5]  # relaxing sweeps count
-
-
-def test_a_stepper_that_does_not_take_a_scene_of_motion_is_a_note():
-    points = steppers.measure(["spinner"], ["xpbd", "avbd"], [(1, 16)])
-    assert [("spin" in p.note, math.isnan(p.distance)) for p in points] == [(True, True)] * 2
-    assert "–" in steppers.table(points)
-
-
-def test_chaos_is_no_reference(monkeypatch):
-    monkeypatch.setattr(steppers, "MOST_SUBSTEPS", 32)
-    with pytest.raises(lv.InputError, match="differ by"):
-        steppers.reference("pile", {"n": 8, "kind": "boxes"})
-
-
-def test_the_figure_of_motion(tmp_path):
-    points = steppers.measure(["ramp"], ["impulses", "avbd"], [(1, 4), (4, 4)])
-    steppers.draw(points, tmp_path / "motion.svg")
-    text = (tmp_path / "motion.svg").read_text()
-    assert "ramp" in text
-    assert text.count("<path") > 10

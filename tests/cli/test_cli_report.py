@@ -198,21 +198,6 @@ def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatc
 QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "--no-figures")
 
 
-def test_report_leaves_records_and_page_and_prints_times(lavender, path, tmp_path):
-    code, out, _ = lavender(
-        "report", path, "--solvers", "pgs", "direct", *QUICK, "--tables", "--out", tmp_path / "out"
-    )
-    assert code == 0
-    names = {p.name for p in (tmp_path / "out").iterdir()}
-    assert names == {"records.jsonl", "records.csv", "records.json", "index.html", "summary.md"}
-    records = bench.read(tmp_path / "out")
-    assert {r.solver for r in records} == {"pgs", "direct"}
-    assert {r.max_iter for r in records if r.mode == "budget"} == {2, 4}
-    assert {r.tol for r in records if r.solver == "pgs" and r.mode == "tol"} == {1e-3, 1e-6}
-    for word in ("stack8", "to 1e-3", "to 1e-6", "CONVERGED", "Use ", "index.html"):
-        assert word in out
-
-
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
         "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
@@ -360,16 +345,6 @@ def test_the_recommendation_comes_first_and_tables_on_request(lavender, path, tm
     assert "reused" not in out
     again = [r for r in bench.read(tmp_path / "out") if not r.turns]
     assert len(again) == plain  # made again, they stand for the earlier ones
-
-
-def test_nothing_is_cut_off_in_a_pipe(tmp_path):
-    long = tmp_path / ("a" * 100 + ".npz")
-    io.save(stack(8), long)
-    words = ("report", long, "--solvers", "sequential_impulses,pgs", *QUICK, "--tables")
-    done = python("-m", "lavender", *words, "--out", tmp_path / "o")
-    assert "…" not in done.stdout
-    assert "a" * 100 in done.stdout.replace("\n", "")
-    assert f"page: {tmp_path / 'o' / 'index.html'}\n" in done.stdout
 
 
 WORKER = """

@@ -1,6 +1,5 @@
 """A report survives what it finds: names, records and other reports that mean it harm."""
 
-import contextlib
 import dataclasses
 import io as text_io
 import json
@@ -9,12 +8,11 @@ import socket
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 from stacks import stack
 
 import lavender as lv
-from lavender import bench, cli, io, report
+from lavender import bench, cli, io
 from lavender.lab.bench import machine
 from lavender.lab.bench.line import code_of
 from lavender.lab.bench.lock import Lock
@@ -34,74 +32,6 @@ def lavender(lavender, tmp_path, monkeypatch):
 
 
 # -- names ----------------------------------------------------------------------------------------
-
-NAMES = {
-    "markup of a terminal": b"[x][bold]{y}[.npz",
-    "not UTF-8": b"caf\xe9\xff.npz",
-    "a superscript": "²1.npz".encode(),
-    "a formula": rb"a$\frac$b.npz",
-    "an open formula": b"a$b.npz",
-    "a hidden label": b"_hidden.npz",
-    "HTML": b"<img src=x onerror=alert(1)>.npz",
-    "lines": b"two\nlines\r\x1b[31m.npz",
-    "turned round": "\u202egnp.npz".encode(),
-    "Markdown": b"a|b`c`[d](e)*f*.npz",
-    "long": b"n" * 200 + b".npz",
-}
-
-
-@POSIX
-def test_files_of_any_name_are_reported(lavender, tmp_path):
-    folder = tmp_path / "problems"
-    folder.mkdir()
-    for name in NAMES.values():
-        io.save(stack(names=[f"[/row]{i}" for i in range(6)]), tmp_path / "plain.npz")
-        with contextlib.suppress(OSError):  # a file system that takes no such name has none to report
-            os.rename(tmp_path / "plain.npz", os.path.join(os.fsencode(folder), name))
-    assert os.listdir(folder)
-    for more in ((), ("--no-figures",)):  # measured and drawn, and read again
-        code, out, err = lavender("report", folder, "--out", "out", *QUICK, *more)
-        assert (code, err.strip()) == (0, "")
-        assert "Traceback" not in out
-        out.encode("utf-8")
-        assert "\x1b" not in out
-        assert len(list((tmp_path / "out" / "figures").glob("work-precision*.png"))) == len(
-            os.listdir(folder)
-        )
-        page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
-        assert "<img src" not in page
-        summary = (tmp_path / "out" / "summary.md").read_text(encoding="utf-8")
-        assert "<img" not in summary
-        rows = [line for line in summary.splitlines() if "| pgs |" in line]
-        assert len(rows) >= len(os.listdir(folder))
-        for row in rows:
-            assert len([c for i, c in enumerate(row) if c == "|" and row[i - 1] != "\\"]) == 7, row
-    code, out, err = lavender("report", "--campaign", folder, "--out", "many", *QUICK[:6], "--workers", 1)
-    assert (code, err.strip()) == (0, "")
-
-
-def test_an_archive_with_members_of_any_name_is_named(lavender, tmp_path):
-    (tmp_path / "problems").mkdir()
-    for i, member in enumerate(("[/x]", "a\nb", "\x1b[31m")):
-        np.savez(tmp_path / "problems" / f"odd{i}.npz", **{member: np.ones(2)})
-    io.save(stack(), tmp_path / "problems" / "good.npz")
-    for _ in range(2):
-        code, out, _ = lavender("report", "problems", *QUICK)
-        assert code in (0, 1)
-        assert "[/x]" in out
-        assert "\x1b" not in out
-
-
-@pytest.mark.parametrize("name", ["half \ud800 of a pair", "[/x]", "a$\\frac$b", "\x1b]0;title\x07"])
-def test_names_within_a_file_are_shown_and_change_nothing(lavender, tmp_path, name):
-    problem = stack(name=name, names=[f"{name} {i}" for i in range(6)])
-    records = bench.run([problem], ["pgs"], bench.Plan(levels=(1e-3,), budgets=(4,), repeats=1))
-    report.write(records, tmp_path / "out")
-    shown = text_io.StringIO()
-    from rich.console import Console
-
-    print_report(Report(records), Console(file=shown, width=140), whole=True)
-    assert printable(name)[:20] in shown.getvalue()
 
 
 def test_what_cannot_be_shown_is_written_as_its_code():

@@ -4,6 +4,7 @@ import base64
 import contextlib
 import io
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -33,6 +34,7 @@ INSIDE = (
     "empty",
     "zero",
     "garbage",
+    "members",
     "good",
     "good",
 )
@@ -106,6 +108,9 @@ def lay_out(spec, folder):
                 os.mkfifo(path)
             elif entry["inside"] == "garbage":
                 path.write_bytes(b"PK\x03\x04" + name.encode(errors="replace"))
+            elif entry["inside"] == "members":
+                with path.open("wb") as file:  # whose names an error may tell
+                    np.savez(file, **{"[/x]": np.ones(2), "a\nb": np.ones(2), "\x1b[31m": np.ones(2)})
             else:
                 whole = Path(folder, "whole.tmp.npz")
                 lv.io.save(problem_of(entry["inside"]), whole)
@@ -142,22 +147,35 @@ def check(spec):
         }[spec["command"]]
         for _ in range(1 + spec["twice"]):
             code, text = quiet(command)
-            yield from told(code, text, command[0])
+            yield from told(code, text, command[0], spec.get("status", STATUS))
         for page in out.glob("*.html"):
             html = page.read_text(encoding="utf-8")
             for tag in ("<img src=x", "<script>alert"):
                 if tag in html:
                     yield "not escaped", f"{tag} stands in {page.name}"
         for page in out.glob("*.md"):
-            if "<img src=x" in page.read_text(encoding="utf-8"):
+            summary = page.read_text(encoding="utf-8")
+            if "<img src=x" in summary:
                 yield "not escaped", f"<img src=x stands in {page.name}"
+            for table in re.split(r"\n\n+", summary):
+                cells = {
+                    len(re.findall(r"(?<!\\)\|", row)) for row in table.splitlines() if row.startswith("|")
+                }
+                if len(cells) > 1:
+                    yield "not escaped", f"rows of unlike cells in {page.name}: {cells}"
 
 
-def told(code, text, command):
-    """A status that is documented, no traceback."""
-    if code not in (0, 1, 2, 3):
+STATUS = (0, 1, 2, 3)
+
+
+def told(code, text, command, status=STATUS):
+    """A status that is documented, or the one that is known; no traceback."""
+    if code not in status:
         yield "raw exit", f"{command}: status {code}"
     if "Traceback (most recent call last)" in text:
         yield "raw traceback", f"{command}: {text[-300:]}"
+    if "\x1b" in text:
+        yield "not escaped", f"{command}: an escape of the terminal"
+    text.encode("utf-8")  # a surrogate cannot be printed
     if code == 2 and not text.strip():
         yield "raw exit", f"{command}: status 2 without a word"

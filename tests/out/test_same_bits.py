@@ -277,18 +277,6 @@ def test_methods_with_bits_of_their_own_meet_the_tolerance_where_the_package_doe
     assert met >= 7
 
 
-@pytest.mark.parametrize("tangents", [1, 2])
-def test_newton_of_the_driver_is_that_of_the_package_under_coulombs_law(tangents):
-    for seed, (bodies, contacts, joints) in itertools.product(
-        range(6), ((6, 10, 0), (6, 10, 1), (30, 60, 3))
-    ):
-        given = rp.random_contact_problem(
-            seed, tangents=tangents, bodies=bodies, contacts=contacts, joints=joints
-        )
-        found = lv.solve(given, "newton", tol=1e-8)
-        assert driven(given, 1e-8, 1500)[0].tobytes() == found.impulse.tobytes(), given
-
-
 def test_newton_that_a_budget_ends_is_no_worse_than_its_start_or_nothing(library):
     """At each of the first factorisations, from doing nothing, a solution of other numbers, and far off."""
     ran = 0

@@ -127,13 +127,6 @@ def test_threads_read_worlds_whose_turn_came_too_late(often):
         assert found.tobytes() == alone.tobytes()
 
 
-def test_threads_prepare_each_their_own(often):
-    problem = random_contact_problem(5)
-    alone = lv.solve(problem, "block_gauss_seidel", max_iter=50)
-    for found in at_once(lambda: lv.prepare(problem, "block_gauss_seidel").solve(max_iter=50)):
-        np.testing.assert_array_equal(found.impulse, alone.impulse)
-
-
 def test_no_object_has_a_property_of_functools():
     imported = re.compile(r"functools import (\([^)]*|.*)\bcached_property|functools\.cached_property")
     files = Path(lv.__file__).parent.rglob("*.py")

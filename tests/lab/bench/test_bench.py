@@ -218,13 +218,6 @@ def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     assert len(bench.read(path).latest()) == len(first)
 
 
-def test_a_changed_problem_of_the_same_name_is_measured_again(tmp_path):
-    path = tmp_path / "records.jsonl"
-    bench.run([stack(5)], ["direct"], QUICK, path)
-    bench.run([stack(6)], ["direct"], QUICK, path)
-    assert len(bench.read(path)) == 2
-
-
 def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     plug_in(interrupted, "fake_interrupt")
     path, into = tmp_path / "records.jsonl", []

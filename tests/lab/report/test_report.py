@@ -265,30 +265,6 @@ def test_no_calls_in_c_for_what_the_library_does_not_take(solver, law, structure
     assert (told.startswith("not in C: ") and sign in told) if sign else "--solver nncg" in told
 
 
-def test_a_page_is_small(tmp_path):
-    rng, cases, solvers, most = random.Random(1), 17, 23, 400_000
-    made = []
-    for i in range(cases):
-        for j in range(solvers):
-            for k in range(8):
-                kind = (
-                    {"mode": "budget", "tol": 0.0, "max_iter": 4**k}
-                    if k < 5
-                    else {"tol": 10.0 ** (-3 * (k - 4))}
-                )
-                made.append(
-                    record(
-                        f"pile(n={i})",
-                        f"solver_{j}",
-                        rng.uniform(1e-5, 1e-2),
-                        10.0 ** rng.uniform(-12, 0),
-                        **kind,
-                    )
-                )
-    found = records_of(*made)
-    assert report.write(found, tmp_path, figures=False).stat().st_size < most
-
-
 def test_advice_by_time_takes_the_best_residual_within_the_budget():
     found = records_of(
         record("a", "rough", 0.01, 1e-2), record("a", "rough", 5.0, 1e-7),
@@ -389,15 +365,6 @@ def test_the_picture_of_all_cases_is_the_median_of_what_was_reached_by_each_time
     more = [record("a", "pgs", 1e-9, 1e-12, turns="one", way=way, mode=mode) for way, mode in
             (("batch", "tol"), ("call", "time"))]  # fmt: skip
     assert overall_figure(records_of(*made, *more)) == found
-
-
-def test_built_in_problems_are_not_called_yours():
-    runs = [record(name, "pgs", 1e-3, 1e-7) for name in ("stack(n=8)", "chain(n=4)")]
-    assert "the 2 built-in problems" in verdict(records_of(*runs)).text
-    named = records_of(*runs)
-    for name, known in list(named.cases.items()):
-        named.add(dataclasses.replace(known, source=f"{name}.npz"))
-    assert "your 2 stacks" in verdict(named).text
 
 
 def test_a_report_of_nothing_says_so(tmp_path):
