@@ -1,6 +1,7 @@
 """Print what extras of the installed package ask for, one requirement a line, so that pip need not build it again.
 
 python .ci/requirements.py EXTRA ...
+python .ci/requirements.py --lowest        what is always needed, in the lowest version that is allowed
 """
 
 import re
@@ -27,5 +28,15 @@ def of(extra: str) -> Iterator[str]:
         raise LookupError(f"lavender-contact has no extra {extra!r}")
 
 
+def lowest() -> Iterator[str]:
+    """NAME==VERSION of each package that is always needed."""
+    for line in requires("lavender-contact") or []:
+        requirement, _, marker = line.partition(";")
+        if "extra" not in marker:
+            yield requirement.strip().replace(">=", "==")
+
+
 if __name__ == "__main__":
-    print("\n".join(dict.fromkeys(line for extra in sys.argv[1:] for line in of(extra))))
+    asked = sys.argv[1:]
+    lines = lowest() if asked == ["--lowest"] else (line for extra in asked for line in of(extra))
+    print("\n".join(dict.fromkeys(lines)))
