@@ -98,7 +98,9 @@ class QPSolution:
             return f"unbounded: the objective falls for ever along ray; at x it is {self.objective:.6g}"
         how = "" if self.solution is None else f"{self.solution.status.name}, "
         words = "solved" if self.found else f"not solved to {self.tol:g}"
-        return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}"
+        wrong = "" if self.solution is None else self.solution.contradicted
+        wrong = f"; CONTRADICTED: {wrong}" if wrong else ""
+        return f"{words}: {how}error {self.error:.1e}, objective {self.objective:.6g}{wrong}"
 
     @cached_property
     def _curvature(self) -> FloatArray:

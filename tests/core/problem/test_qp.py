@@ -286,6 +286,16 @@ def test_no_solver_calls_a_program_unbounded_that_has_no_feasible_point(solver, 
     assert some.ray is not None and not some.found
 
 
+def test_a_claim_without_a_proof_is_told_as_such(plug_in):
+    program = lv.Problem.from_qp(np.diag([1.0, 0.0]), [1.0, -1.0], ub=[1.0, 2.0])
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.INFEASIBLE, 1, {}))
+    answer = lv.solve_qp(program, name)
+    assert not answer.found and answer.ray is None
+    assert "INFEASIBLE" in str(answer) and "CONTRADICTED: says INFEASIBLE, no certificate was given" in str(
+        answer
+    )
+
+
 @given(seed=seeds)
 @example(seed=187)  # found, and a ray in other units
 @example(seed=287)  # a proximal step whose M was not definite
