@@ -75,8 +75,7 @@ def solve_qp(
     QPSolution
         x, y, z, z_box; `error` says how wrong they are, `solution.status` how it ended. INFEASIBLE: no x fulfils the
         constraints, and `problem.qp.multipliers(answer.solution.certificate)` proves it, unless the claim of another
-        package's solver is `contradicted`. An unbounded program has a
-        `ray`.
+        package's solver is `contradicted`. An unbounded program has a `ray`.
 
     Raises
     ------
