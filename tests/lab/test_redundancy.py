@@ -39,15 +39,6 @@ def test_a_cube_on_four_points(as_given):
     assert redundancy(as_given(box_on_corners(0.5))).rank == 6
 
 
-def test_nothing_redundant():
-    found = redundancy(box_on_corners(points=3))
-    assert found.rank == 3
-    assert found.rows == ()
-    assert found.impulse_is_unique.all()
-    assert "impulse" in found.unique
-    assert "no row" in str(found)
-
-
 def test_the_second_of_two_equal_hinges_is_named():
     rng = np.random.default_rng(3)
     jac = rng.normal(size=(5, 12))

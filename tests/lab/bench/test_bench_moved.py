@@ -28,13 +28,6 @@ def test_a_record_has_the_motion_error_of_its_run():
         assert from_json(to_json(r)) == r
 
 
-def test_without_asking_there_is_none(monkeypatch):
-    monkeypatch.setattr("lavender.lab.bench.running.runner.with_motion", None)
-    for r in bench.run(["stack(n=8)"], ["pgs"], bench.Plan(levels=(1e-3,), **SHORT)):
-        assert r.motion is None
-        assert from_json(to_json(r)) == r
-
-
 def test_a_solver_in_a_process_of_its_own_has_one_too():
     records = bench.run(
         ["box_stackF(n=2)", "stack(n=4)"], ["osqp"], bench.Plan(levels=(1e-3,), motion=True, **SHORT)

@@ -265,19 +265,6 @@ def test_no_calls_in_c_for_what_the_library_does_not_take(solver, law, structure
     assert (told.startswith("not in C: ") and sign in told) if sign else "--solver nncg" in told
 
 
-def test_advice_by_time_takes_the_best_residual_within_the_budget():
-    found = records_of(
-        record("a", "rough", 0.01, 1e-2), record("a", "rough", 5.0, 1e-7),
-        record("a", "fine", 1.0, 1e-9),
-    )  # fmt: skip
-    by = {round(math.log10(a.target)): a for a in by_time(found)}
-    assert sorted(by) == [-1, 0, 1]  # decades about 1 s
-    assert by[-1].best.solver == "rough"
-    assert by[-1].best.score == pytest.approx(1e-2)
-    assert by[-1].ranking[1].score == 1.0  # nothing yet: doing nothing
-    assert by[0].best.solver == "fine"
-
-
 def test_time_budgets_are_those_given_and_the_sweeps_are_named(tmp_path):
     budget = {"mode": "budget", "tol": 0.0, "status": "MAX_ITERATIONS", "claims": False}
     found = records_of(

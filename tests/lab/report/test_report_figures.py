@@ -199,9 +199,3 @@ def test_an_axis_and_its_ticks_have_one_unit(low, high, unit, tick):
     assert axis.title == f"time: set-up and solve [{unit}]"
     words = [axis.text(t) for t in axis.ticks()]
     assert tick in words and all(re.fullmatch(r"[\d.]+(e-?\d+)?", word) for word in words)
-
-
-def test_warm_runs_have_their_own_curves(real):
-    records, evil = real
-    labels = {c.label for c in curves.work_precision(records, evil).curves}
-    assert {"pgs", "pgs (warm)"} <= labels
