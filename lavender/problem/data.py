@@ -112,6 +112,7 @@ class ProblemData:
             raise InputError("give matrix=, rows= or generalized=, one of them")
         if self.friction not in FRICTION:
             raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
+        put(self, "friction", str(self.friction))  # NumPy's strings say in messages that they are NumPy's
         if not self.precision:
             put(self, "precision", getattr(self.rows, "precision", "float64"))
         if self.precision not in PRECISIONS:

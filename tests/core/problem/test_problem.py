@@ -37,6 +37,7 @@ def test_the_class_follows_from_the_blocks():
     assert lv.Problem.contact(I2, [1, 1], [0.0, 0.0]).law == "lcp"  # normals only
     assert lv.Problem.contact(I2, [1, 1], [0.5]).law == "coulomb"
     assert lv.Problem.contact(I2, [1, 1], [0.5], friction="cone").law == "cone"
+    assert repr(lv.Problem.contact(I2, [1, 1], [0.5], friction=np.str_("cone")).law) == repr("cone")
     assert lv.Problem.contact(I2, [1, 1], [0.5], patch_radius=[0.1]).law == "coulomb"
 
 
