@@ -20,7 +20,8 @@ a constraint problem of rows, with x and y as its impulses and A without symmetr
 P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
 centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
 D (c - x), and `lavender.solve_qp` repeats it around the x found until that is small. Where the rows of P
-whose diagonal is zero are zero, as they must be, D stands on these alone; if P is singular otherwise, on every row.
+whose diagonal is zero are zero, as they must be, D stands on these alone; if P is singular otherwise, on every row. A
+P that is nearly singular takes v* so far from x that rounding hides x: then such steps follow, with D by the forces.
 """
 
 from __future__ import annotations
@@ -126,13 +127,9 @@ class QPSolution:
     @property
     def _unseen(self) -> float:
         """max_i sum_j |P_ij| X_j (force): a share of X_j more of x_j is no more than that share in any row of J."""
-        of, x = self.qp.generalized, np.abs(self.x)
-        jac = abs(of.jac).tocoo()
-        row = np.maximum(abs(of.jac) @ x, np.abs(self.qp.target))
-        far = np.full(len(x), np.inf)
-        np.minimum.at(far, jac.coords[1], row[jac.coords[0]] / jac.data)
-        far = np.where(far < np.inf, far, x.max(initial=0.0))  # of variables in no row
-        return float((abs(of.mass) @ far).max(initial=0.0))
+        return float(
+            (abs(self.qp.generalized.mass) @ self.qp.sizes(self.x, np.minimum, np.inf)).max(initial=0.0)
+        )
 
     @property
     def objective(self) -> float:
@@ -167,8 +164,9 @@ class QPSolution:
 
     @property
     def found(self) -> bool:
-        """Whether the error is at most `tol` and the program is not unbounded."""
-        return self.ray is None and self.error <= self.tol
+        """Whether the error is at most `tol` and the program is neither unbounded nor proved to be infeasible."""
+        proved = self.solution is not None and self.solution.status.name == "INFEASIBLE"
+        return self.ray is None and not proved and self.error <= self.tol
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,14 +212,34 @@ class QuadraticProgram:
         """Free rows, then impulses >= 0."""
         return _one_sided(self.free, len(self.target))
 
-    def around(self, centre: FloatArray, share: float = 1.0) -> QuadraticProgram:
-        """The proximal step from a centre (n,), with this share of D."""
-        assert self.proximal is not None
-        of, d = self.generalized, share * self.proximal
-        if share != 1.0:
-            of = Generalized(of.jac, of.mass - sp.diags_array(self.proximal - d), of.v_free)
+    def around(self, centre: FloatArray, d: FloatArray) -> QuadraticProgram:
+        """The proximal step from a centre (n,), with this D."""
+        of, before = self.generalized, self.proximal
+        if d is not before:
+            of = Generalized(of.jac, of.mass + sp.diags_array(d if before is None else d - before), of.v_free)
         general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
         return replace(self, generalized=general, proximal=d)
+
+    def nearer(self, x: FloatArray, impulse: FloatArray) -> FloatArray:
+        """D (n,) with which no force takes x_i further than FAR times what rows let one expect of it.
+
+        Forces and sizes are those of x (n,) and of impulses (m,) that are found so far.
+        """
+        of, far = self.generalized, self.sizes(x, np.maximum, 0.0)
+        force = np.abs(self.q) + abs(of.mass) @ far + np.abs(impulse) @ abs(of.jac)
+        return read_only(np.divide(force, FAR * far, out=np.zeros(len(x)), where=far > 0.0))
+
+    def sizes(self, x: FloatArray, most: np.ufunc, without: float) -> FloatArray:
+        """(n,) What x_i would be if it were all of its rows: of the smallest or largest, by np.minimum or np.maximum.
+
+        `without`: where it has no row; the largest of x for inf.
+        """
+        of, x = self.generalized, np.abs(x)
+        jac = abs(of.jac).tocoo()
+        row = np.maximum(abs(of.jac) @ x, np.abs(self.target))
+        far = np.full(len(x), without)
+        most.at(far, jac.coords[1], row[jac.coords[0]] / jac.data)
+        return np.where(far < np.inf, far, x.max(initial=0.0))
 
     @cached_property
     def filled(self) -> float:

@@ -43,7 +43,7 @@ CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
 HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 # Nothing better comes of the same problem; of another centre something may.
-ENOUGH = (tuple(set(Status) - {Status.CONVERGED}), (Status.TIME_LIMIT,))
+ENOUGH = (Status.TIME_LIMIT,)
 UNBOUNDED = (
     1e-7  # relative: a direction along which x ran away, and the objective falls; a point where it may begin
 )
@@ -120,20 +120,24 @@ def solve_qp(
             if point.success or point.residual.at_floor:
                 return replace(answer, ray=ray)
             left = end - perf_counter()
-        if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH[qp.proximal is not None]:
+        if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH:
             break
-        if qp.proximal is not None:
-            slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
-            rough = solution.status in HARD or ROUNDING * _distance(answer) > answer.error
-            soft = slow and (qp.proximal / qp.unit).max() > SOFTEST
-            qp = qp.around(centre, 1.0 / SOFTER if rough else SOFTER if soft else 1.0)
-            general = qp.generalized
-            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
         # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
         far = max(1.0, _distance(answer))
-        inner = max(min(tol, CENTRED) / far if qp.proximal is not None else 0.1 * tightest / far, TIGHTEST)
-        if qp.proximal is None and inner >= tightest:
-            break
+        inner = max(0.1 * tightest / far, TIGHTEST)
+        if qp.proximal is not None or solution.status in HARD or ROUNDING * far > tol or inner >= tightest:
+            slow, centre, before = answer.error > SLOW * before, answer.x, answer.error
+            d = qp.proximal
+            if d is None:
+                d = qp.nearer(centre, answer.impulse)
+            elif solution.status in HARD or ROUNDING * far > answer.error:
+                d = d / SOFTER
+            elif slow and (qp.unit is None or (d / qp.unit).max() > SOFTEST):
+                d = SOFTER * d
+            qp = qp.around(centre, d)
+            general = qp.generalized
+            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
+            inner = max(min(tol, CENTRED) / far, TIGHTEST)
         tightest, limit = inner, None if time_limit is None else left
         solution, x = step(problem, solver, inner, limit, solution.impulse, options)
         answer = qp.solution(solution, tol, x)

@@ -98,6 +98,37 @@ def test_a_singular_p_takes_proximal_steps_to_the_same_judge(seed):
     assert max(kkt(qp, answer)) <= 1e-6 * size
 
 
+def nearly_singular(seed):
+    """A bounded or one-sided program whose P has a condition of 1e4 to 1e10, in five ways."""
+    rng = np.random.default_rng(seed)
+    n, least = int(rng.integers(3, 41)), 10.0 ** -rng.uniform(4.0, 10.0)
+    spread, turn = least ** rng.random(n), np.linalg.qr(rng.normal(size=(n, n)))[0]
+    load, chain = rng.normal(size=(n, 1 + n // 3)), np.diff(np.eye(n), axis=0)
+    P = (
+        (turn * spread) @ turn.T,
+        np.diag(spread),
+        np.diag(np.where(rng.random(n) < 0.5, 1.0, least)),
+        load @ load.T / n + least * np.eye(n),
+        chain.T @ chain + least * np.eye(n),
+    )[seed % 5]
+    G, x = rng.normal(size=(int(rng.integers(n, 4 * n)), n)), rng.normal(size=n)
+    qp = dict.fromkeys(NAMES) | {"P": 0.5 * (P + P.T), "q": rng.normal(size=n), "G": G}
+    qp["h"] = G @ x + rng.exponential(size=len(G)) * rng.integers(0, 2, len(G))
+    box = rng.exponential(size=(2, n)) if rng.random() < 0.7 else np.full((2, n), np.inf)
+    return qp | {"lb": x - box[0], "ub": x + box[1]}
+
+
+@given(seed=seeds)
+def test_a_hessian_that_is_nearly_singular_hides_no_solution(seed):
+    qp = nearly_singular(seed)
+    answer = lv.solve_qp(lv.Problem.from_qp(**qp), tol=1e-8)  # one in a hundred is found to 1e-7 alone
+    assert answer.found, str(answer)
+    primal, dual, _ = kkt(qp, answer)
+    # `error` is relative to forces and velocities; those of x are sums of n terms, each its own size.
+    assert primal <= 1e-7 * np.abs(qp["G"] @ answer.x).max() + 1e-7
+    assert dual <= 1e-7 * max(np.abs(qp["q"]).max(), np.abs(qp["G"].T @ answer.z).max())
+
+
 @pytest.mark.filterwarnings("ignore:Converted matrix", "ignore:The default value of raise_error")
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @settings(max_examples=30)
