@@ -16,7 +16,8 @@
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost; over rows, of bounded ones that failed in the compiled call
+                                SURE times that cost, or MOST where it costs more; over rows, of bounded ones that
+                                failed in the compiled call
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE), `admm`, `nncg`, and sweeps as long as these
                                 gain; all together LAST times Newton's cost, and no longer than LONG
@@ -229,10 +230,11 @@ class Tree:
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
             if self.tried and self.law == "lcp":
                 self.add_rows(LITTLE)
-            yield from islice(self.factorisations(SURE), 1)
-            yield Stage(
-                "certificate", 1.0, self.newton, "whether the least violation proves that there is none"
-            )
+            of = self.states.get("newton")  # over velocities, as the least violation is found
+            cost = self.newton if of is None else of.cost
+            sooner = cost <= max(MOST * self.newton, LITTLE)
+            yield from islice(self.factorisations(SURE if sooner else MOST), 1)
+            yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.factorisations(MOST)
         if self.is_program:
             return
@@ -386,7 +388,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         if stage is None:
             break
         if stage.solver == "certificate":
-            if not log.ends_late(tree.newton):
+            if not log.ends_late(stage.cost):
                 least_violation(log)
             continue
         step = steps.get(stage.solver)

@@ -5,6 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from random_problems import as_matrix, general, random_lcp
 from random_trees import random_general
 
@@ -371,6 +372,21 @@ def test_what_is_counted_to_take_long_has_no_more_than_that(monkeypatch):
     costs_of = [stage.cost for stage in tree if stage.solver == "newton"]
     assert costs_of == [pytest.approx(SURE * tree.newton)]
     assert max(stage.cost for stage in before.stages) == pytest.approx(MOST * before.newton)
+
+
+def test_a_certificate_comes_when_it_is_counted_to_cost_no_more_than_what_ran():
+    """Of a transport plan between k places: 2 k rows of sums, and k^2 bounds of as many velocities."""
+    k, rng = 30, np.random.default_rng(3)
+    sums = sp.vstack([sp.kron(sp.eye(k), np.ones((1, k))), sp.kron(np.ones((1, k)), sp.eye(k))])
+    load = np.concatenate([rng.dirichlet(np.ones(k)) for _ in range(2)])
+    program = {"A": sums.tocsc(), "b": load, "lb": np.zeros(k * k)}
+    problem = lv.Problem.from_qp(1e-2 * sp.eye(k * k).tocsc(), rng.random(k * k), **program)
+    plan = lv.explain(problem)
+    at = [stage.solver for stage in plan.stages].index("certificate")
+    certificate, before = plan.stages[at], plan.stages[at - 1]
+    assert before.solver == "newton over rows"  # A is sparse where N over velocities is full
+    assert certificate.cost > MOST * plan.newton
+    assert before.cost == pytest.approx(MOST * plan.newton)
 
 
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
