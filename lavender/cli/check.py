@@ -63,7 +63,7 @@ def check(
             context, ["reference", "tol", "precision", "threshold"], "with a records.jsonl, which has its own"
         )
         submission = bench.verify(bench.read(files[0]), files[1:], solvers)
-        out.print(str(submission), highlight=False, markup=False, soft_wrap=True)
+        out.print(plain(str(submission)), highlight=False, soft_wrap=True)
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
     contradicted = unread = missing = answers = above = unmet = 0
     asked = precision is not None or was_given(context, "threshold")
@@ -82,13 +82,13 @@ def check(
         finally:
             item.forget()
         out.print(f"[bold]{plain(item.name)}[/]", highlight=False)
-        out.print(str(found), highlight=False, markup=False)
+        out.print(plain(str(found)), highlight=False)
         if stored is not None:
             answers += 1
             above += stored.verdict != AT_FLOOR
             unmet += stored.verdict not in (AT_FLOOR, CLOSE)
             said = f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}"
-            out.print(said, highlight=False, markup=False)
+            out.print(plain(said), highlight=False)
         contradicted += len(found.contradicted)
     if contradicted:
         out.print(f"[bold red]{contradicted} claims are contradicted[/]")

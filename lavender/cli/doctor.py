@@ -8,7 +8,7 @@ from dataclasses import asdict
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, say
 from lavender.lab.bench import doctor as bench_doctor
 
 
@@ -54,13 +54,13 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
         try:
             found[item.name] = diagnose(item.problem)
         except LavenderError as error:
-            click.echo(f"{item.name}: {error}", err=True)
+            say(f"{item.name}: {error}", err=True)
             unread = True
             missing |= isinstance(error, InputError) and item.named
         finally:
             item.forget()
         for suspicion in () if as_json else found.get(item.name, ()):
-            click.echo(f"{item.name}: {suspicion}")
+            say(f"{item.name}: {suspicion}")
     suspect = sum(map(bool, found.values()))
     if as_json:
         click.echo(json.dumps({name: list(map(asdict, told)) for name, told in found.items()}, indent=2))

@@ -13,7 +13,7 @@ import click
 from lavender._version import __version__
 from lavender.base import starting as _starting
 from lavender.base.errors import LavenderError, UnknownName
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, unheard
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_INTERRUPTED, say, unheard
 
 #: Name -> the module that has the command.
 COMMANDS = {
@@ -71,7 +71,7 @@ def main(args: Sequence[str] | None = None) -> None:
         )
         sys.stdout.flush()
     except LavenderError as error:
-        click.echo(f"lavender: {error}", err=True)
+        say(f"lavender: {error}", err=True)
         code = EXIT_BAD_INPUT
     except click.exceptions.ClickException as error:
         error.show()

@@ -7,7 +7,7 @@ import json
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET
+from lavender.cli.options import EXIT_UNMET, say
 
 
 @click.command()
@@ -31,7 +31,7 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
         except InputError as error:
             if item.named:
                 raise
-            click.echo(f"{item.name}: {error}", err=True)
+            say(f"{item.name}: {error}", err=True)
             unread = True
             continue
         item.forget()
@@ -39,6 +39,6 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
         if as_data:
             click.echo(json.dumps(plan.data()))
         else:
-            click.echo(f"{item.name}: {plan}\n")
+            say(f"{item.name}: {plan}\n")
     if unread:
         raise click.exceptions.Exit(EXIT_UNMET)

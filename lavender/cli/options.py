@@ -309,10 +309,19 @@ def bytes_of(gigabytes: float | None) -> int | None:
 
 
 def plain(text: str) -> str:
-    """Text with what rich would take for markup escaped."""
+    """Text with what rich would take for markup escaped, and what a terminal would obey written as its code."""
     from rich.markup import escape
 
-    return escape(text)
+    from lavender.lab.bench.record import printable
+
+    return escape(printable(text, lines=True))
+
+
+def say(text: str, err: bool = False) -> None:
+    """Print what names of files and problems are part of: what a terminal would obey is written as its code."""
+    from lavender.lab.bench.record import printable
+
+    click.echo(printable(text, lines=True), err=err)
 
 
 def parameters_of(words: tuple[str, ...]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread, say
 
 
 @click.command()
@@ -37,10 +37,10 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
             solution = solve(item.problem, solver, tol=tol)
             found = enclose(item.problem, solution)
             short = "" if solution.success else f"; {solver}: {solution.status.name}"
-            click.echo(f"{item.name}: {found}{short}")
+            say(f"{item.name}: {found}{short}")
             unmet |= not found.proven
         except LavenderError as error:
-            click.echo(f"{item.name}: {error}", err=True)
+            say(f"{item.name}: {error}", err=True)
             missing |= isinstance(error, InputError) and item.named
             unmet = True
         finally:

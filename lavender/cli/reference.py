@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread
+from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread, plain
 
 
 @click.command()
@@ -41,12 +41,10 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
             written = motion.save_reference(item.problem, item.source)
             told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
             with going_on():
-                out.print(told, highlight=False, markup=False, soft_wrap=True)
+                out.print(plain(told), highlight=False, soft_wrap=True)
         except LavenderError as error:
             with going_on():
-                out.print(
-                    f"{item.name}: {error}", style="yellow", highlight=False, markup=False, soft_wrap=True
-                )
+                out.print(plain(f"{item.name}: {error}"), style="yellow", highlight=False, soft_wrap=True)
             unread = isinstance(error, InputError) and item.named and not Path(item.source).is_file()
             missing += unread
             unmet += not unread

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread
+from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread, say
 from lavender.io.stored import writable, write_atomically
 
 
@@ -90,8 +90,8 @@ def solve(
                 )
 
         write_atomically(output, write)
-    click.echo(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
-    click.echo(str(solution))
+    say(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
+    say(str(solution))
     if output is not None:
         click.echo(f"written: {output}")
     if solution.status.name == "INTERRUPTED":

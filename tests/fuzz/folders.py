@@ -176,6 +176,5 @@ def told(code, text, command, status=STATUS):
         yield "raw traceback", f"{command}: {text[-300:]}"
     if "\x1b" in text:
         yield "not escaped", f"{command}: an escape of the terminal"
-    text.encode("utf-8")  # a surrogate cannot be printed
     if code == 2 and not text.strip():
         yield "raw exit", f"{command}: status 2 without a word"
