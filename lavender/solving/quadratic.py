@@ -42,11 +42,7 @@ CENTRED = 1e-9  # tol of a step around a centre, at most: a ray shows only to UN
 CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
 HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
-# Nothing better comes of the same problem; of another centre something may.
-ENOUGH = (Status.TIME_LIMIT,)
-UNBOUNDED = (
-    1e-7  # relative: a direction along which x ran away, and the objective falls; a point where it may begin
-)
+UNBOUNDED = 1e-7  # relative: a direction along which the objective falls for ever; a point where it may begin
 
 
 def solve_qp(
@@ -120,8 +116,10 @@ def solve_qp(
             if point.success or point.residual.at_floor:
                 return replace(answer, ray=ray)
             left = end - perf_counter()
-        if answer.error <= tol or left <= 0.0 or solution.status in ENOUGH:
+        if answer.error <= tol or left <= 0.0 or solution.status is Status.TIME_LIMIT:
             break
+        if qp.proximal is None and solution.status not in (Status.CONVERGED, *HARD):
+            break  # a budget that is spent; of another centre something better may come
         # Residuals are relative to doing nothing, x = v*, which may be far from the solution.
         far = max(1.0, _distance(answer))
         inner = max(0.1 * tightest / far, TIGHTEST)

@@ -4,13 +4,12 @@
                    where exchanges are stuck Lemke's path, if asked for                      (pivot/lemke.pyx)
     friction       accelerated sweeps and Newton's method in turns                                 (friction.pxd)
 
-Under friction a part is the whole, or each island in its turn, cut out of A or of the bodies. Part i of n, E0_i its error of doing
-nothing, has met its share where
+Under friction a part is the whole, or each island in its turn, cut out of A or of the bodies. Part i of n has met its share where
 
     E_i <= tol sqrt((E0_i^2 + E0^2 / n) / 2),   V_i <= tol V0                                              (1)
 
-which for all of them together is tol by both measures. An island with the bytes of the one before has its answer. What
-does not end below tol on the judge's own measure is nobody's result: the caller starts again the long way.
+which for all of them together is tol by both measures; E0 and E0_i are errors of doing nothing. An island with the bytes of the one
+before has its answer. What does not end below tol on the judge's own measure is nobody's result: the caller starts the long way.
 """
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, sqrt

@@ -129,6 +129,12 @@ def test_a_hessian_that_is_nearly_singular_hides_no_solution(seed):
     assert dual <= 1e-7 * max(np.abs(qp["q"]).max(), np.abs(qp["G"].T @ answer.z).max())
 
 
+def test_a_budget_is_that_of_one_solve_where_p_is_definite():
+    problem = lv.Problem.from_qp(**nearly_singular(2))
+    solution = lv.solve_qp(problem, "pgs", max_iter=5).solution
+    assert (solution.status.name, solution.iterations) == ("MAX_ITERATIONS", 5)
+
+
 @pytest.mark.filterwarnings("ignore:Converted matrix", "ignore:The default value of raise_error")
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @settings(max_examples=30)

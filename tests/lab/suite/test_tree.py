@@ -374,7 +374,7 @@ def test_what_is_counted_to_take_long_has_no_more_than_that(monkeypatch):
     assert max(stage.cost for stage in before.stages) == pytest.approx(MOST * before.newton)
 
 
-def test_a_certificate_comes_when_it_is_counted_to_cost_no_more_than_what_ran():
+def test_a_certificate_that_costs_more_than_ten_times_newton_comes_after_these():
     """Of a transport plan between k places: 2 k rows of sums, and k^2 bounds of as many velocities."""
     k, rng = 30, np.random.default_rng(3)
     sums = sp.vstack([sp.kron(sp.eye(k), np.ones((1, k))), sp.kron(np.ones((1, k)), sp.eye(k))])
