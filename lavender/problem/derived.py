@@ -23,6 +23,7 @@ class Derived:
     """
 
     __slots__ = (
+        "bodies",
         "factor",
         "judged",
         "lock",
@@ -49,6 +50,7 @@ class Derived:
         # Whose one compiled call did not end, to what tol and from where, and what it did (`SmallCall.in_vain`).
         self.vain: tuple[tuple[str, float, bytes], tuple[int, ...]] | None = None
         self.start: FloatArray | None = None  # (m,) N s, doing nothing
+        self.bodies: Any = None  # `bodies_of` of lavender.lab.suspicions, in a tuple
         self.motion: Any = None  # `Kept` of lavender.lab.motion: the reference of motion errors, its operator
 
 

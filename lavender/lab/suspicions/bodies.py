@@ -22,11 +22,15 @@ GIVEN_FOR = (  # of bodies, and of M
 FAR = 0.25  # -, of the arms: bodies further off each other than another contact of the pair says
 
 
-def bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
-    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies.
+def bodies_of(p: Problem) -> Rows | None:
+    """The rows, or contacts of J and M as rows; None where these are of something else than rigid bodies."""
+    if p.derived.bodies is None:
+        p.derived.bodies = (_bodies_of(p),)
+    return p.derived.bodies[0]
 
-    rows (c, 3): rows of J of each contact, where they are not those that the cones say.
-    """
+
+def _bodies_of(p: Problem, rows: npt.NDArray[np.intp] | None = None) -> Rows | None:
+    """rows (c, 3): rows of J of each contact, where they are not those that the cones say."""
     g, c = p.generalized, p.cones
     contact = c.is_contact
     if g is None or g.nv > LARGE or not contact.any() or np.any(c.n_tangents[contact] != 2):
@@ -78,7 +82,7 @@ def are_grouped(p: Problem) -> bool:
     first = int(p.cones.ptr[:-1][contact][0])
     i = np.arange(k)[:, None]
     each, alike = np.hstack([i, k + 2 * i, k + 2 * i + 1]), np.hstack([i, k + i, 2 * k + i])
-    return any(bodies_of(p, first + order) is not None for order in (each, alike))
+    return any(_bodies_of(p, first + order) is not None for order in (each, alike))
 
 
 def geometry(p: Problem) -> Iterator[Suspicion]:
@@ -162,15 +166,19 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
         (np.r_[-np.ones(len(pair)), np.ones(len(pair))], (np.r_[at, at], pair.T.ravel())),
         shape=(len(pair), n),
     )
+    to_centres = incidence.T.tocsr()
+    a, b = pair.T
+    every = np.arange(n)
+    # What the weights of the pairs stand at in incidence^T weight incidence: entries at one place are added.
+    stand = (np.r_[a, b, a, b, every], np.r_[a, b, b, a, every])
     scale = np.abs(between).max()
     if not 0.0 < scale < np.inf:
         return np.zeros(len(pair))
     weight = np.ones(len(pair))
     for _ in range(8):
-        normal = incidence.T @ sp.diags_array(weight) @ incidence + 1e-9 * sp.eye_array(n)
-        centre = sp.linalg.splu(sp.csc_array(normal)).solve(
-            incidence.T @ (weight[:, None] * (between / scale))
-        )
+        entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
+        normal = sp.csc_array((entries, stand), shape=(n, n))
+        centre = sp.linalg.splu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
         off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
         weight = 1.0 / (off + 1e-4)
     return scale * off
