@@ -82,6 +82,7 @@ def _leading(info: Any, dims: Any, arrays: Any, sizes: Any) -> list[Any]:
     return out
 
 
+@torch.compiler.disable  # type: ignore[untyped-decorator]  # a compiled function calls it between its parts
 def solve(
     J: Any,
     M: Any,

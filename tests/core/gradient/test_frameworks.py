@@ -101,6 +101,20 @@ def test_batches_of_torch():
     assert one(frees).shape == (4, 5)
 
 
+@pytest.mark.filterwarnings("ignore:The .grad attribute")  # which torch.compile itself reads
+def test_a_compiled_loss_of_torch_has_the_same_gradient():
+    torch, solve = torch_and_solve()
+    jac, mass, free, mu, *_ = (torch.tensor(x) for x in GIVEN[0])
+    mu.requires_grad_()
+
+    def loss(mu):
+        return 2.0 * (solve(jac, mass, free, 0.5 * mu)[0] ** 2).sum()
+
+    (plain,) = torch.autograd.grad(loss(mu), mu)
+    (compiled,) = torch.autograd.grad(torch.compile(loss, backend="eager")(mu), mu)
+    assert plain.any() and torch.equal(plain, compiled)
+
+
 def test_what_torch_refuses():
     torch, solve = torch_and_solve()
     jac, mass, free, mu, *_ = (torch.tensor(x) for x in GIVEN[0])
