@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from lavender.base.errors import InputError, SolverUnavailable
-from lavender.gradient.layer import NAMES, Step, shapes, step
+from lavender.gradient.layer import NAMES, SIZES, Step, shapes, step
 from lavender.problem.cones import Cones
 
 try:
@@ -82,7 +82,9 @@ def solve(
                 f"{name} is {x.dtype}; float64 is needed: jax.config.update('jax_enable_x64', True) before it is made"
             )
     shapes(given)
-    # Arrays that share their batch, as `broadcast_all` of vmap would make them.
+    # As many axes of a batch on all arrays: `broadcast_all` of vmap puts its own before them.
+    most = max(x.ndim - n for x, n in zip(given, SIZES, strict=True))
+    given = [x.reshape(*(1,) * (most + n - x.ndim), *x.shape) for x, n in zip(given, SIZES, strict=True)]
     given[1] = 0.5 * (given[1] + jnp.swapaxes(given[1], -1, -2))
     velocity, impulse = _solve(step(given, cones, friction, solver, tol), *given)
     return velocity, impulse

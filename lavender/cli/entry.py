@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import io
 import os
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 import click
 
@@ -56,8 +59,45 @@ def cli() -> None:
 
 
 def main(args: Sequence[str] | None = None) -> None:
-    """Entry point: what lavender raises on purpose becomes one line and status 2."""
+    """Entry point: what lavender raises on purpose becomes one line and status 2, whatever Ctrl-C ends 130."""
     _starting.end()
+    with _interruptions() as came:
+        try:
+            code = _code_of(args)
+        except Exception as error:
+            if not came:
+                raise
+            say(f"lavender: {type(error).__name__}: {error}", err=True)
+            code = EXIT_BAD_INPUT
+    if came and code not in (0, EXIT_INTERRUPTED):
+        click.echo("lavender: stopped", err=True)
+        code = EXIT_INTERRUPTED
+    raise SystemExit(code)
+
+
+@contextlib.contextmanager
+def _interruptions() -> Iterator[list[int]]:
+    """A number for each Ctrl-C: libraries in C make an error of their own of the exception that it raises in them."""
+    came: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        came.append(number)
+        signal.default_int_handler(number, frame)
+
+    try:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, note)
+    except ValueError:  # of another thread than the first
+        pass
+    try:
+        yield came
+    finally:
+        if signal.getsignal(signal.SIGINT) is note:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _code_of(args: Sequence[str] | None) -> int:
+    """The exit code of a command, told what ended it."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:  # it was closed: a file that is opened next would stand in its place
             nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -91,7 +131,7 @@ def main(args: Sequence[str] | None = None) -> None:
     except OSError as error:  # a full disk behind stdout, for one
         click.echo(f"lavender: {error}{_where()}", err=True)
         code = EXIT_BAD_INPUT
-    raise SystemExit(code if isinstance(code, int) else 0)
+    return code if isinstance(code, int) else 0
 
 
 def _where() -> str:

@@ -273,6 +273,26 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
+@pytest.mark.parametrize(
+    "error", ["ValueError('Invalid bounding box')", "lv.InputError('mujoco cannot be imported')"]
+)
+def test_ctrl_c_that_a_library_makes_another_error_of_ends_with_130(error):
+    code = f"""
+import signal, click, lavender as lv
+from lavender.cli import cases, main
+def swallowing(**words):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise {error} from None
+cases.cases.callback = swallowing
+main(["cases"])
+"""
+    said = python("-c", code, status=130).stderr
+    assert "lavender: stopped" in said and eval(error, {"lv": lv}).args[0] in said and "Traceback" not in said
+
+
 @pytest.mark.parametrize("columns", ["0", "1", "19"])
 @pytest.mark.parametrize(
     "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]

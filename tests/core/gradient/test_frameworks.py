@@ -176,3 +176,15 @@ def test_what_jax_refuses():
     jac, mass, free, mu, *_ = GIVEN[0]
     with pytest.raises(lv.InputError, match=r"J is float32; float64 is needed: jax.config.update"):
         solve(jax.numpy.asarray(jac, "float32"), mass, free, mu)
+
+
+def test_vmap_of_jax_is_before_a_batch_inside():
+    jax, solve = jax_and_solve()
+    jac, mass, free, mu, target, soft = map(jax.numpy.asarray, GIVEN[0])
+    many, frees = (x + 0.01 * jax.numpy.arange(3.0).reshape(3, *[1] * x.ndim) for x in (jac, free))
+
+    def push(J):  # as many worlds inside as vmap adds outside
+        return solve(J, mass, frees, mu, target=target, compliance=soft)[0]
+
+    for function in (push, jax.grad(lambda J: push(J).sum())):
+        assert np.allclose(jax.vmap(function)(many), np.stack([function(J) for J in many]), rtol=1e-9)
