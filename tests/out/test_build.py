@@ -31,6 +31,7 @@ LANGUAGES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("small", [[], ["-DLAV_SWEEPS_ONLY"]], ids=["full", "sweeps"])
 @pytest.mark.parametrize(
     ("name", "language"),

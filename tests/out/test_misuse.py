@@ -332,6 +332,7 @@ WHOLE = st.lists(st.integers(-3, 12), min_size=0, max_size=12)
 REAL = st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=0, max_size=12)
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @drawn(st.data())
 def test_no_problem_whatever_makes_the_library_write_beside_its_memory(library, data):

@@ -157,6 +157,7 @@ def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form,
     assert np.abs(f - exact).max() <= 4.0 * max(1.0, wide) * tau * (1.0 + problem.cones.mu.max())
 
 
+@pytest.mark.slow
 def test_a_path_runs_through_its_folds():
     """Steps of a pile on which load passes from stick to slip, up to twelve times on one path."""
     paths = 0

@@ -148,6 +148,7 @@ def runs(pid):
 PROC = pytest.mark.skipif(not os.path.exists("/proc/self/stat"), reason="processes are seen in Linux's /proc")
 
 
+@pytest.mark.slow
 @PROC
 def test_a_backend_that_forks_and_hangs_ends_with_its_child(hostile, watchdog):
     p = stack()
@@ -159,6 +160,7 @@ def test_a_backend_that_forks_and_hangs_ends_with_its_child(hostile, watchdog):
         assert worker.measure(p, task(p, "pgs"))[0].status == "CONVERGED"  # and another worker goes on
 
 
+@pytest.mark.slow
 @PROC
 def test_a_child_that_left_the_group_and_keeps_the_pipe_keeps_nobody_waiting(hostile, watchdog):
     p = stack()
@@ -179,6 +181,7 @@ Worker().measure(p, task(p, "x_fork", time_limit=600.0))
 """
 
 
+@pytest.mark.slow
 @PROC
 def test_a_worker_ends_when_its_parent_is_killed(hostile):
     root = os.path.dirname(__file__)
@@ -212,6 +215,7 @@ def children(pid):
     return [c for child in found for c in (child, *children(child))]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not os.path.exists(f"/proc/self/task/{os.getpid()}/children"), reason="children are seen in Linux's /proc"
 )

@@ -34,6 +34,7 @@ def problems(law, seed):
 # -- the bound -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("numbers, draws", [(Wide, 150), (Exact, 20)])
 def test_no_bound_is_broken(numbers, draws):
     """In rational numbers no rounding decides: exact where cones are polyhedral, to 2^-240 where a disk slides."""
@@ -50,6 +51,7 @@ def test_no_bound_is_broken(numbers, draws):
     holds()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not HAS_WIDE, reason="no long double beyond float64 here")
 def test_the_bound_is_not_loose_and_draws_have_a_truth():
     """The median is 1.0 where the witness is at the floor; 200 draws with a fixed seed, nearly all settled."""

@@ -116,6 +116,7 @@ def test_a_twin_in_rational_numbers_finds_nothing_false(first):
     assert sum(near) >= 0.95 * len(near) > 0
 
 
+@pytest.mark.slow
 def test_sparse_numbers_prove_nothing_false_either(monkeypatch):
     """Small problems by the way of large ones: sparse float64 numbers with bounds, rows of the inverse in portions."""
     for where, name in ((operator, "SMALL"), (operator, "DENSE"), (island, "DENSE"), (island, "PORTION")):
@@ -126,6 +127,7 @@ def test_sparse_numbers_prove_nothing_false_either(monkeypatch):
     assert sum(near) >= 0.9 * len(near) > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["granular(n=9)", "chain(n=1000)"])
 def test_thousands_of_coupled_rows_are_proven(name):
     problem = suite.case(name).problem

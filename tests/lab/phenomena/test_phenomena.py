@@ -95,6 +95,7 @@ def cells(text):
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stepper", STEPPERS)
 def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
     page = cells((Path(__file__).resolve().parents[3] / "docs" / "phenomena.md").read_text(encoding="utf-8"))
@@ -128,6 +129,7 @@ def test_a_pendulum_loses_less_in_shorter_steps(stepper):
     assert left[1] < 0.5 * left[0]
 
 
+@pytest.mark.slow
 def test_what_stands_and_what_falls_are_told_apart():
     for name, key in (("tipping", "slope"), ("overhang", "reach"), ("arch", "thickness")):
         for value in (0.95, 1.05):
