@@ -7,7 +7,8 @@ takes the impulses that were found.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -23,11 +24,12 @@ NAMES = ("J", "M", "v_free", "mu", "target", "compliance")
 SIZES = (2, 2, 1, 1, 1, 1)  # axes of each that are no batch
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Step:
     """What is no array: bounds, law, who solves."""
 
-    cones: Cones
+    cones: Cones = field(compare=False)
+    bounds: tuple[bytes, ...]  # the cones' numbers without mu, which is not read
     friction: str
     solver: str
     tol: float
@@ -125,4 +127,15 @@ def step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str,
         raise InputError(
             f"cones have {cones.n_rows} rows and {contacts} contacts; J has {m} rows and mu {k} values"
         )
-    return Step(cones, friction, solver, tol)
+    bounds = tuple(np.asarray(getattr(cones, f.name)).tobytes() for f in fields(cones) if f.name != "mu")
+    made = Step(cones, bounds, friction, solver, tol)
+    try:
+        return _first_of_equals(made)
+    except TypeError:  # no name or no number, which has no hash: the solve refuses it
+        return made
+
+
+@lru_cache(maxsize=256)
+def _first_of_equals(made: Step) -> Step:
+    # JAX keeps what it compiles of a callback by the identity of its object: another one each call is compiled anew.
+    return made

@@ -47,6 +47,22 @@ def test_the_adjoint_is_summed_over_what_was_repeated():
         assert x == pytest.approx(np.stack([y, z]) if i == 2 else y + z, rel=1e-12, abs=1e-12)
 
 
+def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compiled():
+    given, contacts = GIVEN[0], lv.Cones.contacts
+    made = step(given, None, "coulomb", "auto", 1e-10)
+    assert step(given, contacts(0.7, 2, count=2), "coulomb", "auto", 1e-10) is made  # mu is an array's
+    for cones, *others in (
+        (None, "cone", "auto", 1e-10),
+        (None, "coulomb", "newton", 1e-10),
+        (None, "coulomb", "auto", 1e-9),
+        (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 1.0]), "coulomb", "auto", 1e-10),
+        (contacts(0.5, 1, count=2) + lv.Cones.bounded([0.0, 0.0], [1.0, 2.0]), "coulomb", "auto", 1e-10),
+    ):
+        other = step(given, cones, *others)
+        assert other is not made and other is step(given, cones, *others)
+        made = other
+
+
 @pytest.mark.parametrize("name", ["torch", "jax"])
 def test_a_missing_package_is_named(name, monkeypatch):
     monkeypatch.setitem(sys.modules, name, None)
