@@ -293,14 +293,16 @@ class Tuning:
         enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
         said = []
-        for word, m, why in (
-            ("as accurate as now, faster", self.faster, none),
-            ("as fast as now, more accurate", self.closer, closer),
+        for word, m, why, gains in (
+            ("as accurate as now, faster", self.faster, none, "time"),
+            ("as fast as now, more accurate", self.closer, closer, "worst"),
         ):
             if m is None:
                 said.append(f"{word}: {why}")
                 continue
             held = next((h for h in self.held[1:] if h.setting == m.setting), None)
+            if held is not None and getattr(held, gains) >= getattr(self.held[0], gains):
+                word += ": not on the worlds held back"
             said += [
                 f"{m.setting.line}  <!-- {word} -->", f"    chosen on: {_beside(m, self.now)}",
                 f"    held back: {'not measured' if held is None else _beside(held, self.held[0])}",

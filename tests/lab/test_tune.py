@@ -124,6 +124,19 @@ def test_both_sides_of_the_choice_are_printed():
     assert "1.10 of the time, error 3.0e-3 m/s beside 2.0e-3" in lines[2]
 
 
+def test_a_gain_that_the_held_back_worlds_do_not_have_is_told_as_none():
+    now, quick, exact = (
+        measured(10.0, 1e-3),
+        measured(8.0, 1e-3, iterations=9),
+        measured(10.0, 1e-5, tolerance=1e-9),
+    )
+    for time, error, refuted in ((7.0, 1e-5, False), (11.0, 2e-3, True)):
+        held = [now, measured(time, 1e-3, iterations=9), measured(10.0, error, tolerance=1e-9)]
+        lines = [line for line in chosen(now, quick, exact, held=held).lines if "<option" in line]
+        assert len(lines) == 2
+        assert all(("not on the worlds held back" in line) == refuted for line in lines)
+
+
 def test_ctrl_c_keeps_what_there_is(boxes, monkeypatch):
     fewer(monkeypatch)
 
