@@ -11,12 +11,6 @@ All other impulses are >= 0. As M (x - v*) = J^T lambda,
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
 
-Over velocities J is whitened by the factor of M, which fills it in where P couples many variables. The same program is
-a constraint problem of rows, with x and y as its impulses and A without symmetry, as sparse as P and J:
-
-    [ M  -J^T ] [x]   [ M v*   ]     x within its bounds, lambda as above, J without the rows of bounds
-    [ J   0   ] [y] - [ target ] = w                                                                      (4)
-
 P singular: M = P + D and v* = M^-1 (D c - q) with D >= 0 diagonal: a step of the proximal point method from the
 centre c (Rockafellar 1976, Monotone operators and the proximal point algorithm). Its solution has the dual residual
 D (c - x), and `lavender.solve_qp` repeats it around the x found until that is small. Where the rows of P
@@ -50,9 +44,6 @@ PROXIMAL = 1e-9  # D over P_ii, or over the largest of them where P_ii = 0
 SINGULAR = 1e-10  # least pivot over its diagonal entry up to which P counts as singular
 SHIFT = 1e-12  # of P_ii: P + SHIFT diag(P) has a factor where P is semidefinite to rounding
 FAR = 1e3  # v* over the size of x that right-hand sides, or else q, let one expect: D is made large enough
-# Entries of J, whitened, over those of J and of M's factor, from which (4) costs less than more than one compiled call
-# over velocities; and of more than MANY variables than that call; variables up to which it does not.
-FILLED, WHOLLY, MANY, FEW = 1.0, 3.0, 300, 100
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where q is zero: all of them may vanish
 TINY = 1e-300  # beside x = 0
 BALANCED = 10  # passes by which units of variables without a P_ii are found: factors of 1e4 are left at 1.01
@@ -240,62 +231,6 @@ class QuadraticProgram:
         far = np.full(len(x), without)
         most.at(far, jac.coords[1], row[jac.coords[0]] / jac.data)
         return np.where(far < np.inf, far, x.max(initial=0.0))
-
-    @cached_property
-    def filled(self) -> float:
-        """Entries of J, whitened, over those of J and of M's factor; 0 where rows of (4) are not solved sooner."""
-        of = self.generalized.operator
-        share = of.reach / max(1.0, len(of.jac[1]) + len(of.mass[1]) + of.fill) if of.n > FEW else 0.0
-        return share if share > FILLED else 0.0
-
-    @property
-    def fills_wholly(self) -> bool:
-        """Whether whitening J alone may cost more than rows of (4)."""
-        return self.filled > WHOLLY and len(self.q) > MANY
-
-    @property
-    def _rows_of_box(self) -> tuple[tuple[IntpArray, slice], ...]:
-        """Variables and rows of lb = ub, of lb and of ub."""
-        if self.fixed is None or self.lower is None or self.upper is None:
-            return tuple((np.zeros(0, np.intp), slice(0, 0)) for _ in range(3))
-        end = len(self.target)
-        low = end - len(self.upper)
-        places = slice(self.n_equalities or 0, self.free), slice(low - len(self.lower), low), slice(low, end)
-        return tuple(zip((self.fixed, self.lower, self.upper), places, strict=True))
-
-    @property
-    def _own_rows(self) -> npt.NDArray[np.bool_]:
-        """(m,) Rows of A and G."""
-        own = np.ones(len(self.target), bool)
-        for _, rows in self._rows_of_box:
-            own[rows] = False
-        return own
-
-    def over_rows(self) -> tuple[FloatArray, Cones, sp.csr_array]:
-        """b, cones and A of (4)."""
-        of, own, cones = self.generalized, self._own_rows, self.cones
-        low, high = np.full(of.nv, -np.inf), np.full(of.nv, np.inf)
-        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
-        low[fixed] = high[fixed] = self.target[equal]
-        low[lower], high[upper] = self.target[above], -self.target[below]
-        j = of.jac[own]
-        a = sp.block_array([[of.mass, -j.T], [j, None]], format="csr") if own.any() else of.mass
-        bounds = np.concatenate([low, cones.lower[own]]), np.concatenate([high, cones.upper[own]])
-        return np.concatenate([of.momentum_of(of.v_free), self.target[own]]), Cones.bounded(*bounds), a
-
-    def start_over_rows(self, impulse: FloatArray) -> FloatArray:
-        """Impulses (m,) as those of (4)."""
-        x = self.generalized.v_free + self.generalized.change(impulse)
-        return np.concatenate([x, impulse[self._own_rows]])
-
-    def impulse_from_rows(self, impulse: FloatArray, slack: FloatArray) -> FloatArray:
-        """Impulses (m,) of impulses and slack of (4): bounds carry what is left of the forces."""
-        out, n = np.empty(len(self.target)), len(self.q)
-        (fixed, equal), (lower, above), (upper, below) = self._rows_of_box
-        out[self._own_rows] = impulse[n:]
-        out[equal], out[above], out[below] = slack[fixed], slack[lower], -slack[upper]
-        np.maximum(out[self.free :], 0.0, out=out[self.free :])
-        return out
 
     def multipliers(
         self, impulse: FloatArray

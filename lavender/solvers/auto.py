@@ -196,11 +196,6 @@ class Tree:
             return False
         return len(p._compressed[1]) > (DENSE if p.is_symmetric else SPARSE) * p.m**2
 
-    @property
-    def is_program(self) -> bool:
-        """Rows of a program whose own velocities tell sooner that there is no solution."""
-        return self.problem.qp is not None and self.problem.matrix is not None
-
     @cached_property
     def is_loose(self) -> bool:
         """Contacts under Coulomb's law, nearly each between another pair of bodies or of trees of M: sweeps then decide
@@ -236,8 +231,6 @@ class Tree:
             yield from islice(self.factorisations(SURE if sooner else MOST), 1)
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.factorisations(MOST)
-        if self.is_program:
-            return
         unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
         if "newton over rows" not in self.states:
             self.add_rows(max(MOST * self.newton, LITTLE))
@@ -410,7 +403,7 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
             step.least = stage.least
             step.run(stage.iterations)
             tree.best = log.best
-    if log.best > log.tol and log.certificate is None and not tree.is_program and (log.left > 0 or log.vain):
+    if log.best > log.tol and log.certificate is None and (log.left > 0 or log.vain):
         certify(log)
 
 

@@ -121,8 +121,14 @@ def _newton(
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
-    """Of J and M: the motion that violates J v = target least, near v - v* (nv,) or that of the best impulse.
+def without_dust(y: FloatArray, d: FloatArray) -> FloatArray:
+    """Of a direction (m,) the rows that take part, in the metric of d (m,)."""
+    size = np.sqrt(d) * np.abs(y)
+    return np.where(size > DUST * size.max(), y, 0.0)
+
+
+def least_violation(log: SolveLog) -> None:
+    """Of J and M: the motion that violates J v = target least, near that of the best impulse.
 
     With a diagonal mass C in the place of M and compliances eps d, the impulses lambda(eps) of
 
@@ -133,7 +139,7 @@ def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
     """
     problem, of = log.problem, log.problem.generalized
     assert of is not None
-    v, cones = np.clip(of.change(log.impulse) if v is None else v, -MOST, MOST), problem.cones
+    v, cones = np.clip(of.change(log.impulse), -MOST, MOST), problem.cones
     if problem.law == "coulomb":
         cones = replace(cones, mu=0.0 * cones.mu, rolling=0.0 * cones.rolling)
     squares = of.jac.multiply(of.jac).tocsr()
@@ -155,8 +161,7 @@ def least_violation(log: SolveLog, v: FloatArray | None = None) -> None:
             raise KeyboardInterrupt
         y = lam - before
         y[(np.isfinite(cones.upper) & (y > 0.0)) | (np.isfinite(cones.lower) & (y < 0.0))] = 0.0
-        size = np.sqrt(d) * np.abs(y)
-        y[size <= DUST * size.max()] = 0.0
+        y = without_dust(y, d)
         if not prove(problem, y, log.tol).reason:
             break
     log.note("least violation", Claim(Status.STALLED, 0, {"certificates": 1}, certificate=y), log.best)

@@ -2,9 +2,8 @@
 
     x_(k+1) = argmin 1/2 x.P x + q.x + 1/2 (x - x_k).D (x - x_k)   under the program's constraints
 
-Where `auto` has a P that fills J in, and its compiled call does not solve the program, it solves the rows (4) of
-`problem/quadratic.py` in its place, which stay sparse; where it does not solve these either, it asks for a proof that
-nobody can, then goes over velocities.
+A program of more than a few rows `auto` solves by an interior point on x and the impulses themselves, which needs no D,
+after the compiled call over velocities where that ends sooner; where it fails, these steps follow.
 Each step is a problem of the same J and M = P + D, started from the impulses of the step before. Its answer solves the
 program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 """
@@ -21,13 +20,17 @@ from lavender.base.arrays import FloatArray, number, read_only
 from lavender.base.deadline import Deadline, Stopwatch
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
-from lavender.judge.solution import Claim, Solution, Status
+from lavender.judge.certificates import prove
+from lavender.judge.residuals import Residual, residual
+from lavender.judge.solution import Claim, Solution, Status, Turn
 from lavender.problem import Problem, QPSolution
 from lavender.problem.generalized import Generalized
 from lavender.problem.quadratic import QuadraticProgram
-from lavender.solvers.certify import least_violation
+from lavender.solvers.certify import without_dust
+from lavender.solvers.interior_point import NAME, InteriorPoint
 from lavender.solvers.registry import SMALL_ROWS, get
-from lavender.solvers.solve_log import SolveLog
+from lavender.solvers.setup_times import LAID_OUT, SCIPY, loading
+from lavender.solvers.small import told
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
 STEPS = 50  # proximal steps
@@ -39,7 +42,8 @@ IDLE = 10  # steps in a row without a smaller error, after which no other is mad
 FAILED = 3  # and so many that stall
 TIGHTEST = 1e-15  # tol of a step
 CENTRED = 1e-9  # tol of a step around a centre, at most: a ray shows only to UNBOUNDED
-CLOSER = 0.1  # of tol, over rows: their residual is relative to other forces
+SET_UP = 5e-3  # s of an interior point before its first step, in Python, whatever the size
+SOONER = 5e6  # counted cost [ns] of a compiled call, in which an interior point would hardly have begun
 HARD = (Status.FLOOR, Status.STALLED)  # after which the next step has more of D, too: M is nearly singular
 ENDS = (Status.INFEASIBLE, Status.INTERRUPTED)
 UNBOUNDED = 1e-7  # relative: a direction along which the objective falls for ever; a point where it may begin
@@ -96,9 +100,9 @@ def solve_qp(
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
-    sparse = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS and qp.filled > 0.0
-    step = _over_rows if sparse else _over_velocities
-    solution, x = step(problem, solver, tol, time_limit, start, options)
+    auto, given = solver == "auto" and tol > 0.0 and not options, problem
+    first = _by_interior_point if auto and problem.m > SMALL_ROWS else _over_velocities
+    solution, x = first(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)
     centre, tightest, before, idle, failed, point = None, tol, np.inf, 0, 0, None
     if answer.error <= tol and qp.proximal is None:
@@ -132,18 +136,24 @@ def solve_qp(
                 d = d / SOFTER
             elif slow and (qp.unit is None or (d / qp.unit).max() > SOFTEST):
                 d = SOFTER * d
-            qp = qp.around(centre, d)
-            general = qp.generalized
-            problem = replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
+            problem = _around(problem, qp, centre, d)
+            qp = problem.qp
             inner = max(min(tol, CENTRED) / far, TIGHTEST)
         tightest, limit = inner, None if time_limit is None else left
-        solution, x = step(problem, solver, inner, limit, solution.impulse, options)
+        solution, x = _over_velocities(problem, solver, inner, limit, solution.impulse, options)
         answer = qp.solution(solution, tol, x)
         idle = 0 if answer.error < best.error else idle + 1
         best = min(best, answer, key=lambda one: one.error)
         failed = failed + 1 if solution.status is Status.STALLED else 0
         if idle == IDLE or failed == FAILED:
             break
+    left = end - perf_counter()
+    if (
+        auto and first is _over_velocities and not best.found and left > 0.0
+    ):  # what few programs of few rows need
+        limit = None if time_limit is None else left
+        solution, x = _by_interior_point(given, solver, tol, limit, None, options)
+        best = min(best, given.qp.solution(solution, tol, x), key=lambda one: one.error)
     return best
 
 
@@ -152,6 +162,13 @@ def _nearest(problem: Problem, qp: QuadraticProgram) -> Problem:
     assert qp.unit is not None
     general = Generalized(qp.generalized.jac, sp.diags_array(qp.unit), np.zeros(len(qp.q)))
     return replace(problem, generalized=general, b=qp.target, qp=None, guess=None, copy=False)
+
+
+def _around(problem: Problem, qp: QuadraticProgram, centre: FloatArray, d: FloatArray) -> Problem:
+    """The proximal step from a centre (n,) with this D (n,)."""
+    qp = qp.around(centre, d)
+    general = qp.generalized
+    return replace(problem, generalized=general, b=general.bias(qp.target), qp=qp, copy=False)
 
 
 Step = tuple[Solution, FloatArray | None]  # and x, where it is known better than by the impulses
@@ -163,36 +180,50 @@ def _over_velocities(
     return solve(problem, solver, tol=tol, time_limit=time_limit, impulse=impulse, **options), None
 
 
-def _over_rows(
+def _by_interior_point(
     problem: Problem, solver: str, tol: float, time_limit: float | None, impulse: Any, options: dict[str, Any]
 ) -> Step:
-    """The compiled call over velocities, then sparse rows of `problem.qp`; where these are not solved, velocities."""
-    qp, watch = problem.qp, Stopwatch()
-    if not qp.fills_wholly:
-        made = solve_small(problem, get(solver), impulse, tol, seconds_of(time_limit))
-        if made is not None:
-            return made, None
-    b, cones, matrix = qp.over_rows()
-    over = Problem(b, cones, matrix, copy=False, qp=qp)
-    start = None if impulse is None else qp.start_over_rows(problem.impulse_array(impulse))
-    found = solve(over, solver, tol=CLOSER * tol, time_limit=time_limit, impulse=start)
-    solved = found.status in (Status.CONVERGED, Status.FLOOR)
-    lam, x = qp.impulse_from_rows(found.impulse, found.slack), read_only(found.impulse[: len(qp.q)].copy())
-    status, proof = Status.CONVERGED, None
-    left = None if time_limit is None else max(time_limit - watch.seconds, 1e-6)
-    if not solved:
-        log = SolveLog(problem, tol, 1, Deadline(left))
-        log.offer(lam)
-        least_violation(log, x - qp.generalized.v_free)
-        status, proof = Status.INFEASIBLE, log.certificate
-    if proof is None and not (solved and (qp.proximal is not None or qp.solution(lam, tol, x).found)):
-        return _over_velocities(problem, solver, tol, left, lam if solved else impulse, options)
-    claim = Claim(
-        status, found.iterations, dict(found.work), f"over the rows of P and J: {found.message}",
-        certificate=proof, turns=found.turns,
-    )  # fmt: skip
-    late: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
-    return Solution.late(read_only(lam), claim.status, tol, watch.seconds, late), x
+    """The compiled call over velocities if it ends sooner, then an interior point; where neither ends, velocities."""
+    qp, deadline, watch = problem.qp, Deadline(time_limit), Stopwatch()
+    made = solve_small(problem, get(solver), impulse, tol, seconds_of(time_limit), SOONER)
+    if made is not None:
+        return made, None
+    answer, entries = None, qp.generalized.mass.nnz + qp.generalized.jac.nnz
+    if not deadline.passed(loading(*SCIPY, "qdldl") + SET_UP + LAID_OUT * entries):
+        point = InteriorPoint(qp)
+        answer, proof = point.run(tol, deadline, lambda lam: _proof(problem, lam, tol))
+    if answer is None or not (
+        answer.found or proof is not None or deadline.passed() or qp.ray(answer.x, UNBOUNDED) is not None
+    ):
+        return _over_velocities(problem, solver, tol, deadline.left(1e-6), impulse, options)
+    lam = read_only(answer.impulse)
+    judged = residual(problem, lam)
+    if answer.found and judged.relative > tol:
+        # P^-1 makes more of the dual residual: the step around x itself, with a D that has no such inverse.
+        near = _around(problem, qp, answer.x, read_only(point.unit))
+        problem, judged = min(((one, residual(one, lam)) for one in (problem, near)), key=_wrong)
+    if proof is not None:
+        status = Status.INFEASIBLE
+    elif judged.relative <= tol:
+        status = Status.CONVERGED
+    else:
+        left = Status.STALLED if answer.found or not deadline.passed() else Status.TIME_LIMIT
+        status = Status.FLOOR if judged.at_floor else left
+    work = {"factorisations": point.factorisations}
+    turn = Turn(NAME, work, problem.metric.start_relative, judged.relative)
+    claim = Claim(status, point.factorisations, work, told([turn]), certificate=proof, turns=(turn,))
+    rest: tuple[Any, ...] = judged_later, (problem, problem, get(solver), {}, lam, claim, tol)
+    return Solution.late(lam, status, tol, watch.seconds, rest), answer.x
+
+
+def _proof(problem: Problem, impulse: FloatArray, tol: float) -> FloatArray | None:
+    """What impulses (m,) that grow without end prove, by the rows that take part."""
+    found = prove(problem, without_dust(impulse, problem.d), tol)
+    return None if found.reason else found.y
+
+
+def _wrong(found: tuple[Problem, Residual]) -> float:
+    return found[1].relative
 
 
 def _distance(answer: QPSolution) -> float:

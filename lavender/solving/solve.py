@@ -457,10 +457,16 @@ def judged_later(given: Problem, problem: Problem, *more: Any) -> dict[str, Any]
 
 
 def solve_small(
-    problem: Problem, spec: SolverSpec, impulse: Any, tol: float, limit: float = math.inf
+    problem: Problem,
+    spec: SolverSpec,
+    impulse: Any,
+    tol: float,
+    limit: float = math.inf,
+    most: float = math.inf,
 ) -> Solution | None:
     """The solution of a small problem by one compiled call, judged there; None if `Prepared` has to solve it.
 
+    most: counted cost [ns] after which it is given up.
     If its counted cost is more than the limit [s], the result is the best of what was found by then and of the start.
     The fields of claim, counts and residual are made when they are first read.
     """
@@ -483,7 +489,7 @@ def solve_small(
         given = impulse
     else:
         given = problem.impulse_array(impulse)
-    judged, counts = small.attempt(problem, given, tol, COUNTED * limit)
+    judged, counts = small.attempt(problem, given, tol, min(COUNTED * limit, most))
     if judged is None:
         return None
     status = CONVERGED
