@@ -362,10 +362,10 @@ class Builders(Operators):
             diagonal of P, and the problem is one step of the proximal point method; `lavender.solve_qp` repeats it.
         q : (n,)
         G, h : (mi, n) array or sparse, and (mi,), optional
-            Entries of h may be inf.
+            Entries of h may be inf; from 1e20 on they are.
         A, b : (me, n) array or sparse, and (me,), optional
         lb, ub : (n,), optional
-            Entries may be infinite.
+            Entries may be infinite; from 1e20 on, in size, they are.
         **more
             As `Problem`: name, guess, ...
 

@@ -6,7 +6,8 @@ is the constraint problem of the generalised velocities x with
 
     M = P,   v* = -P^-1 q,   J = [A; I_f; -G; I_l; -I_u],   target = [b; lb_f; -h; lb_l; -ub_u]           (2)
 
-f: variables with lb = ub, whose rows are free like those of A; l, u: other finite bounds; of G the rows with finite h.
+f: variables with lb = ub, whose rows are free like those of A; l, u: other finite bounds; of G the rows with finite h,
+where what is 1e20 or more in size is infinite.
 All other impulses are >= 0. As M (x - v*) = J^T lambda,
 
     P x + q + A^T y + G^T z + z_box = 0,   y = -lambda_A,  z = lambda_G,  z_box = lambda_u - lambda_l - lambda_f  (3)
@@ -47,6 +48,7 @@ FAR = 1e3  # v* over the size of x that right-hand sides, or else q, let one exp
 FLAT = 1e-3  # of max |P_ij| max |x_i|: what forces are measured by where q is zero: all of them may vanish
 TINY = 1e-300  # beside x = 0
 BALANCED = 10  # passes by which units of variables without a P_ii are found: factors of 1e4 are left at 1.01
+ENDLESS = 1e20  # h and bounds from which they are none, as other packages have it for infinity
 SHOWN = 1000  # variables up to which the least eigenvalue of an indefinite P is computed for the message
 Given = tuple[Any, Any, Any, Any, Any, Any, Any, Any]  # P, q, G, h, A, b, lb, ub
 
@@ -63,7 +65,7 @@ class QPSolution:
     y : (me,), or None without A
         Multipliers of A x = b.
     z : (mi,), or None without G
-        Multipliers of G x <= h; 0 where h is infinite.
+        Multipliers of G x <= h; 0 where h is infinite, from 1e20 on.
     z_box : (n,), or None without lb and ub
         Multipliers of the bounds.
     solution : Solution or None
@@ -316,7 +318,9 @@ def quadratic(given: Given) -> QuadraticProgram:
         )
         _check_bounds(lb, ub)
         equal = lb == ub
-        fixed, low, up = (np.flatnonzero(on) for on in (equal, (lb > -np.inf) > equal, (ub < np.inf) > equal))
+        fixed, low, up = (
+            np.flatnonzero(on) for on in (equal, (lb > -ENDLESS) > equal, (ub < ENDLESS) > equal)
+        )
         rows.bounds(fixed, lb, 1.0)
     free = rows.m
     n_g, kept = rows.given("G", G, "h", h)
@@ -407,9 +411,9 @@ class _Rows:
             self.put(rows, as_array(side, vector, (m,)))
             return m, None
         right, kept = as_array(side, vector, (m,), finite=False), None
-        if not all_finite(right):
+        if not (all_finite(right) and (right < ENDLESS).all()):
             check_not_nan(side, right)
-            kept = np.flatnonzero(right < np.inf)
+            kept = np.flatnonzero(right < ENDLESS)
             rows, right = _picked(rows, kept), right[kept]
             if not all_finite(right):
                 raise InputError(f"h is -inf at [{kept[np.argmin(right)]}]: no x is below it")

@@ -8,8 +8,8 @@
 by Mehrotra (1992, On the implementation of a primal-dual interior point method): a step to mu = 0 tells how much of mu
 the next one keeps, and its second order. rho and delta are proximal terms around the iterate (Altman, Gondzio 1999,
 Regularized symmetric indefinite systems in interior point methods), refined away; P, J and target are balanced first
-(Ruiz 2001). What has few entries is factored as (1) stands, quasidefinite, in one order for all steps; else x alone is
-left, with P + rho + J^T (W + delta)^-1 J.
+(Ruiz 2001), then x and the objective get units of their own. What has few entries is factored as (1) stands,
+quasidefinite, in one order for all steps; else x alone is left, with P + rho + J^T (W + delta)^-1 J.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from lavender.base.later import sparse as sp
 from lavender.problem.quadratic import QPSolution, QuadraticProgram
 from lavender.solvers.factors import TINY, WIDE, Panels, rows_of
 from lavender.solvers.setup_times import DENSE, SPARSE, dense_work
+from lavender_ext.core.checks import MOST, largest
 from lavender_ext.factor.sparse import FullCholesky
 
 NAME = "interior point"  # in turns and messages
@@ -34,13 +35,14 @@ PROXIMAL = 1e-8  # rho and delta, of balanced rows
 REFINED = 3  # solves with one factor of (1)
 EXACT = 1e-14  # of the right-hand side, that refinement leaves
 BALANCED = 5  # passes of Ruiz
+LARGE = 0.9  # share of targets that are at most the unit of x: a few may stand for no bound at all
 FULL, FULL_SIZE = (
     0.2,
     3000,
 )  # share of entries from which P or J is a full matrix, of at most so many variables
 CLOSER = 0.01  # of tol, as its norms are other ones than the judge's
 WATCHED = 4.0  # s of one factor, at most: Ctrl-C is heard between two
-SHORT = 0.99  # of the way to the boundary
+SHORT, INSIDE = 0.99, 1.0 - 1e-10  # of the way to the boundary: at first, and at most
 FARKAS = 1e-6  # |J^T lambda| over the sums of its terms, from which lambda may prove that there is no x
 Solve = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
@@ -48,6 +50,7 @@ Solve = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 class InteriorPoint:
     """The balanced program, and the iterate."""
 
+    @np.errstate(all="ignore")  # what overflows in these units is left to velocities
     def __init__(self, qp: QuadraticProgram) -> None:
         self.qp, of = qp, qp.generalized
         p, j = sp.csr_array(of.mass), sp.csr_array(of.jac)
@@ -57,9 +60,17 @@ class InteriorPoint:
         self.p, self.j = _scaled(p, self.column, self.column), _scaled(j, self.row, self.column)
         self.jt = sp.csr_array(self.j.T)
         self.terms = abs(self.jt)
-        q = self.column * qp.q
-        self.size = float(max(np.abs(q).max(initial=0.0), np.abs(self.p.data).max(initial=0.0))) or 1.0
-        self.p, self.q, self.target = self.p / self.size, q / self.size, self.row * qp.target
+        q, target = self.column * qp.q, self.row * qp.target
+        curved, steep = np.abs(self.p.data).max(initial=0.0), np.abs(q).max(initial=0.0)
+        some = np.abs(target[target != 0.0])
+        # x in units of a large target: then P stands beside J as Ruiz left it, whatever the units of x and of q.
+        self.far = 1.0
+        if len(some):
+            self.far = float(np.quantile(some, LARGE))
+        elif steep > 0.0 and curved > 0.0:
+            self.far = float(steep / curved)
+        self.size = float(max(curved, steep / self.far)) or 1.0
+        self.p, self.q, self.target = self.p / self.size, q / (self.size * self.far), target / self.far
         n = len(q)
         many = np.diff(self.j.indptr) > 1
         full = dense_work(n) + 0.5 * np.count_nonzero(many) * float(n) ** 2
@@ -78,6 +89,7 @@ class InteriorPoint:
         """(n,) What stands for P_ii, with J beside it: 1 / sqrt(unit) is a unit of each variable."""
         return self.size / self.column**2
 
+    @np.errstate(all="ignore")  # an iterate that overflows is none
     def run(
         self, tol: float, deadline: Deadline, proof: Callable[[FloatArray], FloatArray | None]
     ) -> tuple[QPSolution | None, FloatArray | None]:
@@ -88,7 +100,7 @@ class InteriorPoint:
         if self.seconds > WATCHED or deadline.passed(self.seconds):
             return None, None
         free, m = self.qp.free, len(self.target)
-        theta = np.ones(m)
+        theta, watch = np.ones(m), Stopwatch()
         theta[:free] = 0.0
         x, lam = self._factored(theta)(-self.q, self.target)
         w = self.j @ x - self.target
@@ -96,8 +108,9 @@ class InteriorPoint:
         _push_inside(w[free:], lam[free:])
         best: tuple[FloatArray, FloatArray] | None = None
         least, nearest, idle = np.inf, np.inf, 0
-        watch = Stopwatch()
         for _ in range(STEPS):
+            if not (largest(self._impulse(lam)) <= MOST and largest(self.far * self.column * x) <= MOST):
+                break  # nor NaN: no answer has such numbers
             dual = self.p @ x + self.q - self.jt @ lam
             primal = self.j @ x - self.target - w
             error = self._error(x, lam, w, dual, primal)
@@ -112,7 +125,7 @@ class InteriorPoint:
                 answer = self._answer(x, lam, tol)
                 if answer.found:
                     return answer, None
-            found = proof(self.size * self.row * lam) if self._may_prove(lam) else None
+            found = proof(self._impulse(lam)) if self._may_prove(lam) else None
             if found is not None:
                 return self._answer(x, lam, tol), found
             if idle > IDLE or deadline.passed(watch.seconds / max(1, self.factorisations)):
@@ -141,7 +154,7 @@ class InteriorPoint:
         dx, dlam = solve(-dual, right)
         dz = dlam[free:]
         ds = -s - second - theta[free:] * dz
-        t = min(1.0, max(SHORT, 1.0 - mu) * min(_boundary(s, ds), _boundary(z, dz)))
+        t = min(1.0, min(max(SHORT, 1.0 - mu), INSIDE) * min(_boundary(s, ds), _boundary(z, dz)))
         w = w.copy()
         w[free:] += t * ds
         return x + t * dx, lam + t * dlam, w
@@ -168,7 +181,12 @@ class InteriorPoint:
     def _error(
         self, x: FloatArray, lam: FloatArray, w: FloatArray, dual: FloatArray, primal: FloatArray
     ) -> float:
-        """The largest of four relative residuals; min(w, lambda) is sqrt(mu) where neither is large."""
+        """The largest of four relative residuals; min(w, lambda) is sqrt(mu) where neither is large.
+
+        Where q is 0 all forces may vanish, and dual and gap with them: the judge knows beside what.
+        """
+        if not self.q.any():
+            return self._answer(x, lam, 0.0).error
         free = self.qp.free
         force, along = dual + self.jt @ lam - self.q, self.j @ x  # P x, J x
         gap = x @ force + self.q @ x - self.target @ lam
@@ -191,7 +209,11 @@ class InteriorPoint:
         return bool((np.abs(self.jt @ lam) <= FARKAS * sums.max(initial=0.0)).all())
 
     def _answer(self, x: FloatArray, lam: FloatArray, tol: float) -> QPSolution:
-        return self.qp.solution(self.size * self.row * lam, tol, self.column * x)
+        return self.qp.solution(self._impulse(lam), tol, self.far * self.column * x)
+
+    def _impulse(self, lam: FloatArray) -> FloatArray:
+        """(m,) In the program's own units."""
+        return self.far * self.size * self.row * lam
 
 
 class _Sparse:

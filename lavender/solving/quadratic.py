@@ -10,6 +10,7 @@ program but for a dual residual of D (x_k - x_(k+1)) (Rockafellar 1976).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -136,7 +137,10 @@ def solve_qp(
                 d = d / SOFTER
             elif slow and (qp.unit is None or (d / qp.unit).max() > SOFTEST):
                 d = SOFTER * d
-            problem = _around(problem, qp, centre, d)
+            try:
+                problem = _around(problem, qp, centre, d)
+            except InputError:  # units so far apart that M has no factor
+                break
             qp = problem.qp
             inner = max(min(tol, CENTRED) / far, TIGHTEST)
         tightest, limit = inner, None if time_limit is None else left
@@ -200,8 +204,9 @@ def _by_interior_point(
     judged = residual(problem, lam)
     if answer.found and judged.relative > tol:
         # P^-1 makes more of the dual residual: the step around x itself, with a D that has no such inverse.
-        near = _around(problem, qp, answer.x, read_only(point.unit))
-        problem, judged = min(((one, residual(one, lam)) for one in (problem, near)), key=_wrong)
+        with suppress(InputError):  # units so far apart that M has no factor, or v* no numbers
+            near = _around(problem, qp, answer.x, read_only(point.unit))
+            problem, judged = min(((one, residual(one, lam)) for one in (problem, near)), key=_wrong)
     if proof is not None:
         status = Status.INFEASIBLE
     elif judged.relative <= tol:

@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from hypothesis import example, given, settings
 from random_problems import seeds
 
 import lavender as lv
-from lavender.base.deadline import NEVER
+from lavender.base.deadline import NEVER, Deadline
 from lavender.solvers import interior_point
 
 NAMES = ("P", "q", "G", "h", "A", "b", "lb", "ub")
@@ -642,3 +643,57 @@ def test_a_few_rows_that_contradict_each_other_among_many_are_proven_by_these(se
     _, z, _ = none.qp.multipliers(none.solution.certificate)
     assert set(np.flatnonzero(z)) == {*fight, 200}
     assert twin.found
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("seed", "curved"), [(0, True), (1, True), (0, False)])
+def test_forces_that_all_vanish_are_told_from_those_that_do_not(seed, curved):
+    """q = 0: P x = J^T lambda = 0 is a solution if some x of P x = 0 is feasible; impulses had shrunk to 0 / 0."""
+    rng = np.random.default_rng(seed)
+    n, rows, root = 90, rng.normal(size=(70, 90)), rng.normal(size=(40, 90))
+    P = root.T @ root if curved else np.zeros((n, n))
+    problem = lv.Problem.from_qp(P, np.zeros(n), G=rows, h=rows @ rng.normal(size=n))
+    answer, _ = interior_point.InteriorPoint(problem.qp).run(1e-9, NEVER, lambda impulse: None)
+    assert answer.found and np.abs(P @ answer.x).max() <= 1e-7 and answer.primal_residual <= 1e-7
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("cost", "far"), [(1e-6, 1e6), (1e-8, 1e-6)])
+def test_units_of_the_objective_and_of_x_are_none_of_the_interior_point(seed, cost, far):
+    """P had been left so small beside J that J^T (W + delta)^-1 J hid it."""
+    rng = np.random.default_rng(seed)
+    root, A, x = rng.normal(size=(120, 120)), rng.normal(size=(70, 120)), rng.normal(size=120)
+    P, q, b = root.T @ root, rng.normal(size=120), A @ x
+    problem = lv.Problem.from_qp(cost * P, cost * far * q, A=A, b=far * b, lb=far * (x - rng.random(120)))
+    found, _ = interior_point.InteriorPoint(problem.qp).run(1e-9, NEVER, lambda impulse: None)
+    assert found.found
+    plain = lv.solve_qp(lv.Problem.from_qp(P, q, A=A, b=b, lb=problem.qp.target[70:] / far))
+    np.testing.assert_allclose(found.x / far, plain.x, atol=1e-6)  # curvatures of P along A x = b exceed 1e-3
+
+
+def test_sides_of_1e20_are_infinite():
+    """Relative to them any A x = b would count as fulfilled."""
+    qp = chained(0)
+    big = qp | {name: np.clip(qp[name], -1e20, 1e20) for name in ("h", "lb", "ub")}
+    plain, other = (lv.Problem.from_qp(*(of[name] for name in NAMES)) for of in (qp, big))
+    assert other == plain
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_units_that_are_far_from_1_end_in_an_answer(seed):
+    """Impulses beyond 1e60, or P + D without a factor, had come out as errors of the input."""
+    rng = np.random.default_rng(seed)
+    G, x, P = rng.normal(size=(66, 70)), rng.normal(size=70), np.diag((rng.random(70) < 0.5) * 1e42)
+    lv.solve_qp(lv.Problem.from_qp(P, 1e52 * G.T @ rng.normal(size=66), G, 1e10 * G @ x))
+    none = 1e-40 * np.vstack([G, -G]), 1e-40 * np.r_[G @ x - 1.0, -G @ x]
+    problem = lv.Problem.from_qp(np.zeros((70, 70)), np.full(70, 1e40), *none)
+    answer, _ = interior_point.InteriorPoint(problem.qp).run(1e-9, NEVER, lambda impulse: None)
+    assert answer is None or not answer.found
+
+
+def test_a_second_factor_is_not_begun_where_the_first_tells_that_it_ends_too_late(monkeypatch):
+    point = interior_point.InteriorPoint(lv.Problem.from_qp(*(chained(0)[name] for name in NAMES)).qp)
+    factor = point.system.factor
+    monkeypatch.setattr(point.system, "factor", lambda theta: (time.sleep(0.05), factor(theta)))
+    point.run(1e-9, Deadline(0.08), lambda impulse: None)
+    assert point.factorisations == 1
