@@ -120,9 +120,12 @@ class QPSolution:
     @property
     def _unseen(self) -> float:
         """max_i sum_j |P_ij| X_j (force): a share of X_j more of x_j is no more than that share in any row of J."""
-        return float(
-            (abs(self.qp.generalized.mass) @ self.qp.sizes(self.x, np.minimum, np.inf)).max(initial=0.0)
-        )
+        of, size = self.qp.generalized, self.qp.sizes(self.x, np.minimum, np.inf)
+        ptr, column, value = of.operator.mass  # the lower triangle, diagonal last, in the order of its factor
+        size = size if of.order is None else size[of.order]
+        row, share = np.repeat(np.arange(of.nv), np.diff(ptr)), np.abs(value)
+        sums = np.bincount(row, share * size[column]) + np.bincount(column, share * size[row])
+        return float((sums - share[ptr[1:] - 1] * size).max(initial=0.0))
 
     @property
     def objective(self) -> float:
@@ -227,11 +230,11 @@ class QuadraticProgram:
 
         `without`: where it has no row; the largest of x for inf.
         """
-        of, x = self.generalized, np.abs(x)
-        jac = abs(of.jac).tocoo()
-        row = np.maximum(abs(of.jac) @ x, np.abs(self.target))
+        jac, x = self.generalized.jac, np.abs(x)
+        of, size = np.repeat(np.arange(len(self.target)), np.diff(jac.indptr)), np.abs(jac.data)
+        row = np.maximum(np.bincount(of, size * x[jac.indices], len(self.target)), np.abs(self.target))
         far = np.full(len(x), without)
-        most.at(far, jac.coords[1], row[jac.coords[0]] / jac.data)
+        most.at(far, jac.indices, row[of] / size)
         return np.where(far < np.inf, far, x.max(initial=0.0))
 
     def multipliers(
