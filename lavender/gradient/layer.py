@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,8 @@ class Step:
         flat, batch = _flat(given)
         found: list[list[FloatArray]] = [[] for _ in NAMES]
         others = [
-            np.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1]) for x in arrays[len(given) :]
+            np.broadcast_to(x, (*batch, x.shape[-1])).reshape(prod(batch), x.shape[-1])
+            for x in arrays[len(given) :]
         ]
         problems, (impulses, y, c) = list(self.problems(flat)), others
         for p, g in zip(problems, derivatives(problems, impulses).vjp(velocity=y, impulse=c), strict=True):
@@ -78,8 +80,9 @@ def _flat(arrays: Sequence[Any]) -> tuple[list[FloatArray], tuple[int, ...]]:
     given = [np.asarray(x, np.float64) for x in arrays]
     leads = [x.shape[: x.ndim - n] for x, n in zip(given, SIZES, strict=True)]
     batch = np.broadcast_shapes(*leads)
+    count = prod(batch)  # of -1 NumPy cannot tell where an array has no rows
     return [
-        np.broadcast_to(x, (*batch, *x.shape[x.ndim - n :])).reshape(-1, *x.shape[x.ndim - n :])
+        np.broadcast_to(x, (*batch, *x.shape[x.ndim - n :])).reshape(count, *x.shape[x.ndim - n :])
         for x, n in zip(given, SIZES, strict=True)
     ], batch
 
@@ -117,11 +120,11 @@ def step(arrays: Sequence[Any], cones: Cones | None, friction: str, solver: str,
     """The step of these arrays; without cones all rows are contacts, as many as mu has values."""
     m, k = arrays[0].shape[-2], arrays[3].shape[-1]
     if cones is None:
-        if k == 0 or m % k or not 1 <= m // k <= 3:
+        if (m or k) and (k == 0 or m % k or not 1 <= m // k <= 3):
             raise InputError(
                 f"J has {m} rows for {k} values of mu; without cones= each contact has a normal and up to two tangents"
             )
-        cones = Cones.contacts(0.0, m // k - 1, count=k)
+        cones = Cones.contacts(0.0, m // k - 1 if k else 0, count=k)
     contacts = int(np.count_nonzero(cones.is_contact))
     if cones.n_rows != m or contacts != k:
         raise InputError(

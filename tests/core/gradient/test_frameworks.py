@@ -47,6 +47,20 @@ def test_the_adjoint_is_summed_over_what_was_repeated():
         assert x == pytest.approx(np.stack([y, z]) if i == 2 else y + z, rel=1e-12, abs=1e-12)
 
 
+@pytest.mark.parametrize("lead", [(), (2,), (0,), (2, 3)])
+def test_a_step_without_contacts_is_free_and_its_gradient_goes_to_the_free_velocity(lead):
+    """And so of batches, of none too."""
+    shapes = (0, 3), (3, 3), (3,), (0,), (0,), (0,)
+    given = [np.zeros((*lead, *shape)) for shape in shapes]
+    given[1], given[2] = given[1] + np.eye(3), given[2] + [1.0, 2.0, 3.0]
+    made = step(given, None, "coulomb", "auto", 1e-12)
+    velocity, impulse = made.forward(*given)
+    assert np.array_equal(velocity, given[2]) and impulse.shape == (*lead, 0)
+    found = made.backward(*given, impulse, 7.0 * np.ones_like(velocity), impulse)
+    assert [x.shape for x in found] == [x.shape for x in given]
+    assert (found[2] == 7.0).all() and not found[1].any()
+
+
 def test_a_step_made_again_is_the_same_object_for_which_jax_keeps_what_it_compiled():
     given, contacts = GIVEN[0], lv.Cones.contacts
     made = step(given, None, "coulomb", "auto", 1e-10)
