@@ -144,11 +144,13 @@ def _what(records: Records, subject: Subject, n: int) -> str:
 
 def _head(records: Records, first: Choice, reached: str, what: str) -> str:
     missed = first.solved < first.cases
+    idle = first.cases - len({r.case for r in records if r.solver == first.solver})  # records of several runs
     said = f"Use {first.solver}: it solves {f'{first.solved} of ' if missed else ''}{what} in {seconds(first.score)}"
     if first.cases > 1:
         said += " on average"
     if missed:
-        said += f" (a miss counted as {seconds(tables.limit_of(records))})"
+        never = f"; on {idle} it has no run" if idle > 0 else ""
+        said += f" (a miss counted as {seconds(tables.limit_of(records))}{never})"
     elif math.isfinite(first.worst) and first.worst > 3.0 * first.score:
         said += f" ({seconds(first.worst)} at worst, {first.hardest})"
     return f"{said}, {reached}."

@@ -244,6 +244,9 @@ def test_one_sentence_and_a_line_to_copy_come_first(tmp_path):
     assert said.leaders == ("auto", "pgs")
     text = html.unescape(report.write(Report(found, None, [1e-3, 1.0]), tmp_path, figures=False).read_text())
     assert text.index(said.told[0].text) < text.index(said.told[0].line) < text.index("<table")
+    # Of two runs put together: x never ran on b, which is no miss of its own.
+    parts = verdict(records_of(record("a", "x", 0.004, 1e-9), record("b", "y", 9.0, 0.5)))
+    assert "(a miss counted as 2.00 s; on 1 it has no run)" in parts.told[0].text
     nobody = verdict(records_of(record("a", "x", 1.0, 0.5)))
     assert nobody.text == "No solver brings your stack down to 1e-6 of the error of doing nothing."
     assert "Python's share" in text  # a limitation, on every page
