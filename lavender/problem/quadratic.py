@@ -469,9 +469,9 @@ def _definite(
     )
     far = np.abs(root * made.v_free).max(initial=0.0) / (FAR * expected) if expected > 0.0 else 0.0
     if far > 1.0:
-        d = far * d
-        made = _shifted(lower, jac, d, momentum)
-        assert made is not None
+        further = _shifted(lower, jac, far * d, momentum)
+        if further is not None:  # D within the numbers that M may have
+            made, d = further, far * d
     return made, read_only(d), read_only(unit)
 
 

@@ -36,10 +36,8 @@ REFINED = 3  # solves with one factor of (1)
 EXACT = 1e-14  # of the right-hand side, that refinement leaves
 BALANCED = 5  # passes of Ruiz
 LARGE = 0.9  # share of targets that are at most the unit of x: a few may stand for no bound at all
-FULL, FULL_SIZE = (
-    0.2,
-    3000,
-)  # share of entries from which P or J is a full matrix, of at most so many variables
+FULL = 0.2  # share of entries from which P and J are full matrices,
+FULL_SIZE = 3000  # of at most so many variables
 CLOSER = 0.01  # of tol, as its norms are other ones than the judge's
 WATCHED = 4.0  # s of one factor, at most: Ctrl-C is heard between two
 SHORT, INSIDE = 0.99, 1.0 - 1e-10  # of the way to the boundary: at first, and at most
@@ -49,6 +47,8 @@ Solve = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 
 class InteriorPoint:
     """The balanced program, and the iterate."""
+
+    late = False  # it ended for want of time
 
     @np.errstate(all="ignore")  # what overflows in these units is left to velocities
     def __init__(self, qp: QuadraticProgram) -> None:
@@ -128,7 +128,8 @@ class InteriorPoint:
             found = proof(self._impulse(lam)) if self._may_prove(lam) else None
             if found is not None:
                 return self._answer(x, lam, tol), found
-            if idle > IDLE or deadline.passed(watch.seconds / max(1, self.factorisations)):
+            self.late = deadline.passed(watch.seconds / max(1, self.factorisations))
+            if idle > IDLE or self.late:
                 break
             x, lam, w = self._step(x, lam, w, dual, primal)
         return (None if best is None else self._answer(*best, tol)), None
@@ -185,20 +186,17 @@ class InteriorPoint:
 
         Where q is 0 all forces may vanish, and dual and gap with them: the judge knows beside what.
         """
+        free, along = self.qp.free, self.j @ x
+        short = _relative(np.minimum(w[free:], lam[free:]), along, self.target)
         if not self.q.any():
-            return self._answer(x, lam, 0.0).error
-        free = self.qp.free
-        force, along = dual + self.jt @ lam - self.q, self.j @ x  # P x, J x
-        gap = x @ force + self.q @ x - self.target @ lam
-        parts: tuple[tuple[Any, tuple[Any, ...]], ...] = (
-            (dual, (force, self.q, dual - force - self.q)),
-            (primal, (along, self.target)),
-            (np.minimum(w[free:], lam[free:]), (along, self.target)),
-            ([gap], ([x @ force], [self.q @ x], [self.target @ lam])),
-        )
+            return max(short, self._answer(x, lam, 0.0).error)
+        force = dual + self.jt @ lam - self.q  # P x
+        gap = np.array([x @ force, self.q @ x, -self.target @ lam])
         return max(
-            float(np.abs(left).max(initial=0.0) / (max(np.abs(of).max(initial=0.0) for of in sums) or 1.0))
-            for left, sums in parts
+            short,
+            _relative(dual, force, self.q, dual - force - self.q),
+            _relative(primal, along, self.target),
+            _relative(gap.sum(keepdims=True), gap),
         )
 
     def _may_prove(self, lam: FloatArray) -> bool:
@@ -288,6 +286,11 @@ def _largest(a: sp.csr_array, right: FloatArray) -> FloatArray:
 def _scaled(a: sp.csr_array, left: FloatArray, right: FloatArray) -> sp.csr_array:
     at = np.repeat(left, np.diff(a.indptr))
     return sp.csr_array((at * a.data * right[a.indices], a.indices, a.indptr), shape=a.shape)
+
+
+def _relative(left: FloatArray, *terms: FloatArray) -> float:
+    """What is left over the largest of the terms it is the sum of."""
+    return float(np.abs(left).max(initial=0.0) / (max(np.abs(x).max(initial=0.0) for x in terms) or 1.0))
 
 
 def _boundary(x: FloatArray, dx: FloatArray) -> float:

@@ -30,7 +30,7 @@ from lavender.problem.quadratic import QuadraticProgram
 from lavender.solvers.certify import without_dust
 from lavender.solvers.interior_point import NAME, InteriorPoint
 from lavender.solvers.registry import SMALL_ROWS, get
-from lavender.solvers.setup_times import LAID_OUT, SCIPY, loading
+from lavender.solvers.setup_times import LAID_OUT, loading
 from lavender.solvers.small import told
 from lavender.solving.solve import judged_later, seconds_of, solve, solve_small
 
@@ -192,12 +192,13 @@ def _by_interior_point(
     made = solve_small(problem, get(solver), impulse, tol, seconds_of(time_limit), SOONER)
     if made is not None:
         return made, None
-    answer, entries = None, qp.generalized.mass.nnz + qp.generalized.jac.nnz
-    if not deadline.passed(loading(*SCIPY, "qdldl") + SET_UP + LAID_OUT * entries):
+    answer, of = None, qp.generalized.operator
+    entries = 2 * len(of.mass[1]) + len(of.jac[1])
+    if not deadline.passed(loading("scipy.sparse") + SET_UP + LAID_OUT * entries):
         point = InteriorPoint(qp)
         answer, proof = point.run(tol, deadline, lambda lam: _proof(problem, lam, tol))
     if answer is None or not (
-        answer.found or proof is not None or deadline.passed() or qp.ray(answer.x, UNBOUNDED) is not None
+        answer.found or proof is not None or point.late or qp.ray(answer.x, UNBOUNDED) is not None
     ):
         return _over_velocities(problem, solver, tol, deadline.left(1e-6), impulse, options)
     lam = read_only(answer.impulse)
@@ -212,7 +213,7 @@ def _by_interior_point(
     elif judged.relative <= tol:
         status = Status.CONVERGED
     else:
-        left = Status.STALLED if answer.found or not deadline.passed() else Status.TIME_LIMIT
+        left = Status.STALLED if answer.found or not point.late else Status.TIME_LIMIT
         status = Status.FLOOR if judged.at_floor else left
     work = {"factorisations": point.factorisations}
     turn = Turn(NAME, work, problem.metric.start_relative, judged.relative)

@@ -696,4 +696,4 @@ def test_a_second_factor_is_not_begun_where_the_first_tells_that_it_ends_too_lat
     factor = point.system.factor
     monkeypatch.setattr(point.system, "factor", lambda theta: (time.sleep(0.05), factor(theta)))
     point.run(1e-9, Deadline(0.08), lambda impulse: None)
-    assert point.factorisations == 1
+    assert point.factorisations == 1 and point.late
