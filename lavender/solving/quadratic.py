@@ -101,8 +101,8 @@ def solve_qp(
         )
     tol, end = number("tol", tol, low=0.0), perf_counter() + seconds_of(time_limit)
     start = options.pop("impulse", None)
-    auto, given = solver == "auto" and tol > 0.0 and not options, problem
-    first = _by_interior_point if auto and problem.m > SMALL_ROWS else _over_velocities
+    large = solver == "auto" and tol > 0.0 and not options and problem.m > SMALL_ROWS
+    first = _by_interior_point if large else _over_velocities
     solution, x = first(problem, solver, tol, time_limit, start, options)
     answer = best = qp.solution(solution, tol, x)
     centre, tightest, before, idle, failed, point = None, tol, np.inf, 0, 0, None
@@ -151,13 +151,6 @@ def solve_qp(
         failed = failed + 1 if solution.status is Status.STALLED else 0
         if idle == IDLE or failed == FAILED:
             break
-    left = end - perf_counter()
-    if (
-        auto and first is _over_velocities and not best.found and left > 0.0
-    ):  # what few programs of few rows need
-        limit = None if time_limit is None else left
-        solution, x = _by_interior_point(given, solver, tol, limit, None, options)
-        best = min(best, given.qp.solution(solution, tol, x), key=lambda one: one.error)
     return best
 
 
