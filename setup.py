@@ -67,9 +67,7 @@ else:
     COMPILE_ARGS += [*OPTIONS["COMPILE_FLAGS"], "-Wno-unused-function"]
     if MODE == "asan":
         LINK_ARGS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=undefined"]
-        # A third of the time to compile, for what ends by a signal or as a wrong address.
-        unasked = "-fno-sanitize=null,object-size,pointer-overflow"
-        COMPILE_ARGS += [*LINK_ARGS, unasked, "-fno-omit-frame-pointer"]
+        COMPILE_ARGS += [*LINK_ARGS, "-fno-omit-frame-pointer"]
 
 
 class BuildKernels(build_ext):
