@@ -25,7 +25,7 @@ from lavender_ext.judge.measure import all_finite
 
 
 class Foreign(Solver):
-    """A solver of another package, of which `prepare`, `update` and `run` suffice."""
+    """A solver of another package, of which `prepare` and `run` suffice."""
 
     def __init__(self, name: str, solver: Any) -> None:
         self.name, self.solver = name, solver
@@ -33,12 +33,24 @@ class Foreign(Solver):
         if missing:
             raise InputError(
                 f"solver {name!r}: its factory made a {type(solver).__name__} without {' and '.join(missing)}; "
-                "prepare and run are needed, and update where a problem is replaced (lavender.registry.Solver)"
+                "prepare and run are needed (lavender.registry.Solver)"
             )
 
+    def _call(self, method: str, *arguments: Any) -> Any:
+        """What its method returns; an error where that would end the process, and every other run with it."""
+        try:
+            return getattr(self.solver, method)(*arguments)
+        except SystemExit as error:
+            raise RuntimeError(
+                f"solver {self.name!r} called sys.exit({error.code!r:.60}) in {method}; an exception, or a claim "
+                "that says what failed, is needed"
+            ) from error
+
+    def _has(self, method: str) -> bool:
+        return getattr(self.solver, method, None) is not None
+
     def _if_there(self, method: str, *arguments: Any) -> Any:
-        asked = getattr(self.solver, method, None)
-        return None if asked is None else asked(*arguments)
+        return self._call(method, *arguments) if self._has(method) else None
 
     def setup_time(self, problem: Problem) -> float:
         """What its `prepare` takes [s]; 0 where it does not say."""
@@ -55,11 +67,13 @@ class Foreign(Solver):
 
     def prepare(self, problem: Problem) -> Held:
         """Factor, colour, allocate, for a copy of the problem."""
-        return Held(problem, self.solver.prepare(_private(problem)))
+        return Held(problem, self._call("prepare", _private(problem)))
 
     def update(self, held: Held, problem: Problem) -> Held:
-        """The same structure with new numbers."""
-        return Held(problem, self.solver.update(held.state, _private(problem)))
+        """The same structure with new numbers: prepared anew where it has no `update`, which has the same result."""
+        if not self._has("update"):
+            return self.prepare(problem)
+        return Held(problem, self._call("update", held.state, _private(problem)))
 
     def run(
         self, held: Held, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
@@ -67,7 +81,7 @@ class Foreign(Solver):
         """`max_iter` more iterations on a copy of the impulse; what it has come to is copied back."""
         handed = impulse.copy()
         try:
-            claim = self.solver.run(held.state, handed, max_iter, tol, time_limit)
+            claim = self._call("run", held.state, handed, max_iter, tol, time_limit)
         except KeyboardInterrupt:
             _copy_back(handed, impulse)
             raise
@@ -87,6 +101,11 @@ class Foreign(Solver):
         work, certificate, dual = said.work, said.certificate, said.dual
         if not isinstance(said.status, Status):
             wrong = wrong or f"claims the status {claim.status!r:.60}; a lavender.Status is needed"
+        elif said.status is Status.REFUSED:
+            wrong = (
+                wrong
+                or "claims the status REFUSED, which only `solve_many` gives, to data that are no problem"
+            )
         elif not _counts(claim.iterations):
             wrong = wrong or f"claims {claim.iterations!r:.60} iterations; a whole number from 0 is needed"
         elif iterations > max_iter:
@@ -102,7 +121,7 @@ class Foreign(Solver):
             )
         if certificate is not None:
             try:
-                certificate = read_only(np.array(certificate, np.float64))
+                certificate = read_only(np.array(certificate).astype(np.float64, casting="same_kind"))
             except (TypeError, ValueError):
                 wrong = wrong or f"gives a certificate that is no array of {m} numbers ({certificate!r:.60})"
         if wrong:
@@ -110,10 +129,11 @@ class Foreign(Solver):
         return replace(
             claim,
             iterations=iterations,
-            work={k: int(n) for k, n in work.items()},
+            work={_one_line(k): int(n) for k, n in work.items()},
             dual=read_only(dual.copy()) if isinstance(dual, np.ndarray) else dual,
             certificate=certificate,
-            message=" ".join(claim.message.split()),
+            message=_one_line(claim.message),
+            form=_one_line(claim.form),
             turns=(),
         )
 
@@ -148,6 +168,10 @@ def _copy_back(handed: FloatArray, impulse: FloatArray) -> bool:
     if kept:
         impulse[:] = handed
     return kept
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
 
 
 def _counts(n: Any) -> bool:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import importlib.util
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Protocol
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, whole_number
 from lavender.base.deadline import Deadline
 from lavender.base.errors import InputError, SolverUnavailable, UnknownName, last_words
 from lavender.base.later import imported, loading
@@ -78,7 +78,7 @@ class State(Protocol):
 class Solver:
     """What a factory returns: `prepare` and `run`, and what it does otherwise than here.
 
-    A plug-in may return any object with `prepare`, `update` and `run` (`external/foreign.py`).
+    A plug-in may return any object with `prepare` and `run` (`external/foreign.py`).
     """
 
     def prepare(self, problem: Problem) -> Any:
@@ -132,7 +132,8 @@ class SolverSpec:
     Raises
     ------
     InputError
-        A law or operator that does not exist, an empty name or none.
+        A law or operator that does not exist, none at all, an empty name, options that are no table, requires that
+        is no tuple of names, or a max_iter that is no whole number.
     """
 
     name: str
@@ -175,20 +176,26 @@ class SolverSpec:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
-        if (
-            not set(self.laws) <= set(LAWS)
-            or not self.laws
-            or not set(self.operators) <= set(OPERATORS)
-            or not set(self.boxes) <= {"coulomb", "cone"}
-            or not self.operators
-        ):
+        for what, names in (("laws", LAWS), ("operators", OPERATORS), ("boxes", ("coulomb", "cone"))):
+            given = getattr(self, what)
+            is_some = isinstance(given, Collection) and not isinstance(given, (str, bytes))
+            if not is_some or not all(isinstance(name, str) and name in names for name in given):
+                raise InputError(
+                    f"{what} of solver {self.name!r} are {given!r:.80}; a set of {', '.join(names)} is needed"
+                )
+            if not given and what != "boxes":
+                raise InputError(f"solver {self.name!r} has no {what}; of {', '.join(names)} one is needed")
+            object.__setattr__(self, what, frozenset(given))
+        if not isinstance(self.requires, (tuple, list)) or not all(isinstance(n, str) for n in self.requires):
             raise InputError(
-                f"solver {self.name!r}: laws {sorted(self.laws)} must be of {LAWS}, operators "
-                f"{self.operators!r} a set of {OPERATORS}, boxes {sorted(self.boxes)} of coulomb and cone"
+                f"requires of solver {self.name!r} is {self.requires!r:.80}; a tuple of names of modules is needed"
             )
-        object.__setattr__(self, "laws", frozenset(self.laws))
-        object.__setattr__(self, "operators", frozenset(self.operators))
-        object.__setattr__(self, "boxes", frozenset(self.boxes))
+        if not isinstance(self.options, Mapping):
+            raise InputError(
+                f"options of solver {self.name!r} are {self.options!r:.80}; a table of names, with a line on each, "
+                "is needed"
+            )
+        object.__setattr__(self, "max_iter", whole_number(f"max_iter of solver {self.name!r}", self.max_iter))
         if not self.resumable:
             object.__setattr__(self, "callback", False)
             object.__setattr__(self, "history", False)

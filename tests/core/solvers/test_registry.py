@@ -2,13 +2,14 @@
 
 import dataclasses
 import importlib.metadata
+import sys
 import warnings
 
 import numpy as np
 import pytest
 
 import lavender as lv
-from lavender import registry
+from lavender import bench, registry
 
 SPEC = registry.get("pgs")
 TINY = lv.Problem.lcp(np.eye(2), np.ones(2))
@@ -30,12 +31,25 @@ def named(name, **more):
         {"laws": frozenset({"lcp", "lpc"})},
         {"operators": frozenset({"rows", "tensor"})},
         {"operators": frozenset()},
+        {"laws": "lcp"},
+        {"laws": None},
+        {"laws": [["lcp"], 3]},
+        {"boxes": "cone"},
+        {"requires": "numpy"},
+        {"options": ["omega"]},
+        {"max_iter": -1},
+        {"max_iter": "7"},
     ],
-    ids=["no name", "no text as a name", "no law", "unknown law", "unknown operator", "no operator"],
+    ids=lambda wrong: next(iter(wrong)),
 )
 def test_a_spec_that_makes_no_sense_is_refused(wrong):
-    with pytest.raises(lv.InputError, match=r"laws|operators|name"):
+    with pytest.raises(lv.InputError, match=rf"{next(iter(wrong))}.*needed"):
         dataclasses.replace(SPEC, **wrong)
+
+
+def test_laws_and_forms_are_taken_from_any_collection():
+    spec = dataclasses.replace(SPEC, laws=["lcp", "cone"], operators=("matrix",), boxes={"cone": 1})
+    assert (spec.laws, spec.operators, spec.boxes) == ({"lcp", "cone"}, {"matrix"}, {"cone"})
 
 
 def test_what_cannot_be_resumed_has_no_callback_and_no_history():
@@ -87,6 +101,9 @@ def test_a_refusal_that_raises_refuses_for_its_own_solver_alone(register):
 def test_what_a_plug_in_says_stands_on_one_line(plug_in):
     name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {}, "two\nlines"))
     assert lv.solve(TINY, name).message == "two lines"
+    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {"a\nb": 1}, "", "a\nb"), "lines")
+    solution = lv.solve(TINY, name)
+    assert (solution.work, solution.solver.form) == ({"a b": 1}, "a b")
 
     def fails(problem, impulse):
         raise ArithmeticError("two\nlines")
@@ -129,6 +146,50 @@ def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
     assert solution.status is lv.Status.NUMERICAL_ERROR
     assert "claims 7 iterations, where 5 were asked for at most" in solution.message
     assert lv.solve(TINY, name, max_iter=7).iterations == 7
+
+
+def test_refused_is_no_claim_of_a_solver(plug_in):
+    # It is said of the data of a world: callers that meet it do not look at the residual.
+    solution = lv.solve(TINY, plug_in(lambda problem, impulse: lv.Claim(lv.Status.REFUSED, 1)))
+    assert solution.status is lv.Status.NUMERICAL_ERROR
+    assert "claims the status REFUSED" in solution.message
+
+
+def test_a_certificate_of_complex_numbers_is_none(plug_in):
+    claim = lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.full(TINY.m, 1j))
+    solution = lv.solve(TINY, plug_in(lambda problem, impulse: claim))
+    assert solution.status is lv.Status.NUMERICAL_ERROR and "no array of 2 numbers" in solution.message
+
+
+@pytest.mark.parametrize("where", ["prepare", "update", "run"])
+def test_a_plug_in_that_would_end_the_process_costs_its_own_record(where, register):
+    def method(name, result):
+        def call(self, *arguments):
+            return sys.exit(3) if name == where else result
+
+        return call
+
+    results = {"prepare": 0, "update": 0, "run": lv.Claim(lv.Status.STALLED, 1)}
+    register(named("exits", factory=type("Exits", (), {n: method(n, r) for n, r in results.items()})))
+    with pytest.raises(RuntimeError, match=rf"'exits' called sys.exit\(3\) in {where}"):
+        lv.prepare(TINY, "exits").solve(lv.Problem.lcp(np.eye(2), [2.0, 1.0]))
+    records = bench.run([TINY], ["exits", "pgs"], bench.Plan(levels=(1e-3,), budgets=(), repeats=1))
+    assert {r.status for r in records if r.solver == "pgs"} == {"CONVERGED"}
+
+
+def test_a_plug_in_without_update_is_prepared_anew(register):
+    class Bare:
+        def prepare(self, problem):
+            return problem
+
+        def run(self, state, impulse, n, tol, time_limit):
+            impulse[:] = state.b  # of A = 1
+            return lv.Claim(lv.Status.CONVERGED, 1)
+
+    register(named("bare", factory=Bare))
+    solver = lv.prepare(TINY, "bare")
+    assert solver.solve().success
+    assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
 def test_a_refusal_names_the_way_round():
