@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_UNMET, one_thread
+from lavender.cli.options import EXIT_UNMET, one_thread, say
 from lavender.io.stored import writable, write_text
 
 
@@ -65,11 +65,11 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
             after = measure_warm(mj, path, warm)
         except (ValueError, LavenderError) as error:  # MuJoCo's own word about a file is a ValueError
             lost.append(f"{path.name}: left out: {str(error).splitlines()[0][:140]}")
-            click.echo(lost[-1], err=True)
+            say(lost[-1], err=True)
             continue
         found += new
         consecutive += after
-        click.echo(f"{path.name}: {len(new)} problems", err=True)
+        say(f"{path.name}: {len(new)} problems", err=True)
     if out is not None:
         lines = [json.dumps({"cpu": cpu_name(), **versions(("mujoco", "numpy"))})]
         lines += [json.dumps(asdict(s)) for s in found]
@@ -78,9 +78,9 @@ def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Pat
     if not found and not consecutive:
         raise InputError("no step of these models had a problem to solve: more steps, or other models")
     if found:
-        click.echo(table(found))
+        say(table(found))
     if consecutive:
-        click.echo(f"\n{warm_table(consecutive)}")
+        say(f"\n{warm_table(consecutive)}")
     if lost:
-        click.echo("\n".join(lost))
+        say("\n".join(lost))
         raise click.exceptions.Exit(EXIT_UNMET)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import refuse_unused
+from lavender.cli.options import refuse_unused, say
 from lavender.io.stored import writable
 
 VECTORS = 4  # problems in the test vectors, at most
@@ -40,4 +40,4 @@ def export(
     writable(folder, folder=True)  # before the vectors are solved for
     more = vectors.made(records, solver, VECTORS) if records is not None else {}
     written = library.write(kind, folder, more=more, replace=replace)
-    click.echo(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")
+    say(f"{len(written)} files in {folder}: {', '.join(p.name for p in written)}")

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused
+from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused, say
 from lavender.io.stored import make_folder, writable, write_text
 
 
@@ -105,7 +105,7 @@ def problems(
         for name in chosen:
             (case,) = suite.cases(name)
             case.problem.save(out / f"{file_name(name)}.npz")
-        click.echo(f"{len(chosen)} problems in {out}")
+        say(f"{len(chosen)} problems in {out}")
     elif secret is not None:
         click.echo("\n".join(chosen))
     elif page is None:

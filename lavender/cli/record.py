@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lavender.cli.options import precision_option, recording_options, refuse_unused_recording
+from lavender.cli.options import precision_option, recording_options, refuse_unused_recording, say
 
 
 @click.command()
@@ -28,4 +28,4 @@ def record(
     from lavender.io.recording import record_file
 
     refuse_unused_recording(context, True)
-    click.echo(str(record_file(model, out, steps, precision=precision or "float64", **asked)))
+    say(str(record_file(model, out, steps, precision=precision or "float64", **asked)))

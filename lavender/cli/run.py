@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import going_on, parameters_of, refuse_unused
+from lavender.cli.options import going_on, parameters_of, refuse_unused, say
 
 FILES = ("trace", "plot", "film", "record")  # options that leave them
 
@@ -107,9 +107,9 @@ def run(
         click.echo()
     for name, option in (("trace", "trace"), ("figure", "plot"), ("film", "film")):
         if asked[option] is not None:
-            click.echo(f"{name}: {asked[option]}")
+            say(f"{name}: {asked[option]}")
     if record is not None:
-        click.echo(f"{found.recorded} problems in {record}: lavender report {record}")
+        say(f"{found.recorded} problems in {record}: lavender report {record}")
     best = 1e3 * found.cost.min()
     click.echo(
         f"{found.scene}: {len(found)} steps, {found.time[-1]:.3f} s, {found.method}, {best:.3g} ms a step at best"

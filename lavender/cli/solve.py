@@ -93,7 +93,7 @@ def solve(
     say(f"{item.name}: {item.problem.law}, {item.problem.m} rows")
     say(str(solution))
     if output is not None:
-        click.echo(f"written: {output}")
+        say(f"written: {output}")
     if solution.status.name == "INTERRUPTED":
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if solution.status.name == "INFEASIBLE" and not solution.contradicted:

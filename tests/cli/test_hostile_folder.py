@@ -9,6 +9,7 @@ import subprocess
 import sys
 
 import pytest
+from mujoco_scene import scene
 from stacks import stack
 
 import lavender as lv
@@ -37,6 +38,24 @@ def lavender(lavender, tmp_path, monkeypatch):
 def test_what_cannot_be_shown_is_written_as_its_code():
     assert printable("a\udce9\ud800\n\x1b\u202eé²") == "a\\xe9\\ud800\\n\\x1b\\u202eé²"
     assert printable("a\nb\r", lines=True) == "a\nb\\r"
+
+
+@POSIX
+def test_what_commands_print_of_paths_is_text(lavender, tmp_path):
+    pytest.importorskip("mujoco")
+    path = tmp_path / "evil\x1b]0;title\x07.xml"
+    path.write_text(scene())
+    to = "to\x1b[31m"
+    for line in (
+        ["bench", "mujoco", path, "--steps", "1"],
+        ["record", path, "--steps", "15", "--every", "15", "--out", to],
+        ["problems", "--secret", "word", "--count", "1", "--out", f"{to}1"],
+        ["run", "stack", "--set", "n=1", "--steps", "2", "--trace", f"{to}.csv", "--record", f"{to}2"],
+        ["solve", "stack(n=2)", "--output", f"{to}.npz"],
+    ):
+        code, out, err = lavender(*line)
+        assert code == 0, err
+        assert "\\x1b" in out + err and "\x1b" not in out + err
 
 
 def test_long_names_that_differ_at_the_end_keep_files_of_their_own():

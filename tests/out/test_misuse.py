@@ -275,14 +275,16 @@ def test_to_count_memory_no_array_is_read_but_where_joints_end(library, form, me
 SCRIPT = """
 import { readFileSync } from 'node:fs';
 const [folder, given] = [process.argv[1], JSON.parse(process.argv[2])], lav = await import(`${folder}/index.mjs`);
-const solver = (await lav.load(readFileSync(`${folder}/liblavender.wasm`))).solver(lav.LAV_PGS);
+const library = await lav.load(readFileSync(`${folder}/liblavender.wasm`)), solver = library.solver(lav.LAV_PGS);
 const value = [2, 0, 0, 0, 2, 0, 0, 0, 2];
 const whole = { form: 1, n_blocks: 3, n_rows: 3, n_entries: 9, value, b: [1, 2, 3], lower: [0, 0, 0] };
+const fails = (call) => { try { return call(library.solver(lav.LAV_PGS)); } catch (error) { return error.message; } };
+const early = [(s) => s.run(), (s) => s.impulse(), (s) => s.velocity(), (s) => s.set()].map(fails);
 const said = given.map(([problem, budget]) => {
   try { solver.set({ ...whole, ...problem }); solver.run(budget); return [...solver.impulse()]; }
   catch (error) { return error.message; }
 });
-console.log(JSON.stringify(said));
+console.log(JSON.stringify([early, ...said]));
 """
 
 
@@ -294,6 +296,8 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript
         ({"kind": [0.7, 0, 0]}, {}, "no whole number"),
         ({"b": {}}, {}, "an array of numbers is needed"),
         ({"lower": True}, {}, "an array of numbers is needed"),
+        ({"b": [1, None, 3]}, {}, "b holds what is no number"),  # NaN on its way through JSON
+        ({"b": [1, "2", 3]}, {}, "b holds what is no number"),
         ({"n_rows": 2.5}, {}, "n_rows is 2.5"),
         ({"rows": 3}, {}, "there is no rows"),
         ({}, {"max_iter": 5}, "there is no max_iter"),
@@ -305,7 +309,8 @@ def test_javascript_reads_nothing_behind_an_array_and_ignores_nothing(javascript
     words = ["node", "--input-type=module", "-e", SCRIPT, str(javascript), json.dumps(asked)]
     done = subprocess.run(words, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    first, *said, last = json.loads(done.stdout)
+    early, first, *said, last = json.loads(done.stdout)
+    assert all("no problem is set" in text for text in early[:3]) and "no table of fields" in early[3]
     assert (first, last) == ([0.5, 1.0, 1.5], [1.5, 1.0, 0.5])  # whole ones, before and after
     for (_, _, sign), text in zip(mistakes, said, strict=True):
         assert isinstance(text, str) and sign in text

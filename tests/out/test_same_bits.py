@@ -328,10 +328,7 @@ def test_motion_errors_are_those_of_the_package(library):
             continue
         reference = solver.impulse()
         x = reference * (1.0 + 0.01 * np.cos(np.arange(given.m)))
-        out = Motion()
-        out.size = ct.sizeof(Motion)
-        at = [np.ascontiguousarray(a).ctypes.data_as(ct.c_void_p) for a in (x, reference)]
-        assert library.c.lav_motion_error(solver.at, *at, given.m, ct.byref(out)) == 0
+        out = motion(library, solver, x, reference)
         wanted = lv.motion_error(given, x, reference)
         if wanted.energy is None:
             continue
@@ -353,6 +350,46 @@ def test_motion_errors_are_those_of_the_package(library):
             )  # without friction Coulomb's law is convex, which the package does not use
             assert out.bound == np.inf or given.law != "coulomb" or not rough
     assert looked >= 5
+
+
+def motion(library, solver, impulse, reference):
+    out = Motion()
+    out.size = ct.sizeof(Motion)
+    at = [ct.c_void_p(x.ctypes.data) for x in (impulse, reference)]
+    assert library.c.lav_motion_error(solver.at, *at, len(impulse), ct.byref(out)) == 0
+    return out
+
+
+def test_a_motion_beside_which_compliance_stores_much_more_is_measured(library):
+    # 1/2 x.A x = 1e-18 / 2 + 1 / 2: as a difference the motion's share of it would be 0.
+    rows = lv.Rows(
+        [1e-18],
+        np.zeros((1, 3, 3)),
+        [-np.eye(6)[0]],
+        jac=[np.eye(12)[6]],
+        joint_body=[[-1, 0]],
+        joint_ptr=[0, 1],
+    )
+    given = lv.Problem.from_rows(rows, compliance=[1.0])
+    solver = library.open(library.problem(given), library.options("sequential_impulses"))
+    impulse, reference = np.array([2.0]), np.array([1.0])
+    found, wanted = (
+        motion(library, solver, impulse, reference),
+        lv.motion_error(given, impulse, reference),
+    )
+    assert found.kinetic == pytest.approx(wanted.kinetic, rel=1e-12) and wanted.kinetic > 0.0
+    assert found.relative == pytest.approx(1.0, rel=1e-12)
+    found = motion(library, solver, np.array([1e200]), np.array([1.0]))  # whose energy float64 does not hold
+    assert found.energy == found.relative == np.inf
+    found = motion(library, solver, np.array([1.0]), np.array([0.0]))
+    assert found.kinetic > 0.0 and found.relative == np.inf  # the reference moves nothing
+
+
+def test_the_motion_of_no_rows_is_none(library):
+    given = lv.Problem.from_rows(lv.Rows(np.ones(1), np.eye(3)[None], np.zeros((1, 6))))
+    solver = library.open(library.problem(given), library.options("newton"))
+    found = motion(library, solver, np.zeros(0), np.zeros(0))
+    assert (found.kinetic, found.energy, found.relative, found.row, found.body) == (0.0, 0.0, 0.0, -1, -1)
 
 
 def test_frames_of_float32_are_made_whole_as_the_package_does(library):
@@ -398,3 +435,4 @@ def test_a_dumped_problem_is_the_problem_to_the_last_bit(library, folder, compil
     assert looked == {"matrix", "rows", "generalized"}
     missing = str(tmp_path / "no" / "such").encode()
     assert c.dump(solver.at, ct.byref(problem), missing) == -20
+    assert c.dump(solver.at, None, missing) == c.dump(solver.at, ct.byref(problem), None) == -1

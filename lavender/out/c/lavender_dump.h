@@ -116,6 +116,7 @@ static inline void lav_dump_rows(lav_dump_file *d, const char *const *name, cons
 
 /* The problem that was set in a solver, with the right-hand side that it has there. */
 static inline int32_t lav_dump(lav_solver *solver, const lav_problem *q, const char *path) {
+  if (!solver || !q || !path) return LAV_ERROR_NULL;
   static const char *const jac[] = {"general_jac_data", "general_jac_indices", "general_jac_indptr"};
   static const char *const mass[] = {"general_mass_data", "general_mass_indices", "general_mass_indptr"};
   static const char *const matrix[] = {"A_data", "A_indices", "A_indptr"};

@@ -67,9 +67,12 @@ static void change_of(lav_solver *s, const double *x, double *v) {
   core_velocity_rows_velocity(&s->p, &s->r, x, v);
 }
 
-/* A x into out (m), what compliance adds into soft: 1/2 x.A x is an energy [J]; v: scratch of change_of. */
-static double energy_of(lav_solver *s, const double *x, double *v, double *out, double *elastic) {
-  double whole = 0.0, soft = 0.0, theta;
+/* Of a sum that rounding may leave below 0, or overflow leave without a value. */
+static double energy_from(double sum) { return sum < 0.0 ? 0.0 : sum < INFINITY ? sum : INFINITY; }
+
+/* A x into out (m); 1/2 x.A x is an energy [J], without what compliance stores the `kinetic` one of v = change_of(x). */
+static double energy_of(lav_solver *s, const double *x, double *v, double *out, double *kinetic) {
+  double whole = 0.0, moving = 0.0;
   int32_t i;
   change_of(s, x, v);
   if (s->form == LAV_BODIES) core_rows_rows_times(&s->p, &s->r, v, out);
@@ -78,20 +81,19 @@ static double energy_of(lav_solver *s, const double *x, double *v, double *out, 
 #ifndef LAV_SWEEPS_ONLY
     if (s->form == LAV_VELOCITIES) out[i] = core_generalized_jac_row(&s->g, i, v);
 #endif
-    theta = s->form == LAV_MATRIX ? 0.0 : s->r.compliance[i] * x[i];
-    out[i] += theta;
+    moving += 0.5 * x[i] * out[i];
+    out[i] += s->form == LAV_MATRIX ? 0.0 : s->r.compliance[i] * x[i];
     whole += 0.5 * x[i] * out[i];
-    soft += 0.5 * x[i] * theta;
   }
-  *elastic = soft;
-  return whole > 0.0 ? whole : 0.0;
+  *kinetic = energy_from(moving);
+  return energy_from(whole);
 }
 
 int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double *reference, int32_t n, lav_motion *out) {
   lav_solver *s = solver;
   lav_motion found;
   lav_verdict verdict;
-  double *delta, *slope, *v, soft, own, wrong, x, y;
+  double *delta, *slope, *v, own = 0.0, wrong = 0.0, x = 0.0, y = 0.0;
   int32_t i, k;
   GIVE_BACK(enter(s));
   if (!s->ready) return leave(s, LAV_ERROR_NO_PROBLEM);
@@ -104,15 +106,15 @@ int32_t lav_motion_error(lav_solver *solver, const double *impulse, const double
   found.row = found.body = -1;
   delta = s->compare, slope = delta + n, v = slope + n;
   judge(s, reference, 0, &verdict);
-  wrong = n > 0 ? energy_of(s, s->watch.e, v, slope, &soft) : 0.0;
-  own = n > 0 ? energy_of(s, reference, v, slope, &soft) : 0.0;
-  own -= s->form == LAV_MATRIX ? 0.0 : soft;
   for (i = 0; i < n; i++) delta[i] = impulse[i] - reference[i];
-  x = n > 0 ? energy_of(s, delta, v, slope, &soft) : 0.0;
-  y = s->form == LAV_MATRIX ? x : x > soft ? x - soft : 0.0;
+  if (n > 0) {
+    wrong = energy_of(s, s->watch.e, v, slope, &y);
+    energy_of(s, reference, v, slope, &own);
+    x = energy_of(s, delta, v, slope, &y);
+  }
   found.energy = sqrt(x);
   found.kinetic = sqrt(y);
-  found.relative = y == 0.0 ? 0.0 : sqrt(y / own);
+  found.relative = y == 0.0 ? 0.0 : own > 0.0 && y < INFINITY ? sqrt(y / own) : INFINITY;
   found.bound = s->p.law == LAV_COULOMB && core_parts_has_friction(&s->p) ? INFINITY : found.energy + sqrt(wrong);
   for (i = 0; i < n; i++)
     if (fabs(slope[i]) > found.rows || found.row < 0) found.rows = fabs(slope[i]), found.row = i;

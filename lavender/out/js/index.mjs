@@ -1,5 +1,5 @@
 // liblavender in WebAssembly: the functions and names of lavender.h, a solver over typed arrays.
-import { LAV_BODIES, LAV_ERROR_COUNT, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
+import { LAV_BODIES, LAV_ERROR_COUNT, LAV_ERROR_NO_PROBLEM, LAV_ERROR_ROOM, STRUCTS } from './header.mjs';
 export * from './header.mjs';
 
 const ARRAYS = { 'int32_t*': Int32Array, 'double*': Float64Array, 'uint64_t*': BigUint64Array };
@@ -105,6 +105,10 @@ class Struct {
   }
 }
 
+function needsFields(given) {
+  if (Object(given) !== given) throw new TypeError(`${given} is no table of fields by name: { iterations: 100 }, for one, is needed`);
+}
+
 /** One solver; its memory at least doubles where a problem asks for more, and impulses move with it. */
 export class Solver {
   constructor(library, method, options) {
@@ -118,6 +122,7 @@ export class Solver {
   /** A problem: counts by name, arrays of numbers by name, as in lavender.h. */
   set(given) {
     const q = this.problem;
+    needsFields(given);
     this.library.check(this.c.lav_default_problem(given.form ?? LAV_BODIES, q.at));
     this.fill(q, given);
     if (!this.at) this.open();
@@ -133,7 +138,7 @@ export class Solver {
   }
   /** Counts and numbers first, then arrays, whose lengths follow from them. */
   fill(struct, given) {
-    if (Object(given) !== given) throw new TypeError(`${given} is no table of fields by name: { iterations: 100 }, for one, is needed`);
+    needsFields(given);
     const some = Object.entries(given).filter(([, value]) => value != null);
     const kind = ([key]) => struct.fields[key]?.[0] ?? '', isArray = (field) => kind(field) in ARRAYS;
     for (const field of some) if (/\(\*\)|void/.test(kind(field))) throw new TypeError(`${field[0]} is of C alone: leave it out`);
@@ -148,6 +153,9 @@ export class Solver {
   copy(key, values, kind) {
     if (kind === 'int32_t*' && !(values instanceof Int32Array) && Array.prototype.some.call(values, (x) => (x | 0) !== x)) {
       throw new TypeError(`${key} holds what is no whole number of 32 bits`);
+    }
+    if (kind === 'double*' && !ArrayBuffer.isView(values) && Array.prototype.some.call(values, (x) => typeof x !== 'number')) {
+      throw new TypeError(`${key} holds what is no number, which would count as 0, for one null: JSON has it for NaN and infinity`);
     }
     const bytes = values.length * ARRAYS[kind].BYTES_PER_ELEMENT;
     let held = this.arrays.get(key);
@@ -169,13 +177,18 @@ export class Solver {
     this.at = this.library.view('int32_t*', this.pointer, 1)[0];
   }
   run(budget = {}) {
+    this.needsProblem();
     this.library.check(this.c.lav_default_budget(this.budget.at)); // 1000 iterations, tol 1e-6
     this.fill(this.budget, budget);
     this.result.set('size', STRUCTS.lav_result.size);
     this.library.check(this.c.lav_run(this.at, this.budget.at, this.result.at));
     return this.result.plain();
   }
+  needsProblem() {
+    if (!this.at) this.library.check(LAV_ERROR_NO_PROBLEM);
+  }
   numbers(call, n) {
+    this.needsProblem();
     const at = this.library.take(8 * n + 8);
     const code = call(this.at, at, n), out = this.library.view('double*', at, n).slice();
     this.library.top = at;
