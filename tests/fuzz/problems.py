@@ -1,5 +1,7 @@
 """Problems and how they are to be solved, as plain data (what JSON can hold): strategies and builders."""
 
+from functools import cache
+
 import hypothesis.strategies as st
 import numpy as np
 import scipy.sparse as sp
@@ -24,6 +26,7 @@ def problem_specs(largest=12):
     return st.integers(0, 99).flatmap(lambda x: crowds() if x >= 92 else parts(largest))
 
 
+@cache
 @st.composite
 def crowds(draw):
     """Up to 40 side by side, most of them alike or of one operator and law, more than `auto` takes whole."""
@@ -38,11 +41,13 @@ def kind_of(spec):
     return spec["operator"], spec["friction"], lv.ROUND in spec["cones"]["kind"]
 
 
+@cache
 def parts(largest=12):
     """Problems whose rows mostly hang together."""
     return st.one_of(*[bodies()] * 7, *[generalized(largest)] * 3, *[matrices(largest)] * 10).map(plain)
 
 
+@cache
 @st.composite
 def matrices(draw, largest):
     """A of its entries."""
@@ -62,6 +67,7 @@ def finite(x):
     return np.clip(np.nan_to_num(x, nan=0.0), -LARGEST, LARGEST)
 
 
+@cache
 @st.composite
 def cones(draw, rows):
     """Blocks of about `rows` rows."""
@@ -112,11 +118,13 @@ def rolling(draw, kind):
     return {"rolling": draw(choices((0.0, 0.01, 0.5, 1e-12, 1e8), len(kind)))}
 
 
+@cache
 def choices(options, n):
     """n of the options (n,)."""
     return st.lists(st.sampled_from(options), min_size=n, max_size=n).map(np.array)
 
 
+@cache
 @st.composite
 def matrix(draw, m):
     """(m, m)."""
@@ -161,6 +169,7 @@ def matrix(draw, m):
 # -- bodies, joints and contacts -----------------------------------------------------------------------------------
 
 
+@cache
 @st.composite
 def bodies(draw):
     """A factored problem."""
@@ -211,11 +220,13 @@ def bodies(draw):
     return spec | draw(optional(compliance=numbers(m).map(np.abs), guess=numbers(m)))
 
 
+@cache
 def pairs(n):
     """Two of n bodies, the first perhaps the world (-1)."""
     return st.tuples(st.integers(-1, n - 1), st.integers(0, n - 1)).filter(lambda pair: pair[0] != pair[1])
 
 
+@cache
 @st.composite
 def inertia(draw, style):
     """An inverse inertia (3, 3), diagonal or turned."""
@@ -226,6 +237,7 @@ def inertia(draw, style):
     return 0.5 * out + 0.5 * out.T
 
 
+@cache
 @st.composite
 def directions(draw, n):
     """Normals and tangents (n, 3)."""
@@ -246,6 +258,7 @@ WHOLE = ("joint_ptr", "joint_body", "contact_body")
 # -- generalised coordinates ---------------------------------------------------------------------------------------
 
 
+@cache
 @st.composite
 def generalized(draw, largest):
     """J, M of a forest, v*, target: rows on chains of its trees, masses and rows of any size."""
@@ -283,6 +296,7 @@ def generalized(draw, largest):
     return spec | draw(optional(compliance=soft, guess=numbers(m, sizes)))
 
 
+@cache
 @st.composite
 def round_cones(draw):
     """One or two cones with three to five rows behind the normal."""

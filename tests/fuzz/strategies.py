@@ -1,6 +1,7 @@
-"""Strategies that the inputs of this folder are made of."""
+"""Strategies that the inputs of this folder are made of, each made once: Hypothesis looks through every new one."""
 
 import json
+from functools import cache
 
 import hypothesis.strategies as st
 import numpy as np
@@ -15,16 +16,19 @@ STYLES = ("tame", "tame", "tame", "scales", "whole", "wild", "special")
 MODERATE = st.floats(-4.0, 4.0, allow_subnormal=False)
 
 
+@cache
 def chance(p):
     """True with probability p about; towards False when made smaller."""
     return st.integers(0, 99).map(lambda x: x >= 100 - round(100 * p))
 
 
+@cache
 def generators():
     """Generators of NumPy: many numbers for the price of one choice, which cannot be made smaller one by one."""
     return st.integers(0, 2**32 - 1).map(np.random.default_rng)
 
 
+@cache
 @st.composite
 def numbers(draw, n, style=None):
     """n numbers (n,): of moderate size, over many scales, whole, of any size inside the door, or its ends and dust."""
@@ -43,11 +47,13 @@ def numbers(draw, n, style=None):
     return np.clip(x, -LARGEST, LARGEST)
 
 
+@cache
 def positive(n, style=None):
     """n numbers > 0 (n,)."""
     return numbers(n, style).map(lambda x: np.where(x != 0.0, np.abs(x), 1.0))
 
 
+@cache
 def some(n, p):
     """Which of n (n,), each with probability p about."""
     return generators().map(lambda rng: rng.random(n) < p)

@@ -5,8 +5,9 @@
 
 Cython writes a module's core (`cdef ... noexcept nogil`) and its Python part into one file, and what several modules
 cimport into each of them. Every file is read token by token into its declarations (structs, enums, typedefs, functions,
-groups under `#if`); a name leads to the declaration that makes it, and what that uses leads on. A function that another
-module imports by pointer is the function itself here. What is reached must not name Python: who uses it is told.
+groups under `#if`); a name leads to the declaration that makes it, and what that uses leads on. Bodies of functions,
+nine tenths of all tokens, are read of those that are reached. A function that another module imports by pointer is the
+function itself here. What is reached must not name Python: who uses it is told.
 
 Names lose what Cython puts before them (`__pyx_f_12lavender_ext_4core_5block_clip` is `core_block_clip`), core
 functions `lav_x` become `k_x`, and everything of the kernels is `static`: a build that leaves some of `front` out
@@ -26,6 +27,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -82,11 +84,17 @@ KEYWORDS = frozenset(
 
 TOKEN = re.compile(
     r"""(?P<directive>(?<![^\n])[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*)
-      |(?P<skip>\n|[^\S\n]+|/\*.*?\*/|//[^\n]*)
-      |(?P<name>[A-Za-z_]\w*)
+      |(?P<skip>\n|/\*.*?\*/|//[^\n]*|[^\S\n]+(?=\n|/[/*]|\Z))
+      |(?P<space>[^\S\n]*)(?:
+       (?P<name>[A-Za-z_]\w*)
       |(?P<literal>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|\.?\d(?:[eEpP][+-]|[\w.])*)
-      |(?P<mark>[^\s\w])""",
+      |(?P<mark>[^\s\w]))""",
     re.VERBOSE | re.DOTALL,
+)
+#: All that may hold a brace which opens or closes no block, and those that do.
+BRACE = re.compile(
+    r"""\n[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*|/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*'|[{}]""",
+    re.DOTALL,
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
 MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
@@ -94,17 +102,6 @@ MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
 
 class CutFailed(Exception):
     """The C of the kernels could not be made, or needs Python; the message says where."""
-
-
-@dataclass
-class Item:
-    """One declaration: the names it makes, those it uses, its text."""
-
-    kind: str  # include, macro, type, prototype, variable, function, group
-    text: str
-    makes: set[str] = field(default_factory=set)
-    uses: set[str] = field(default_factory=set)
-    origin: str = ""
 
 
 class Token(NamedTuple):
@@ -115,21 +112,91 @@ class Token(NamedTuple):
     before: str  # white space
 
 
-def tokens(text: str) -> Iterator[Token]:
-    """Words, literals, marks and lines of the preprocessor; comments are white space."""
-    before = ""
-    for match in TOKEN.finditer(text):
-        kind, said = match.lastgroup or "", match.group()
-        if kind == "skip":
-            before += said if said.isspace() else " "
-            continue
-        yield Token(kind, said.lstrip() if kind == "directive" else said, before)
-        before = ""
+@dataclass
+class Item:
+    """One declaration: the names it makes, those it uses, its text."""
+
+    kind: str  # include, macro, type, prototype, variable, function, group
+    part: list[Token]
+    makes: set[str] = field(default_factory=set)
+    origin: str = ""
+    kept: frozenset[str] = frozenset()  # core functions that keep their names
+
+    @cached_property
+    def whole(self) -> list[Token]:
+        """All tokens, those of bodies one by one."""
+        out: list[Token] = []
+        for token in self.part:
+            if token.kind != "body":
+                out.append(token)
+                continue
+            inside = tokens(token.text[1:])
+            out += [Token("mark", "{", token.before), *inside]
+        return out
+
+    @cached_property
+    def text(self) -> str:
+        """As it is written out."""
+        # Words are told from what they stand in: no string of a kernel is one.
+        return WORD.sub(lambda match: _plain(match.group(), self.kept), _text(self.whole))
+
+    @cached_property
+    def uses(self) -> set[str]:
+        """Words that may be names of other declarations."""
+        used: set[str] = set()
+        last = ""
+        for token in self.whole:
+            words = [token.text] if token.kind == "name" and last not in (".", "->") else []
+            if token.kind == "directive":
+                words = WORD.findall(token.text)
+            last = "->" if last == "-" and token.text == ">" else token.text
+            used.update(words)
+        return {_plain(name, self.kept) for name in used}
+
+    def rename(self, kept: frozenset[str]) -> None:
+        """Give names as they are written out."""
+        self.kept = kept
+        self.makes = {_plain(name, kept) for name in self.makes}
+
+
+def tokens(text: str, bodies: bool = False) -> Iterator[Token]:
+    """Words, literals, marks and lines of the preprocessor; comments are white space.
+
+    bodies : what stands in braces behind a parenthesis is one token, with its braces.
+    """
+    before, last, at = "", "", 0
+    while at >= 0:
+        start, at = at, -1
+        for match in TOKEN.finditer(text, start):
+            kind = match.lastgroup or ""
+            said = match[kind]
+            if kind == "skip":
+                before += said if said.isspace() else " "
+                continue
+            before += match["space"] or ""
+            if bodies and said == "{" and last == ")":
+                kind, at = "body", _end_of_block(text, match.end())
+                said = text[match.start("mark") : at]
+            last = said
+            yield Token(kind, said.lstrip() if kind == "directive" else said, before)
+            before = ""
+            if kind == "body":
+                break
+
+
+def _end_of_block(text: str, at: int) -> int:
+    """Behind the brace that closes the block whose first character stands at `at`."""
+    depth = 1
+    for match in BRACE.finditer(text, at):
+        depth += (match[0] == "{") - (match[0] == "}")
+        if depth == 0:
+            return match.end()
+    return len(text)
 
 
 def read(text: str, origin: str = "") -> list[Item]:
     """The declarations of a C file one by one, those between `#if` and `#endif` together."""
-    stream = list(tokens(text))
+    stream = list(tokens(text, bodies=True))
     closing, opened = {}, []
     for at, token in enumerate(stream):
         word = _word(token)
@@ -160,7 +227,7 @@ def _declarations(
                 at = last + 1
                 continue
             if _word(token) == "include":
-                yield Item("include", token.text.strip(), origin=origin)
+                yield Item("include", [token], origin=origin)
             elif _word(token) == "define":
                 yield _macro(token, origin)
             at += 1
@@ -184,20 +251,17 @@ def _level(closing: dict[int, int], outer: int, at: int) -> bool:
 
 
 def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
-    depth, is_function, i = 0, False, at
-    while i < end:
+    depth = 0
+    for i in range(at, end):
+        if stream[i].kind == "body" and depth == 0:
+            return i + 1
         text = stream[i].text if stream[i].kind == "mark" else ""
         if text in ("(", "[", "{"):
-            if text == "{" and depth == 0:
-                is_function = i > at and stream[i - 1].text == ")"
             depth += 1
         elif text in (")", "]", "}"):
             depth -= 1
-            if text == "}" and depth == 0 and is_function:
-                return i + 1
         elif text == ";" and depth == 0:
             return i + 1
-        i += 1
     return end
 
 
@@ -213,40 +277,25 @@ def _text(part: list[Token]) -> str:
     return re.sub(r"[ \t]+\n", "\n", "".join(out))
 
 
-def _uses(item: Item, part: list[Token]) -> None:
-    last = ""
-    for token in part:
-        words = [token.text] if token.kind == "name" and last not in (".", "->") else []
-        if token.kind == "directive":
-            words = WORD.findall(token.text)
-        last = "->" if last == "-" and token.text == ">" else token.text
-        item.uses.update(words)
-
-
 def _macro(token: Token, origin: str) -> Item:
-    words = WORD.findall(token.text)
-    made = Item("macro", token.text.strip(), {words[1]}, origin=origin)
-    _uses(made, [token])
-    return made
+    return Item("macro", [token], {WORD.findall(token.text)[1]}, origin)
 
 
 def _group(part: list[Token], origin: str) -> Item:
-    made = Item("group", _text(part), origin=origin)
+    made = Item("group", part, origin=origin)
     inside: list[Token] = [token for token in part if token.kind != "directive"]
     for item in _declarations(inside, {}, 0, len(inside), origin):
         made.makes |= item.makes
     for token in part:
         if _word(token) == "define":
             made.makes.add(WORD.findall(token.text)[1])
-    _uses(made, part)
     return made
 
 
 def _item(part: list[Token], origin: str) -> Item:
     """One declaration from its tokens: what it is, and what it is called."""
-    words = [token.text for token in part]
-    made = Item("variable", _text(part), origin=origin)
-    _uses(made, part)
+    words = ["{" if token.kind == "body" else token.text for token in part]
+    made = Item("variable", part, origin=origin)
     names = [i for i, token in enumerate(part) if token.kind == "name" and token.text not in KEYWORDS]
     brace = words.index("{") if "{" in words else -1
     if words[0] == "typedef":
@@ -294,7 +343,7 @@ class _Table:
 
     def __init__(self) -> None:
         self.by_name: dict[str, Item] = {}
-        self.twice: dict[str, str] = {}
+        self.others: dict[str, list[Item]] = {}
 
     def add(self, items: Iterable[Item]) -> None:
         for item in items:
@@ -302,8 +351,8 @@ class _Table:
                 held = self.by_name.get(name)
                 if held is None or self.RANK[item.kind] > self.RANK[held.kind]:
                     self.by_name[name] = item
-                elif held.kind == item.kind == "function" and held.text != item.text:
-                    self.twice[name] = f"{held.origin} and {item.origin}"
+                elif held.kind == item.kind == "function":
+                    self.others.setdefault(name, []).append(item)
 
     def reach(self, roots: Iterable[str]) -> list[Item]:
         """What the names lead to, in an order in which everything stands before its use."""
@@ -318,16 +367,17 @@ class _Table:
             return
         if name in path:
             raise CutFailed(f"{' > '.join(path)} > {name} comes round")
-        if name in self.twice:
-            raise CutFailed(f"{name} is not the same in {self.twice[name]}")
+        for other in self.others.get(name, ()):
+            if other.part != item.part and other.text != item.text:
+                raise CutFailed(f"{name} is not the same in {item.origin} and {other.origin}")
         if item.kind in ("variable", "prototype"):
             if item.kind == "prototype" and item.text.startswith(("struct", "union")):
                 return
             raise CutFailed(
                 f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
             )
-        for other in sorted(item.uses - item.makes - KEYWORDS):
-            self._visit(other, done, (*path, name))
+        for used in sorted(item.uses - item.makes - KEYWORDS):
+            self._visit(used, done, (*path, name))
         done[id(item)] = item
 
 
@@ -352,7 +402,7 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
     for name, text in translations:
         items = read(text, name)
         for item in items:
-            _rename(item, kept)
+            item.rename(kept)
         table.add(item for item in items if item.kind != "include")
     own = read(front, "front")
     made = set().union(*(item.makes for item in own), KEYWORDS)
@@ -370,13 +420,6 @@ def _private(item: Item, kept: frozenset[str]) -> str:
         inline = "inline " if "CYTHON_INLINE" in item.uses else ""
         text = text if item.makes & kept else f"static {inline}{text}"
     return text
-
-
-def _rename(item: Item, kept: frozenset[str]) -> None:
-    # Words are told from what they stand in: no string of a kernel is one.
-    item.text = WORD.sub(lambda match: _plain(match.group(), kept), item.text)
-    item.makes = {_plain(name, kept) for name in item.makes}
-    item.uses = {_plain(name, kept) for name in item.uses}
 
 
 def _plain(name: str, kept: frozenset[str]) -> str:
