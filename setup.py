@@ -5,6 +5,7 @@ Environment:
     LAVENDER_DEBUG=1        every index of every memoryview is checked, -Og -g1
     LAVENDER_DEBUG=asan     the same, with the address and undefined-behaviour sanitizers, which also see raw
                             pointers (gcc; run Python with LD_PRELOAD="$(gcc -print-file-name=libasan.so)")
+    CYTHON_CACHE_DIR=D      translations are kept in D by what they are made of, as ccache does for C
     LAVENDER_FILES_URL=U    where the files of this version can be fetched: links and pictures of the long description
                             begin with it, since an index shows the text alone, and so do the project's URLs
 """
@@ -92,6 +93,9 @@ class BuildKernels(build_ext):
         # A build that is killed leaves torn files, newer than their sources; and who reads translations while they are
         # written makes his own (lavender/sim/web/cut.py).
         stamp.unlink(missing_ok=True)
+        if self.force:
+            for translated in out.rglob("*.c"):
+                translated.unlink()
         out.mkdir(parents=True, exist_ok=True)
         try:
             self.make(out)
@@ -110,7 +114,7 @@ class BuildKernels(build_ext):
             self.extensions,
             build_dir=str(out),
             compiler_directives=DIRECTIVES,
-            force=bool(self.force),
+            cache=os.environ.get("CYTHON_CACHE_DIR", False),
             nthreads=workers if forks else 0,
             shared_utility_qualified_name=SHARED,
         )
