@@ -209,12 +209,12 @@ def shares(models: tuple[str, ...] = ()) -> dict[str, dict[str, tuple[int, int]]
         "robots, J and M": list(robots(models)),
     }
     for form, problems in forms.items():
-        for more in ("", ", the state too"):
-            right: set[str] = set()
-            for mistake, wrong in (x for _, given in problems for x in planted(given)):
-                told = diagnose(wrong.problem, **(wrong.state if more else {}))
-                kinds = {suspicion.kind for suspicion in told}
-                right = kinds if mistake == NONE else right
+        rights: dict[str, set[str]] = {}
+        for mistake, wrong in (x for _, given in problems for x in planted(given)):
+            problem = wrong.problem
+            for more, state in (("", {}), (", the state too", wrong.state)):
+                kinds = {suspicion.kind for suspicion in diagnose(problem, **state)}
+                right = rights[more] = kinds if mistake == NONE else rights[more]
                 hit, all_ = found.setdefault(form + more, {}).get(mistake, (0, 0))
                 found[form + more][mistake] = (
                     hit + bool(kinds if mistake == NONE else kinds - right),

@@ -34,6 +34,7 @@ class Derived:
         "small",
         "spread",
         "start",
+        "suspicions",
         "vain",
         "view",
     )
@@ -51,6 +52,7 @@ class Derived:
         self.vain: tuple[tuple[str, float, bytes], tuple[int, ...]] | None = None
         self.start: FloatArray | None = None  # (m,) N s, doing nothing
         self.bodies: Any = None  # `bodies_of` of lavender.lab.suspicions, in a tuple
+        self.suspicions: Any = None  # what its checks found of the problem alone
         self.motion: Any = None  # `Kept` of lavender.lab.motion: the reference of motion errors, its operator
 
 

@@ -281,6 +281,14 @@ def test_the_compliance_that_is_advised_gives_an_answer(law, form):
     assert not [s for s in lv.diagnose(softer) if s.kind == "conflict"]
 
 
+def test_what_is_looked_for_once_is_told_anew():
+    problem = lv.Problem.contact(np.eye(6), [0.0, 0.0, 0.2, 0.0, 0.0, 0.2], mu=[0.5, 12.0])
+    first, second = (lv.diagnose(problem) for _ in range(2))
+    assert first == second and len(first) == 2
+    first[0].data["mine"] = 1.0
+    assert all("mine" not in told[0].data for told in (second, lv.diagnose(problem)))
+
+
 def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an_answer():
     """Walls leave these balls no room: several conflicts at once, of which a proof names one."""
     fights = 0

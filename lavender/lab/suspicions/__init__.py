@@ -18,6 +18,7 @@ problems. If the numbers would be ordinary under another reading (M^-1 read as M
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,10 @@ def diagnose(
     state = motion.state_before(problem, velocity, gap, dt)
     given = problem.guess if impulse is None else problem.impulse_array(impulse)
     with np.errstate(all="ignore"):  # what is beyond float64 is no larger and no smaller than anything
-        found = [s for check in CHECKS for s in check(problem)]
+        known = problem.derived.suspicions
+        if known is None:
+            known = problem.derived.suspicions = tuple(s for check in CHECKS for s in check(problem))
+        found = [replace(s, data=dict(s.data)) for s in known]
         found += motion.stepped(problem, *state)
         if given is not None:
             found += blocks.wrong_impulses(problem, given)

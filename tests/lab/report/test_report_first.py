@@ -145,6 +145,7 @@ def test_a_paper_is_written_from_records_alone(real, tmp_path):
         write_paper(Report(records_of()), tmp_path / "none")
 
 
+@pytest.mark.slow
 def test_a_paper_has_a_figure_for_each_folder_and_backends_by_their_own_interface(tmp_path):
     """What is not drawn, and whose time is another, stands in the caption."""
     made, places = [], {"a": "mine/piles", "b": "mine/piles", "c": "mine/chains", "d": "mine/chains"}

@@ -320,6 +320,7 @@ for n in (60, 92_683):
 """
 
 
+@pytest.mark.slow
 def test_coincident_spheres_touch_or_are_refused():
     # 92,683 of them are 2^32 and 55,607 pairs: what counts in 32 bits takes them for few
     pytest.importorskip("resource")
