@@ -45,7 +45,8 @@ def finish(
     status, message = claim.status, claim.message
     relative = judged.relative
     if status is not NUMERICAL_ERROR and not all_finite(impulse):
-        status = DIVERGED
+        status, row = DIVERGED, int(np.argmin(np.isfinite(impulse)))
+        message = _joined(message, f"the impulse of {problem.row_name(row)} is {impulse[row]}")
     elif (
         status is CONVERGED
         and tol < relative == judged.floor

@@ -286,7 +286,7 @@ def read(path: str | Path) -> Records:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """Lines of a file, one after the other; the last one without a newline, which is torn, is left out."""
+    """Lines of a file without the mark that some editors put in front of UTF-8; the last is left out if it is torn."""
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -301,7 +301,7 @@ def _lines(path: Path) -> Iterator[str]:
                             f"{path} has a line of more than {MOST_LINE} bytes; a records.jsonl is needed"
                         )
                     return
-                yield line[:-1].decode("utf-8", errors="replace")
+                yield line[:-1].decode("utf-8", errors="replace").removeprefix("\ufeff")
     except OSError as error:
         raise InputError(
             f"cannot read {path} ({error.strerror or error}); a records.jsonl is needed"

@@ -148,6 +148,17 @@ def test_more_iterations_than_were_asked_for_are_no_result(plug_in):
     assert lv.solve(TINY, name, max_iter=7).iterations == 7
 
 
+def test_the_row_whose_impulse_is_not_finite_is_named(plug_in):
+    # A lambda has it in every row that is coupled, so that the worst row tells nothing.
+    def breaks(problem, impulse):
+        impulse[2] = np.nan
+        return lv.Claim(lv.Status.CONVERGED, 1)
+
+    solution = lv.solve(lv.Problem.lcp(np.eye(3) + 1.0, np.ones(3)), plug_in(breaks))
+    assert (solution.status, solution.residual.worst_row) == (lv.Status.DIVERGED, 0)
+    assert solution.message == "the impulse of row 2 is nan"
+
+
 def test_refused_is_no_claim_of_a_solver(plug_in):
     # It is said of the data of a world: callers that meet it do not look at the residual.
     solution = lv.solve(TINY, plug_in(lambda problem, impulse: lv.Claim(lv.Status.REFUSED, 1)))

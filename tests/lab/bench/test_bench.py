@@ -182,6 +182,9 @@ def test_each_record_is_on_disk_when_it_is_made(tmp_path):
     records = bench.run([stack(6)], ["pgs", "direct"], QUICK, path, watch=watch)
     assert seen == [True] * len(records)
     assert bench.read(path).records == records.records
+    # Of an editor that marks UTF-8; put together, the mark stands before each part.
+    path.write_bytes(2 * (b"\xef\xbb\xbf" + path.read_bytes()))
+    assert bench.read(path).records == records.records
 
 
 def test_the_same_command_goes_on_where_it_was_killed(tmp_path, monkeypatch):
