@@ -413,6 +413,16 @@ def test_what_comes_back_is_what_the_package_judges_it_to_be(library, seed, meth
         assert out.iterations <= iterations + 2 and solver.whole()
 
 
+@pytest.mark.parametrize("method, tol", [("sequential_impulses", 0.1), ("anderson", 0.01), ("nncg", 0.01)])
+def test_a_budget_that_ends_within_tol_between_two_checks_has_converged(library, method, tol):
+    given = self_test_problem()
+    for n in range(1, 40):
+        solver = library.open(library.problem(given), library.options(method))
+        found = lv.solve(given, method, tol=tol, max_iter=n)
+        assert (solver.run(n, tol).outcome == 1) == found.success == (found.status is lv.Status.CONVERGED)
+    assert found.success
+
+
 def test_structs_lie_as_python_reads_them_and_grow_only_at_the_end(library, folder):
     from lavender.out.header import STRUCTS, functions, struct_fields
 

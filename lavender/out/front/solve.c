@@ -305,6 +305,9 @@ static int32_t run(lav_solver *s, const lav_budget *budget, lav_result *out) {
   else row->step(s, budget, out);
   out->verdict.size = (uint32_t)sizeof out->verdict;
   judge(s, s->impulse, 1, &out->verdict);
+  if (budget->tol > 0.0 && out->verdict.relative <= budget->tol
+      && (out->outcome == LAV_MAX_ITERATIONS || out->outcome == LAV_TIME_LIMIT || out->outcome == LAV_STALLED))
+    out->outcome = LAV_CONVERGED; /* between two checks of its own */
   return LAV_OK;
 }
 
