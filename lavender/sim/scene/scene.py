@@ -92,7 +92,13 @@ class Parameters:
             check_sizes(name, np.array([getattr(self, name)]))
         gravity: Any = self.gravity
         if shape_of("gravity", gravity) == ():
-            gravity = (0.0, 0.0, -number("gravity", gravity))
+            size = number("gravity", gravity)
+            if size < 0.0:  # of who has the sign of z in mind: everything would fly upwards
+                raise InputError(
+                    f"gravity is {size:g}; a number points downwards and is at least 0: give {-size:g}, or a vector, "
+                    f"(0, 0, {size:g}) m/s^2"
+                )
+            gravity = (0.0, 0.0, -size)
         put(self, "gravity", tuple(numbers("gravity", gravity, 3).tolist()))
         for name in ("solver_options", "stepper_options"):
             options = getattr(self, name)

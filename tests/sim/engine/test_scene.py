@@ -186,6 +186,7 @@ def test_bad_parts_are_refused_and_nothing_is_added(build, message):
         ({"solver_options": {"omega": 1}}, "solver_options"),
         ({"solver": "pgs", "order": "reverse"}, "solver_options"),
         ({"solver_options": 3, "solver": "pgs"}, "mapping"),
+        ({"gravity": -9.81}, r"points downwards.* give 9.81"),
     ],
 )
 def test_bad_parameters_are_refused(more, message):
