@@ -102,7 +102,8 @@ def read_dialect(c_file: Path) -> list[str]:
     compiler = shlex.split(os.environ.get("CC", "cc"))
     include = "-I" + sysconfig.get_paths()["include"]
     found: dict[str, None] = {}
-    for more in ([], PLAIN):
+    guarded = PLAIN[0].removeprefix("-D") in c_file.read_text(encoding="utf-8")
+    for more in ([], PLAIN) if guarded else ([],):  # without the word both read the same
         command = [
             *compiler,
             *OPTIONS["COMPILE_FLAGS"],
