@@ -37,10 +37,10 @@ def solvers() -> None:
             if has
         ]
         reason = reasons[name]
-        what = spec.summary if reason is None else f"[yellow]{plain(reason)}[/]"
+        what = plain(spec.summary) if reason is None else f"[yellow]{plain(reason)}[/]"
         laws = [law for law in LAWS if law in spec.laws]
         table.add_row(
-            name,
+            plain(name),
             " ".join(laws),
             " ".join(o for o in OPERATORS if o in spec.operators),
             ", ".join(abilities),

@@ -176,6 +176,8 @@ class SolverSpec:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise InputError(f"a solver's name is {self.name!r}; a text that is not empty is needed")
+        if not isinstance(self.summary, str):
+            raise InputError(f"summary of solver {self.name!r} is {self.summary!r:.80}; a text is needed")
         for what, names in (("laws", LAWS), ("operators", OPERATORS), ("boxes", ("coulomb", "cone"))):
             given = getattr(self, what)
             is_some = isinstance(given, Collection) and not isinstance(given, (str, bytes))

@@ -58,6 +58,13 @@ def test_what_commands_print_of_paths_is_text(lavender, tmp_path):
         assert "\\x1b" in out + err and "\x1b" not in out + err
 
 
+def test_what_a_plug_in_calls_itself_is_text(lavender, register):
+    register(dataclasses.replace(lv.registry.get("pgs"), name="p\x1b[31m[red]q", summary="of [bold]a\x1b[0m"))
+    code, out, _ = lavender("solvers")
+    assert code == 0 and "\x1b" not in out
+    assert r"p\x1b[31m[red]q" in out and r"of [bold]a\x1b[0m" in out
+
+
 def test_long_names_that_differ_at_the_end_keep_files_of_their_own():
     names = ["n" * 300 + str(i) for i in range(3)]
     assert len({file_name(name) for name in names}) == 3

@@ -35,6 +35,7 @@ def named(name, **more):
         {"laws": None},
         {"laws": [["lcp"], 3]},
         {"boxes": "cone"},
+        {"summary": None},
         {"requires": "numpy"},
         {"options": ["omega"]},
         {"max_iter": -1},
