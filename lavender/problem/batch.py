@@ -300,6 +300,12 @@ class Batch(Sequence[Problem]):
         check_sizes("mu", mu, "-")
         return replace(part, mu=mu)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies and pickles hold the names themselves: what makes them may hold an engine's model.
+        if self.names_of is None:
+            return self.__dict__
+        return self.__dict__ | {"names_of": tuple(map(self.names_of, range(len(self)))).__getitem__}
+
     # -- a sequence of problems ------------------------------------------------------------------------
 
     def __len__(self) -> int:

@@ -1,5 +1,8 @@
 """Many states of MuJoCo in arrays: the problems and answers of one at a time, in float64 and in float32."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from mujoco_scene import mj, scene, whole_mass
@@ -75,6 +78,15 @@ def test_a_state_that_is_not_finite_harms_no_other():
     assert sorted(many.faults) == sorted(found.faults) == [1, 3]
     for i in (0, 2, 4):
         assert batch[i] == clean.batch[i]
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))])
+def test_an_engine_s_worlds_are_copied_and_pickled_with_their_names(again):
+    model = mj.MjModel.from_xml_string(scene(cone="pyramidal", condim=3, jacobian="dense"))
+    batch, impulse = lv.io.from_mujoco_many(model, states_of(model, 3))
+    twin = again(batch)
+    assert [list(p.names) for p in twin] == [list(p.names) for p in batch]
+    assert str(lv.residual_many(twin, impulse)[2]) == str(lv.residual_many(batch, impulse)[2])
 
 
 def test_a_model_in_which_nothing_moves_has_worlds_without_rows():
