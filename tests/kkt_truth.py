@@ -4,6 +4,7 @@ The conditions that hold at a solution (free, at a bound, open, sticking, slidin
 their equations are solved in wider numbers and every condition is then checked. Where one is broken, conditions are
 read anew off what was found. Rational numbers are exact where cones are polyhedral (rows, contacts of at most one
 tangent); where a disk slides a square root stands in the equations, and they hold to 2^-EXACT_BITS of their size.
+Those of a quadratic program, from its arrays as given, are measured in float64.
 """
 
 from fractions import Fraction
@@ -288,3 +289,33 @@ def shift_in(problem, a, y, numbers):
         bounds = [(rows - j, reach) for rows, reach in parts(problem.cones, i, numbers.number)]
         p[j:end] = project_cone(z[j:end], d[j:end], bounds, numbers.sqrt)
     return d * (y - p)
+
+
+OF_PROGRAM = ("P", "q", "G", "h", "A", "b", "lb", "ub")
+
+
+def of_program(qp, answer):
+    """(primal, dual, gap) of min 1/2 x.P x + q.x, G x <= h, A x = b, lb <= x <= ub, from the arrays as given."""
+    x, force = answer.x, qp["P"] @ answer.x + qp["q"]
+    short, wrong, value = [0.0], [0.0], x @ force
+    if qp["A"] is not None:
+        force = force + qp["A"].T @ answer.y
+        short.append(np.abs(qp["A"] @ x - qp["b"]).max(initial=0.0))
+        value += qp["b"] @ answer.y
+    if qp["G"] is not None:
+        force = force + qp["G"].T @ answer.z
+        short.append((qp["G"] @ x - qp["h"]).max(initial=0.0))
+        wrong.append(-answer.z.min(initial=0.0))
+        finite = qp["h"] < np.inf
+        wrong.append(np.abs(answer.z[~finite]).max(initial=0.0))
+        value += qp["h"][finite] @ answer.z[finite]
+    for bound, sign in (("ub", 1.0), ("lb", -1.0)):
+        if qp[bound] is not None:
+            short.append((sign * (x - qp[bound])).max())
+            push = np.maximum(sign * answer.z_box, 0.0)
+            finite = np.isfinite(qp[bound])
+            wrong.append(push[~finite].max(initial=0.0))
+            value += sign * qp[bound][finite] @ push[finite]
+    if answer.z_box is not None:
+        force = force + answer.z_box
+    return max(short), max(*wrong, np.abs(force).max()), abs(value)

@@ -31,7 +31,6 @@ import numpy.typing as npt
 from lavender.base.arrays import FloatArray, as_array, borrowed, check_not_nan, read_only, shape_of
 from lavender.base.errors import InputError
 from lavender.base.later import issparse
-from lavender.base.later import sparse as sp
 from lavender.problem.cones import Cones
 from lavender.problem.derived import cached_property
 from lavender.problem.generalized import Compressed, Generalized, compressed, lower_of
@@ -212,7 +211,7 @@ class QuadraticProgram:
         """The proximal step from a centre (n,), with this D."""
         of, before = self.generalized, self.proximal
         if d is not before:
-            of = Generalized(of.jac, of.mass + sp.diags_array(d if before is None else d - before), of.v_free)
+            of = of.shifted(d if before is None else d - before)
         general = of.with_jacobian(v_free=of.solve(d * centre - self.q))
         return replace(self, generalized=general, proximal=d)
 

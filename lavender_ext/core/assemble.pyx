@@ -256,6 +256,40 @@ def dense_to_csr(const double[:, ::1] a, double sign=1.0):
     return whole[:n + 1], whole[n + 1:], numbers
 
 
+def transposed(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data, int n):
+    """(indptr, indices, data) of the transpose of a matrix (m, n) in compressed rows."""
+    cdef Py_ssize_t nnz = indices.shape[0]
+    ptr_array, row_array, value_array = np.empty(n + 2, np.int32), np.empty(max(nnz, 1), np.int32), np.empty(max(nnz, 1))
+    cdef int32_t[::1] ptr = ptr_array, row = row_array
+    cdef double[::1] value = value_array
+    by_columns(<int32_t>indptr.shape[0] - 1, n, &indptr[0], &indices[0] if nnz else NULL, &data[0] if nnz else NULL,
+               &ptr[0], &row[0], &value[0])
+    return ptr_array[:n + 1], row_array[:nnz], value_array[:nnz]
+
+
+def mirrored(const int32_t[::1] indptr, const int32_t[::1] indices, const double[::1] data):
+    """(indptr, indices, data) of both triangles of a symmetric matrix from the rows of its lower one, diagonal last."""
+    cdef Py_ssize_t n = indptr.shape[0] - 1, nnz = indices.shape[0]
+    cdef Py_ssize_t i, q, k = 0
+    upper = transposed(indptr, indices, data, n)
+    cdef const int32_t[::1] above = upper[0], column = upper[1]
+    cdef const double[::1] number = upper[2]
+    ptr_array, index_array, value_array = np.zeros(n + 1, np.int32), np.empty(2 * nnz - n, np.int32), np.empty(2 * nnz - n)
+    cdef int32_t[::1] ptr = ptr_array, index = index_array
+    cdef double[::1] value = value_array
+    for i in range(n):
+        for q in range(indptr[i], indptr[i + 1]):
+            index[k] = indices[q]
+            value[k] = data[q]
+            k += 1
+        for q in range(above[i] + 1, above[i + 1]):     # the diagonal is there already
+            index[k] = column[q]
+            value[k] = number[q]
+            k += 1
+        ptr[i + 1] = <int32_t>k
+    return ptr_array, index_array, value_array
+
+
 cdef int32_t count_rows(Py_ssize_t lines, Py_ssize_t across, const int32_t* ptr, const int32_t* idx, const double* val,
                         bint columns, int32_t* count) noexcept nogil:
     # count[row] += its nonzeros; False where the matrix has no ascending indices in range, or numbers that the door excludes.

@@ -1,1 +1,1 @@
-"""Newton's method, turn by turn: systems of bodies or rows, interior points, exchanges, rounds, what is tried when."""
+"""Newton's method by turns: systems of bodies, rows and programs, interior points, exchanges, rounds, and when."""
