@@ -130,7 +130,9 @@ def test_threads_read_worlds_whose_turn_came_too_late(often):
 def test_no_object_has_a_property_of_functools():
     imported = re.compile(r"functools import (\([^)]*|.*)\bcached_property|functools\.cached_property")
     files = set(Path(lv.__file__).parent.rglob("*.py"))
-    files -= {path for path in files if path.name == "cut.py"}  # run without the package; no user holds its objects
+    files -= {
+        path for path in files if path.name == "cut.py"
+    }  # run without the package; no user holds its objects
     assert [path.name for path in files if imported.search(path.read_text(encoding="utf-8"))] == []
 
 
