@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import math
+import sys
 import time
 from types import SimpleNamespace
 
@@ -219,6 +220,13 @@ def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     assert len(ids) == 3
     assert len(bench.read(path)) == 3 * len(first)
     assert len(bench.read(path).latest()) == len(first)
+
+
+def test_a_solver_that_calls_exit_costs_its_own_record(plug_in):
+    plug_in(lambda problem, impulse: sys.exit(3), "fake_exit")
+    records = bench.run([chain(2)], ["fake_exit", "pgs"], QUICK)
+    assert {r.status for r in records if r.solver == "pgs"} == {"CONVERGED", "MAX_ITERATIONS"}
+    assert not any(r.solver == "fake_exit" and r.success for r in records)
 
 
 def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
