@@ -91,18 +91,10 @@ class InteriorPoint:
     @property
     def unit(self) -> FloatArray:
         """(n,) What stands for P_ii, with J beside it: 1 / sqrt(unit) is a unit of each variable."""
-        return self._given(self.size / self.column**2)
+        return self.qp.generalized._given(self.size / self.column**2)
 
     def _ordered(self, x: FloatArray) -> FloatArray:
         return x if self.order is None else x[self.order]
-
-    def _given(self, x: FloatArray) -> FloatArray:
-        """Variables (n,) in the order of the program."""
-        if self.order is None:
-            return x
-        out = np.empty_like(x)
-        out[self.order] = x
-        return out
 
     @np.errstate(all="ignore")  # an iterate that overflows is none
     def run(
@@ -171,7 +163,7 @@ class InteriorPoint:
         return u
 
     def _answer(self, x: FloatArray, lam: FloatArray, tol: float) -> QPSolution:
-        return self.qp.solution(lam, tol, self._given(x))
+        return self.qp.solution(lam, tol, self.qp.generalized._given(x))
 
     def _impulse(self) -> FloatArray:
         """(m,) In the program's own units."""
