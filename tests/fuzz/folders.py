@@ -7,6 +7,7 @@ import os
 import re
 import tempfile
 from pathlib import Path
+from unittest import mock
 
 import hypothesis.strategies as st
 import numpy as np
@@ -14,6 +15,7 @@ from strategies import chance
 
 import lavender as lv
 import lavender.cli
+from lavender.lab.bench.running import finals
 
 NAMES = (
     "a.npz", "[/x].npz", "[bold].npz", "²1.npz", "a$\\frac$b.npz", "a$b.npz", "<img src=x onerror=alert(1)>.npz",
@@ -25,19 +27,8 @@ NAMES = (
     "step-1.npz", "step-٣.npz", "😀.npz",
 )  # fmt: skip
 RAW_NAMES = tuple(base64.b64encode(name).decode() for name in (b"\xff\xfe.npz", b"a\x80.npz"))
-INSIDE = (
-    "names",
-    "name",
-    "lone surrogate",
-    "huge numbers",
-    "infeasible",
-    "empty",
-    "zero",
-    "garbage",
-    "members",
-    "good",
-    "good",
-)
+INSIDE = ("names", "name", "lone surrogate", "huge numbers", "infeasible", "empty", "zero", "garbage", "members",
+          "good", "good")  # fmt: skip
 
 
 def folder_specs():
@@ -86,7 +77,7 @@ def problem_of(inside):
     if inside == "lone surrogate":
         return lv.Problem.lcp(a, [1.0, 1.0], names=["\ud800", "b"], name="\udcff")
     if inside == "huge numbers":
-        return lv.Problem.lcp(1e300 * a, [1e300, -1e300])
+        return lv.Problem.lcp(1e59 * a, [1e59, -1e59])
     if inside == "infeasible":
         return lv.Problem.lcp(-np.eye(2), [1.0, 1.0])
     if inside == "empty":
@@ -126,28 +117,18 @@ def check(spec):
         folder.mkdir()
         lay_out(spec, folder)
         plan = ["--solvers", "pgs,nncg", "--levels", "1e-3", "--budgets", "4", "--repeats", "1"]
+        files = [str(path) for path in sorted(folder.iterdir())]
         command = {
-            "report": [
-                "report",
-                str(folder),
-                *plan,
-                "--out",
-                str(out),
-            ],
+            "report": ["report", str(folder), *plan, "--out", str(out)],
             "check": ["check", str(folder), "--solvers", "pgs,nncg"],
-            "files": [
-                "report",
-                *(str(p) for p in sorted(folder.iterdir())),
-                *plan,
-                "--out",
-                str(out),
-                "--no-figures",
-            ],
+            "files": ["report", *files, *plan, "--out", str(out)],
         }[spec["command"]]
         for turn in range(1 + spec["twice"]):
             # Figures cost most: where it is run twice, they are drawn of the records that were read.
-            drawn = spec["command"] != "report" or (spec["figures"] and turn == spec["twice"])
-            code, text = quiet(command if drawn else [*command, "--no-figures"])
+            drawn = command[0] == "check" or (spec["figures"] and turn == spec["twice"])
+            # What is timed again and again would take seconds, whatever a folder holds.
+            with mock.patch.object(finals, "MOST_ROUNDS", 1):
+                code, text = quiet(command if drawn else [*command, "--no-figures"])
             yield from told(code, text, command[0], spec.get("status", STATUS))
         for page in out.glob("*.html"):
             html = page.read_text(encoding="utf-8")

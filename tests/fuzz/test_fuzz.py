@@ -24,7 +24,7 @@ from judge_twin import Problem, spec_of
 from strategies import plain
 
 
-@settings(max_examples=40, suppress_health_check=list(HealthCheck))
+@settings(max_examples=15, suppress_health_check=list(HealthCheck))
 @given(parts=st.lists(problems.parts(6), min_size=1, max_size=12), seed=st.integers(0, 2**32))
 def test_a_crowd_is_its_parts_side_by_side(parts, seed):
     parts = [part for part in parts if problems.kind_of(part) == problems.kind_of(parts[0])]
@@ -48,13 +48,7 @@ def test_a_crowd_is_its_parts_side_by_side(parts, seed):
 
 def test_the_judge_sees_a_false_claim():
     problem = random_lcp(3)
-    spec = {
-        "kind": "solve",
-        "problem": spec_of(problem),
-        "solver": "direct",
-        "options": {"tol": 1e-9},
-        "again": False,
-    }
+    spec = {"problem": spec_of(problem), "solver": "direct", "options": {"tol": 1e-9}, "again": False}
     good = lv.solve(problem, "direct", tol=1e-9)
     assert list(checks.claims(spec, problem, good)) == []
 
@@ -122,11 +116,11 @@ def test_crashes_hangs_and_raw_exceptions_are_found_and_kept(tmp_path, monkeypat
 # -- what the fuzzer draws for hours, for some seconds --------------------------------------------------------------
 
 
-# some seconds each
-EXAMPLES = {"solve": 200, "file": 250, "steps": 60, "snapshot": 60, "folder": 2, "door": 60, "promise": 60}
+# Some seconds each. Of folders, which take a second each, there is one of everything in found.jsonl.
+EXAMPLES = {"solve": 150, "file": 150, "steps": 60, "snapshot": 60, "door": 60, "promise": 60}
 
 
-@pytest.mark.parametrize("kind", checks.INPUTS)
+@pytest.mark.parametrize("kind", EXAMPLES)
 def test_drawn_by_hypothesis_every_promise_holds(kind):
     @settings(max_examples=EXAMPLES[kind], suppress_health_check=list(HealthCheck))
     @given(spec=checks.INPUTS[kind])
@@ -135,12 +129,7 @@ def test_drawn_by_hypothesis_every_promise_holds(kind):
 
     refused = checks.COUNTS["refused"]
     holds()
-    if kind in (
-        "solve",
-        "steps",
-        "door",
-        "promise",
-    ):  # of files and snapshots that are damaged most are refused
+    if kind not in ("file", "snapshot"):  # of those that are damaged most are refused
         refused = checks.COUNTS["refused"] - refused
         assert refused < 0.95 * EXAMPLES[kind], "nearly every input was refused: nothing is tested"
 
