@@ -41,6 +41,7 @@ from lavender.sim.engine.state import State
 from lavender.sim.scene import Scene
 
 TOWERS = ((2, 4), (4, 4), (6, 4))  # boxes, sweeps
+TALL = ((6, 4), (10, 8), (14, 8))  # of which gravity is quicker than the sweeps
 ORDERS = ("given", "symmetric", "alternating")
 PLAY = 2e-5  # m, gap of a face where feedback acts: more than the differences move it
 STEP = 1e-7  # m, rad, m/s, N s of the differences
@@ -210,7 +211,7 @@ def figure(path: str | PathLike[str]) -> None:
     left.set(xlim=(0.7, 1.2), ylim=(-0.8, 0.8), xlabel="Re z", ylabel="Im z")
     left.set_title("6 boxes, 4 sweeps: eigenvalues z of a substep", fontsize=10)
     gains = np.geomspace(1e-3, 1.0, 16)
-    for n, sweeps in ((2, 4), (4, 4), (6, 4)):
+    for n, sweeps in TOWERS:
         kappa, _ = slowest(modes(n, sweeps, h))
         most = [np.abs(modes(n, sweeps, h, gain=g).z[0]) for g in gains]
         (line,) = middle.semilogx(gains, most, "o", ms=3, label=f"{n} boxes, {sweeps} sweeps")
@@ -221,7 +222,7 @@ def figure(path: str | PathLike[str]) -> None:
     middle.set(xlabel="g, share of the gap closed in a substep", ylabel="largest |z|", ylim=(0.99, 1.21))
     middle.set_title("dots: measured, lines: equation (2), dotted: g = κ", fontsize=10)
     lengths = np.array([1 / 240, 1 / 120, 1 / 60, 1 / 45, 1 / 30])
-    for n, sweeps in ((6, 4), (10, 8), (14, 8)):
+    for n, sweeps in TALL:
         rate = [max(0.0, modes(n, sweeps, x).growth[0]) for x in lengths]
         right.plot(1e3 * lengths, rate, "o-", ms=4, label=f"{n} boxes, {sweeps} sweeps")
     right.set(xlabel="substep [ms]", ylabel="growth [1/s]")

@@ -171,22 +171,6 @@ def test_siconos_solves_the_same_problems():
 # -- engines ---------------------------------------------------------------------------------------
 
 
-def test_engines_step_the_same_scene():
-    steps = engines.measure_scene("stack6", settle=200, rounds=1)
-    names = [s.engine for s in steps]
-    assert names[:2] == ["lavender, 16 sweeps", "lavender newton"]
-    for s in steps:
-        assert s.time > 0.0 and s.note == ""
-        # Four points under each of six boxes; MuJoCo adds a few between edges while PGS lets boxes tilt.
-        assert 24 <= s.contacts <= 40
-        assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
-        assert math.isnan(s.relative) == ("pybullet" in s.engine)
-    text = comparison.engines_table(steps).splitlines()
-    lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
-    assert len(text) == 2 + len(steps) + (2 + len(lost) if lost else 0)
-    assert all(any(f"- stack6: {s.engine}," in line for line in text) for s in lost)
-
-
 def test_mujoco_carries_the_same_weight():
     pytest.importorskip("mujoco", reason="needs MuJoCo: pip install 'lavender-contact[peers]'")
     problem = engines.export("stack6", settle=480)
@@ -199,14 +183,28 @@ def test_mujoco_carries_the_same_weight():
     assert np.all(problem.cones.mu == 0.5)
 
 
-def test_command(tmp_path):
-    out = tmp_path / "peers.json"
-    done = CliRunner().invoke(
-        command, ["--no-solvers", "--scenes", "stack6", "--out", str(out)], catch_exceptions=False
-    )
-    assert done.exit_code == 0
-    record = json.loads(out.read_text())
-    assert record["steps"][0]["engine"] == "lavender, 16 sweeps"
-    if importlib.util.find_spec("pybullet") is not None:
-        assert any("pybullet" in s["engine"] for s in record["steps"])
-    assert "not here: " in done.output and "| stack6 | lavender newton |" in done.output
+def test_the_command_steps_the_same_scene_in_every_engine_and_keeps_losses(tmp_path, monkeypatch):
+    out, steps = tmp_path / "peers.json", []
+
+    def short(scene, sweeps):
+        steps.extend(measured(scene, sweeps, settle=200, rounds=1))
+        return steps
+
+    measured = engines.measure_scene
+    monkeypatch.setattr(engines, "measure_scene", short)
+    words = ["--no-solvers", "--scenes", "stack6", "--out", str(out)]
+    done = CliRunner().invoke(command, words, catch_exceptions=False)
+    assert done.exit_code == 0 and "not here: " in done.output
+    assert [s["engine"] for s in json.loads(out.read_text())["steps"]] == [s.engine for s in steps]
+    assert [s.engine for s in steps[:2]] == ["lavender, 16 sweeps", "lavender newton"]
+    for package in ("mujoco", "pybullet"):
+        assert any(package in s.engine for s in steps) == (importlib.util.find_spec(package) is not None)
+    for s in steps:
+        assert s.time > 0.0 and s.note == "" and f"| stack6 | {s.engine} |" in done.output
+        # Four points under each of six boxes; MuJoCo adds a few between edges while PGS lets boxes tilt.
+        assert 24 <= s.contacts <= 40
+        assert 0.0 <= s.depth < 0.01 and s.speed < 0.1
+        assert math.isnan(s.relative) == ("pybullet" in s.engine)
+    lost = [s for s in steps if comparison.over_ours(s, steps) < 1.0]
+    assert done.output.count("- stack6: ") == len(lost)
+    assert all(f"- stack6: {s.engine}," in done.output for s in lost)

@@ -29,19 +29,6 @@ def test_the_page_has_the_shares_of_planted_mistakes_that_are_found(found):
         assert f"| {mistake} | {cells} |" in page
 
 
-def test_rows_of_j_that_are_no_normals_are_told_as_those_of_bodies(found):
-    """Nothing is told of what is right; signs and order of rows are told wherever contacts are of rigid bodies."""
-    for of in found.values():
-        assert of["none"] == (0, 30)
-        assert of["normals flipped"] == of["tangents first"] == of["mu in degrees"] == (30, 30)
-        for mistake in (
-            "gap or depth of the wrong sign",
-            "targets divided by dt twice",
-            "v* = v + a, without dt",
-        ):
-            assert of[mistake][0] >= 10
-
-
 @pytest.mark.parametrize("spin_of", ["a ball", "a box"])
 def test_a_kinematic_tree_is_not_taken_for_rigid_bodies(spin_of):
     """A base that hangs below the feet it stands on is no mistake, if there are joints in between."""
@@ -83,7 +70,7 @@ STATE = {
 
 
 def test_the_state_before_the_step_tells_what_the_problem_alone_does_not():
-    for name, sound in list(scenes())[::5]:
+    for name, sound in list(scenes())[::15]:
         for x in (sound, replace(sound, rows=None)):
             assert lv.diagnose(x.problem, **x.state) == (), name
             for mistake, wrong in planted(x):

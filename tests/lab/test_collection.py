@@ -35,7 +35,6 @@ def test_problems_are_made_again_with_the_same_numbers(start):
 
 AVX512 = "X86_V4 AVX512_ICL AVX512_SPR AVX512F AVX512CD AVX512_SKX"  # as NumPy has named them
 OTHERS = {
-    "Haswell": {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": AVX512},
     "Nehalem": {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": f"{AVX512} X86_V3 AVX2 FMA3"},
     "SkylakeX": {"OPENBLAS_CORETYPE": "SkylakeX"},
 }

@@ -23,21 +23,23 @@ from lavender.out.header import constants, functions, javascript
 from lavender.sim.web import cut
 
 WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Werror"]
-LANGUAGES = {
-    "C99": ["-std=c99"],
-    "C11": ["-std=c11"],
-    "C++11": ["-std=c++11", "-x", "c++"],
-    "C++17": ["-std=c++17", "-x", "c++"],
-}
+# The first and the last that are promised; the library is compiled as C11 wherever it is run.
+LANGUAGES = {"C99": ["-std=c99"], "C++11": ["-std=c++11", "-x", "c++"], "C++17": ["-std=c++17", "-x", "c++"]}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("small", [[], ["-DLAV_SWEEPS_ONLY"]], ids=["full", "sweeps"])
 @pytest.mark.parametrize(
-    ("name", "language"),
-    [*(("gcc", language) for language in LANGUAGES), ("clang", "C99"), ("clang", "C++11")],
+    ("name", "language", "small"),
+    [
+        ("gcc", "C99", []),
+        ("gcc", "C++17", []),
+        ("clang", "C99", []),
+        ("clang", "C++11", []),
+        ("gcc", "C99", ["-DLAV_SWEEPS_ONLY"]),
+        ("clang", "C++11", ["-DLAV_SWEEPS_ONLY"]),
+    ],
 )
-def test_no_warning_in_either_language(folder, tmp_path, name, small, language):
+def test_no_warning_in_either_language(folder, tmp_path, name, language, small):
     command, quick = [name], ["-fsyntax-only"]
     if name == "clang" and shutil.which(name) is None:  # zig's compiler is clang's
         pytest.importorskip("ziglang", reason="neither clang nor ziglang is installed (extra: wasm)")

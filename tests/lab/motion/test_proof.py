@@ -32,7 +32,7 @@ def test_a_linear_problem_beside_rational_numbers():
 
 
 CASES = (
-    "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "pyramid(k=30)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)",
+    "stack(n=8)", "box_stack(n=4)", "pyramid(k=4)", "pyramid(k=16)", "box_stackF(n=4)", "slabF(n=4, sliding=0.5)",
     "four_bar", "big_boxF(mass_ratio=1, sliding=0.5)", "granular(n=2, friction=cone)", "granularF(n=2, sliding=0.5)",
     "pyramidF(k=6, mass_ratio=1e3, sliding=0.5)",  # rows that depend on others by quotients of thousands of bits
 )  # fmt: skip
@@ -55,7 +55,7 @@ def test_cases_of_the_suite_are_proven_where_rows_depend_on_each_other_too(name)
 def test_every_kind_of_contact_and_form(friction, rolling):
     """Bodies, their A as a dense and as a sparse matrix, and J and M: one solution, by each of them."""
     proven = 0
-    for seed in range(12):
+    for seed in range(6):
         problem = random_contact_problem(seed, friction, bodies=6, joints=2, contacts=3, rolling=rolling)
         solution = lv.solve(problem, "newton", tol=1e-13)
         found = lv.prove(problem, solution)
@@ -69,7 +69,7 @@ def test_every_kind_of_contact_and_form(friction, rolling):
             again = lv.prove(other, solution)
             # A was rounded: another problem, whose solution is off by some 1e-16 times the condition.
             assert again.proven and np.allclose(again.impulse, found.impulse, atol=1e-9)
-    assert proven >= 10
+    assert proven >= 5
 
 
 def test_an_answer_at_the_edge_of_a_family_of_impulses_is_proven_from_inside_of_it(monkeypatch):
@@ -108,7 +108,7 @@ def test_without_python_flint_it_says_what_to_install(monkeypatch):
         lv.prove(lv.Problem.lcp(np.eye(1), [1.0]), [1.0])
 
 
-@pytest.mark.parametrize("first", range(0, 200, 50))
+@pytest.mark.parametrize("first", (0, 50))
 def test_a_twin_in_rational_numbers_finds_nothing_false(first):
     tried = [proof_twin.attack(seed) for seed in range(first, first + 50)]
     assert not [wrong for _, _, wrong in tried if wrong]
@@ -121,7 +121,7 @@ def test_sparse_numbers_prove_nothing_false_either(monkeypatch):
     """Small problems by the way of large ones: sparse float64 numbers with bounds, rows of the inverse in portions."""
     for where, name in ((operator, "SMALL"), (operator, "DENSE"), (island, "DENSE"), (island, "PORTION")):
         monkeypatch.setattr(where, name, 1)
-    tried = [proof_twin.attack(seed) for seed in range(200, 260)]
+    tried = [proof_twin.attack(seed) for seed in range(200, 230)]
     assert not [wrong for _, _, wrong in tried if wrong]
     near = [held for label, held, _ in tried if label in ("strict exact", "strict near", "strict noise")]
     assert sum(near) >= 0.9 * len(near) > 0

@@ -68,14 +68,14 @@ def test_three_reports_of_a_near_tie_name_the_same_set(speeds, noise):
     """Each report is of another hour, on a machine up to 1.6 times as fast; the truly fastest is among the named."""
     fastest = min(speeds, key=speeds.get)
     agreed = []
-    for first in range(0, 36, 3):
+    for first in range(0, 18, 3):
         found = [
             race(in_turns(speeds, seed, tuple(ROBOTS), noise, rerun=1.6, sizes=ROBOTS, repeats=21))
             for seed in range(first, first + 3)
         ]
         assert all(fastest in f.named for f in found)
         agreed.append(len({frozenset(f.named) for f in found}) == 1)
-    assert sum(agreed) >= 11  # of 12: two standard errors are no certainty
+    assert sum(agreed) >= 5  # of 6: two standard errors are no certainty
 
 
 def test_who_misses_a_case_is_never_the_first_whatever_the_mean_says():

@@ -79,6 +79,12 @@ def test_a_function_and_its_name_agree():
         ("toy_stack(kick=-1)", lv.InputError, "upwards"),
         ("toy_stack(friction=glue)", lv.InputError, "none, box"),
         ("random_spd(condition=0.5)", lv.InputError, "1 or more"),
+        ("near_parallel(angle=0)", lv.InputError, "needed"),
+        ("slider(mu=-1)", lv.InputError, "needed"),
+        ("diagonal(kind=odd)", lv.InputError, "known"),
+        ("infeasible(kind=odd)", lv.InputError, "known"),
+        ("slab(n=1)", lv.InputError, "needed"),
+        ("units(kg=0)", lv.InputError, "needed"),
     ],
 )
 def test_a_wrong_name_says_what_was_meant(text, error, sign):
@@ -116,16 +122,6 @@ def test_boxed_friction_has_the_rows_of_the_contacts_and_bounds_of_their_loads()
     assert upper[ground, 1].sum() == pytest.approx(0.5 * 25 * build.FALL, rel=1e-14)
 
 
-def test_sizes_of_the_families_that_others_measured():
-    for n, m in ((4, 299), (9, 3402)):
-        assert suite.granular(n).problem.m == m
-        assert suite.granular(n, "cone").problem.m == 3 * m
-    assert suite.pyramid(10).problem.m == 400
-    assert suite.pyramid(20).problem.m == 1600
-    assert suite.box_stack(10).problem.m == 40
-    assert suite.chain(333).problem.m == 999
-
-
 def test_mass_ratio_and_sliding_do_what_they_say():
     inv_mass = suite.pyramid(4, mass_ratio=1e6, bottom_ratio=100.0).problem.rows.inv_mass
     assert inv_mass.tolist() == [0.01] * 4 + [1.0] * 5 + [1e-6]
@@ -134,33 +130,6 @@ def test_mass_ratio_and_sliding_do_what_they_say():
     assert np.allclose(np.hypot(pushed[:, 0], pushed[:, 1]), 0.5, rtol=1e-15)
     assert len(np.unique(pushed[:, 0])) == 5
     assert not np.any(pushed[:, 2:])
-
-
-def test_a_frictional_twin_slides():
-    """With 0.5 m/s nearly all contacts that carry load slip at the solution."""
-    problem = suite.case("pyramidF(k=4, sliding=0.5)").problem
-    solution = lv.solve(problem, "pgs", tol=1e-8, max_iter=20_000)
-    assert solution.success, str(solution)
-    lam = solution.impulse.reshape(-1, 3)
-    carrying = lam[:, 0] > 1e-6 * lam[:, 0].max()
-    slipping = np.hypot(lam[:, 1], lam[:, 2]) > (1 - 1e-6) * 0.5 * lam[:, 0]
-    assert np.mean(slipping[carrying]) > 0.9
-
-
-def test_chains_are_banded_and_hold_their_weight():
-    for case in (suite.chain(6, 100.0), suite.hang(6, 100.0)):
-        a = case.problem.csr.tocoo()
-        assert np.abs(a.coords[0] - a.coords[1]).max() <= 5
-        after = case.problem.velocity(case.reference.impulse)
-        # Anchors stay together: with the first held, J v = 0 to rounding of the impulses.
-        assert np.abs(case.problem.jacobian @ after.ravel()).max() <= 1e-12
-    hung = suite.hang(6, 100.0)
-    assert hung.reference.impulse[2] == pytest.approx(
-        105.0 * build.FALL, rel=2e-2
-    )  # the top joint carries it all
-    assert np.linalg.cond(suite.hang(30).problem.dense()) > 10 * np.linalg.cond(
-        suite.chain(30).problem.dense()
-    )
 
 
 # -- references -----------------------------------------------------------------------------------
@@ -194,6 +163,7 @@ def test_a_reference_is_a_solution(name):
     reference = case.reference
     if reference is None:
         assert case.problem.law in ("coulomb", "cone")
+        assert name not in hard.SET or "sliding=0.5" in name or name == "box_stackF(n=10, mass_ratio=1e6)"
         return
     assert reference.source
     if reference.impulse is None:
@@ -207,11 +177,6 @@ def test_a_reference_is_a_solution(name):
     assert reference.compare in ("impulse", "slack", "error")
 
 
-def test_only_what_slides_at_large_ratios_has_no_reference():
-    without = [name for name in set(hard.SET) - LARGE if suite.case(name).reference is None]
-    assert all("sliding=0.5" in name or name == "box_stackF(n=10, mass_ratio=1e6)" for name in without)
-
-
 def test_the_toy_stack_is_solved_by_trying_all_active_sets():
     problem = suite.toy_stack().problem
     found = enumerate_lcp(problem.dense(), problem.b, problem.cones.lower, problem.cones.upper)
@@ -222,18 +187,6 @@ def test_the_toy_stack_is_solved_by_trying_all_active_sets():
     assert lv.residual(problem, clamped).relative > 0.1  # solving, then clamping once, is another answer
 
 
-def test_two_particles_follow_the_formula_of_the_docstring():
-    case = suite.two_particles(m1=3.0, m2=0.5, drift=0.02)
-    v = case.problem.rows.v_free
-    n = np.array([0.6, 0.0, 0.8])
-    assert case.problem.dense()[0, 0] == pytest.approx(1 / 3 + 2, rel=1e-15)
-    assert case.problem.b[0] == pytest.approx(-2.0 - n @ (v[1, :3] - v[0, :3]), rel=1e-15)
-    after = case.problem.velocity(case.reference.impulse)[:, :3]
-    assert n @ (after[1] - after[0]) == pytest.approx(-2.0, rel=1e-14)
-    assert 3.0 * after[0] + 0.5 * after[1] == pytest.approx(3.0 * v[0, :3] + 0.5 * v[1, :3], rel=1e-14)
-    assert case.problem.row_name(0) == "rod"
-
-
 def test_random_spd_has_the_condition_it_names():
     for condition in (1.0, 1e3, 1e8):
         a = suite.random_spd(30, condition).problem.dense()
@@ -242,7 +195,7 @@ def test_random_spd_has_the_condition_it_names():
 
 
 def test_extended_precision_beats_float64_and_refuses_what_it_cannot_solve():
-    case = suite.random_spd(40, 1e10)
+    case = suite.random_spd(12, 1e10)
     a, b = case.problem.dense(), case.problem.b
     wide = exact.solve_linear(case.problem)
     plain = np.linalg.solve(a, b)

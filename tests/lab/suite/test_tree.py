@@ -13,13 +13,11 @@ import lavender as lv
 from lavender import registry, suite
 from lavender.base.deadline import Deadline
 from lavender.judge.residuals import reference
-from lavender.lab.suite.build import Bodies, Contacts, contact_problem
-from lavender.problem import OPERATORS
 from lavender.solvers import costs
 from lavender.solvers.auto import LAST, LITTLE, MOST, SURE, Tree, solve, tree_goes_on
 from lavender.solvers.certify import certify
 from lavender.solvers.solve_log import SolveLog
-from lavender.solvers.steps import METHODS, NEAR, Iterations, Newton, Step, Sweeps
+from lavender.solvers.steps import METHODS, NEAR, Newton, Step, Sweeps
 from lavender_ext.small import checked_sweeps
 
 
@@ -71,6 +69,7 @@ FIRST = {
     "a loose pile, a matrix": (lambda: as_matrix(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
     "a loose pile, J and M": (lambda: general(suite.case("granularF(n=6, seed=2)").problem), LOOSE),
     "a pile that rolls": (lambda: suite.case("drawn_rolling(seed=98103)").problem, LOOSE),
+    "a pile that rolls, a matrix": (lambda: as_matrix(suite.case("drawn_rolling(seed=98103)").problem), LOOSE),
     "a tight pile": (lambda: suite.pyramid(k=6, friction="coulomb").problem, ["anderson", "anderson", "newton"]),
 }  # fmt: skip
 
@@ -78,13 +77,16 @@ FIRST = {
 @pytest.mark.parametrize("name", FIRST)
 def test_each_line_is_reached_and_named(name):
     make, expected = FIRST[name]
-    stages = lv.explain(make()).stages
+    problem = make()
+    stages = lv.explain(problem).stages
     assert [stage.solver.partition(" ")[0] for stage in stages[: len(expected)]] == expected
     assert ("nncg from the cone law" in [stage.solver for stage in stages]) == ("loose" in name)
     assert all(stage.why and stage.iterations > 0.0 and stage.cost > 0.0 for stage in stages)
+    methods = {METHODS[stage.solver][0] for stage in stages if stage.solver != "certificate"}
+    assert [name for name in methods if registry.get(name).refuses(problem)] == []
     found = lv.prepare(make(), "auto").solve(tol=1e-6)
     assert found.success
-    compiled = {"lemke", "direct", "anderson", "newton"} if make().m <= registry.SMALL_ROWS else set()
+    compiled = {"lemke", "direct", "anderson", "newton"} if problem.m <= registry.SMALL_ROWS else set()
     assert {turn.solver.partition(" ")[0] for turn in found.turns} <= set(expected) | compiled
 
 
@@ -140,32 +142,6 @@ def test_turns_end_where_nobody_gains():
     assert turns == ["admm", "nncg", "anderson", "admm", "nncg"], "twice, sweeps once"
 
 
-@pytest.mark.parametrize("seed", range(12))
-def test_counts_are_what_newton_does(seed):
-    """Multiply-adds of the factor and entries that are there; a dense one has m^3/3, none in a band has less than m."""
-    problem = random_general(seed, ("coulomb", "cone")[seed % 2], n=20, compliance=True, contacts=12)
-    state = registry.get("newton").load()().prepare(problem)
-    nv = problem.generalized.nv
-    # Every island full, at most; passing over a column is counted for as much as eight multiply-adds.
-    assert 0.0 < state.count.work <= 8.0 * nv**2 + nv**3 / (3.0 if seed % 2 == 0 else 6.0)
-    assert state.count.entries == problem.metric.work
-    rows = registry.get("newton").load()(form="impulse").prepare(problem)
-    assert rows.count.form == "dense" and rows.count.work == problem.m**3 / 3.0
-    sparse = registry.get("newton").load()().prepare(as_matrix(suite.stack(n=400).problem))
-    assert sparse.count.form == "panels" and 400.0 <= sparse.count.work < 400.0**3 / 3.0
-
-
-@pytest.mark.parametrize(
-    "name", ["stack(n=200)", "granularF(n=4)", "pyramidF(k=6)", "wild(seed=24)", "wild(seed=3)"]
-)
-def test_the_least_is_below_what_is_counted(name):
-    problem = suite.case(name).problem
-    reference(problem)
-    tree = Tree(problem)
-    if problem.generalized is None:
-        assert tree.least <= tree.newton * (1.0 + 1e-12)
-
-
 def test_explain_counts_nothing_anew_and_refuses_what_is_none():
     problem = suite.granular(n=3, friction="coulomb").problem
     first, second = lv.explain(problem), lv.explain(suite.granular(n=3, friction="coulomb").problem)
@@ -193,13 +169,6 @@ def test_a_small_problem_is_told_by_who_solves_it(make, names):
     assert told and all(name in told for name in names), told
     solution = lv.solve(problem)
     assert solution.success and all(turn.solver.partition(" ")[0] in names for turn in solution.turns)
-
-
-def test_there_are_twelve_rates():
-    def numbers(rates):
-        return sum(numbers(value) if isinstance(value, dict) else 1 for value in rates.values())
-
-    assert numbers(costs.RATES) <= 12
 
 
 class Made(Step):
@@ -231,29 +200,6 @@ def test_every_step_goes_on_and_the_best_of_all_is_returned(monkeypatch):
     np.testing.assert_array_equal(log.impulse, found[-1] * solved + problem.start())
     after = [turn.after for turn in log.turns]
     assert (np.diff(after) <= 0.0).all() and len(after) == len(found)
-
-
-@pytest.mark.parametrize("kind", ["anderson", "nncg", "newton"])
-def test_a_step_in_parts_is_the_step_at_once(kind):
-    problem = suite.pyramid(k=4, friction="coulomb").problem
-    reference(problem)
-    got = []
-    for parts in ([40.0], [10.0, 10.0, 20.0]):
-        log = SolveLog(problem, 1e-13, 10**6)
-        log.offer(problem.start())
-        if kind == "anderson":
-            step = Sweeps(problem)
-            step.begin(log)
-        elif kind == "newton":
-            step = Newton("newton", log)
-            step.state = Tree(problem).states["newton"]
-        else:
-            step = Iterations(kind, log)
-        for n in parts:
-            if not step.over:
-                step.run(n)
-        got.append(log.best)
-    assert max(got) < 1e-2, got
 
 
 @pytest.mark.parametrize("sweeps, from_nothing", [(2, True), (200, False)])
@@ -338,17 +284,6 @@ def test_rows_of_a_follow_where_newton_over_velocities_ends_in_vain():
     assert solution.success and solution.turns[-1].solver == "newton over rows", solution.turns
 
 
-@pytest.mark.parametrize("seed", [0, 3, 15])
-def test_rows_of_a_follow_for_few_contacts_of_uneven_compliance(seed):
-    rng = np.random.default_rng(seed)
-    jac, half = rng.standard_normal((27, 6)), 0.3 * np.tril(rng.standard_normal((6, 6))) + np.eye(6)
-    scale = 10.0 ** rng.uniform(-1.5, 1.5, 6)
-    mass, soft = scale[:, None] * (half @ half.T) * scale, 10.0 ** rng.uniform(-6.0, -1.0, 27)
-    v_free, cones = rng.standard_normal(6), lv.Cones.contacts(rng.uniform(0.0, 1.2, 9))
-    problem = lv.Problem.from_jacobian(jac, mass, v_free, cones=cones, friction="cone", compliance=soft)
-    assert lv.solve(problem, tol=1e-6).success
-
-
 @pytest.mark.parametrize("friction", ["cone", "coulomb"])
 @pytest.mark.parametrize("contacts", [10, 40])
 def test_sweeps_alone_solve_contacts_whose_rows_have_unlike_units(contacts, friction):
@@ -396,21 +331,6 @@ def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     monkeypatch.setattr("lavender.solvers.certify.find_direction", lambda *asked: 1 / 0)
     certify(log)
     assert not log.turns
-
-
-@pytest.mark.parametrize("form", OPERATORS[:2])
-def test_where_contacts_roll_the_tree_has_no_step_that_cannot_roll(form):
-    rng = np.random.default_rng(3)
-    position = np.array([[1.0 * (k % 4), 0.0, 0.5 + k // 4] for k in range(12)])
-    pairs = [(k - 4 if k >= 4 else -1, k) for k in range(12)]
-    contacts = Contacts(pairs, position - [0.0, 0.0, 0.5], [0.0, 0.0, 1.0])
-    bodies = Bodies(position, 1.0, 0.4)
-    bodies.v_free += 0.2 * rng.standard_normal(bodies.v_free.shape)
-    problem = contact_problem(bodies, contacts, "coulomb", rolling=0.02)
-    problem = as_matrix(problem) if form == "matrix" else problem
-    for stage in lv.explain(problem).stages:
-        assert registry.get(METHODS[stage.solver][0]).refuses(problem) is None
-    assert lv.solve(problem, tol=1e-9).success
 
 
 def test_cones_that_sweeps_do_not_take_have_steps_that_do():
