@@ -297,6 +297,10 @@ def play(scene, spec, quiet=False):
                 seen.update(observation["contacts"]["impulses"].tobytes())
                 if terminated:
                     COUNTS["lost"] += 1
+                    if spec.get("lasts"):
+                        found.append(
+                            ("false claim", f"{info['lost_body']} is lost, which nothing throws away")
+                        )
                     return found, seen.digest()
         elif not (quiet and word in CHANGES_NOTHING):
             try:

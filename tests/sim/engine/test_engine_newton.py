@@ -43,7 +43,7 @@ def _contact_rows(state):
 def test_a_step_is_what_solve_returns(name, more):
     sim = lv.Simulation(lv.Scene(name, solver="newton", **more))
     judged = 0
-    for step in range(60):
+    for step in range(45):
         problem = sim.constraint_problem()
         observation = sim.step()[0]
         if problem.m == 0:
@@ -63,7 +63,7 @@ def test_a_step_is_what_solve_returns(name, more):
         size = np.abs(found.impulse).max() + np.abs(problem.b / problem.d).max()
         assert observation["solver"][5] == pytest.approx(error, abs=1e-12 * size)
         judged += 1
-    assert judged >= 30  # the scenes touch something from the first half second on
+    assert judged >= 15  # the scenes touch something from the first half second on
 
 
 def test_the_first_phase_ends_in_each_of_its_ways():
@@ -120,7 +120,7 @@ def test_what_the_first_phase_does_not_reach_is_left_as_it_came():
     assert found.work["sweeps"] == sweeps and found.work["factorisations"] > factorisations
 
 
-def test_another_newton_is_asked_itself():
+def test_another_newton_is_asked_itself(register):
     asked = []
 
     class Mine(newton.Newton):
@@ -128,17 +128,10 @@ def test_another_newton_is_asked_itself():
             asked.append(problem.m)
             return super().prepare(problem)
 
-    spec = registry.get("newton")
-    mine = lv.SolverSpec(
-        name="newton", factory=Mine, laws=spec.laws, resumable=False, max_iter=10, summary="counts its calls"
-    )
+    register(dataclasses.replace(registry.get("newton"), factory=Mine, max_iter=10))
     sim = lv.Simulation(lv.Scene("stack", n=2, solver="newton"))
-    registry.register(mine, replace=True)
-    try:
-        for _ in range(3):
-            sim.step()
-    finally:
-        registry.register(spec, replace=True)
+    for _ in range(3):
+        sim.step()
     assert asked == [24, 24, 24]
 
 

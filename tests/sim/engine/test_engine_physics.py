@@ -56,9 +56,11 @@ def test_restitution_gives_the_wanted_speed_and_slow_contacts_do_not_bounce(step
         assert v == pytest.approx(2.0 * expected, abs=1e-12)
 
 
+@pytest.mark.parametrize("stepper", ["impulses", "soft_step", "xpbd"])
 @pytest.mark.parametrize("kind", ["collisions", "joints"])
-def test_a_closed_system_keeps_its_momentum(kind):
-    scene = lv.Scene(gravity=0.0, friction=0.5, position_iterations=0)
+def test_a_closed_system_keeps_its_momentum(kind, stepper):
+    more = {"position_iterations": 0} if stepper == "impulses" else {}
+    scene = lv.Scene(gravity=0.0, friction=0.5, stepper=stepper, **more)
     rng = np.random.default_rng(4)
     if kind == "collisions":
         for i in range(6):
@@ -89,8 +91,12 @@ def test_a_closed_system_keeps_its_momentum(kind):
         contacts += int(last["solver"][2])
     after = momentum(last)
     assert contacts > 0 or kind != "collisions"
-    # Rounding of a few hundred additions near 10 kg m^2/s.
-    np.testing.assert_allclose(after, before, rtol=0, atol=1e-12)
+    # Of angular momentum the others lose what a joint that has opened, or a depth, is long.
+    kept = slice(6 if stepper == "impulses" else 3)
+    # Rounding of a few hundred additions near 10 kg m^2/s; xpbd takes velocities from places.
+    np.testing.assert_allclose(
+        after[kept], before[kept], rtol=0, atol=1e-12 if stepper == "impulses" else 1e-11
+    )
     np.testing.assert_allclose(np.linalg.norm(last["quaternions"], axis=1), 1.0, atol=1e-15)
 
 
@@ -181,7 +187,5 @@ def test_a_box_grips_more_on_the_diagonal(more):
 
 
 def test_what_no_scene_of_boxes_has_is_told():
-    with pytest.raises(lv.UnknownName, match="friction_shape"):
-        lv.Scene("stack", friction_shape="square")
     with pytest.raises(lv.InputError, match="no spin friction"):
         lv.Simulation(lv.Scene("spinner", friction_shape="box"))

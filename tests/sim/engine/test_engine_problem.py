@@ -11,7 +11,7 @@ from worked import after
 import lavender as lv
 from lavender.io.stored import framed, unframed
 from lavender.sim.engine import stepping
-from lavender.sim.engine.layout import HEAD, SETTING
+from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.snapshot import MAGIC
 from lavender.sim.scene.scene import SCENE_ORDERS
 from lavender.sim.scene.steppers import STEPPERS
@@ -172,33 +172,26 @@ def test_foreign_and_damaged_snapshots_are_refused(tmp_path):
     sim = lv.Simulation(lv.Scene("stack", n=3))
     path = tmp_path / "state"
     sim.save(path)
-    for other in (
-        lv.Scene("stack", n=4),
-        lv.Scene("stack", n=3, friction=0.3),
-        lv.Scene("stack", n=3, friction_shape="box"),
-        lv.Scene("stack", n=3, mass=2.0),
-        *(lv.Scene("stack", n=3, stepper=name) for name in list(STEPPERS)[1:]),
-    ):
+    others = [{"n": 4}, {"friction": 0.3}, {"friction_shape": "box"}, {"mass": 2.0}]
+    for other in (*others, *({"stepper": name} for name in list(STEPPERS)[1:])):
         with pytest.raises(lv.InputError, match="another scene"):
-            lv.Simulation(other).load(path)
-    data = bytearray(path.read_bytes())
-    for at in (5, len(data) // 2, len(data) - 1):
-        bad = data.copy()
-        bad[at] ^= 1
+            lv.Simulation(lv.Scene("stack", **{"n": 3, **other})).load(path)
+    data = path.read_bytes()
+    cut, *flipped = (
+        data[:-40],
+        *(data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :] for k in (5, len(data) // 2, -33)),
+    )
+    for bad in (cut, *flipped):
         path.write_bytes(bad)
         with pytest.raises(lv.InputError, match=r"not a lavender snapshot|damaged"):
             sim.load(path)
-    path.write_bytes(data[:-40])
-    with pytest.raises(lv.InputError, match="damaged"):
-        sim.load(path)
     # What is cut or lengthened inside a file whose checksum is right.
     header, end = unframed(data, MAGIC, 2**20)
-    said, arrays = header["lengths"], bytes(data[end:-32])
+    said, arrays = header["lengths"], data[end:-32]
     for lengths, rest in (
         (said, arrays[:-8]),
         (said, arrays + bytes(8)),
         ([*said[:3], said[3] - 1], arrays[:-8]),
-        ([*said[:3], said[3] + 1], arrays + bytes(8)),
         ([said[0] - 1, *said[1:]], arrays[4:]),
         ([*said[:3], -1], arrays),
         ([10**30, *said[1:]], arrays),
@@ -279,16 +272,6 @@ def test_any_registered_solver_steps_the_scene(name, rolling):
     assert np.abs(observation["velocities"]).max() < 1e-4
 
 
-def test_direct_steps_a_chain_like_many_sweeps():
-    exact = lv.Simulation(lv.Scene("chain", n=4, solver="direct", substeps=2, position_iterations=0))
-    sweeps = lv.Simulation(lv.Scene("chain", n=4, solver_iterations=64, position_iterations=0))
-    for _ in range(20):
-        a, b = exact.step()[0], sweeps.step()[0]
-    # 12 rows: 64 warm sweeps reach about 1e-6 of each step; twenty steps add up to well below a millimetre.
-    np.testing.assert_allclose(a["positions"], b["positions"], rtol=0, atol=1e-4)
-    assert exact.residual()["relative"] < 1e-9
-
-
 @pytest.mark.parametrize("policy", ["use", "keep", "damp", "raise"])
 def test_a_failed_solve_is_counted_and_dealt_with(policy):
     # One sweep of pgs cannot reach 1e-6 on six boxes.
@@ -340,31 +323,6 @@ def test_the_residual_of_all_rows_is_the_judges():
     assert share["joint"] == pytest.approx(energy[: len(problem.rows.jac)].sum() / energy.sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("name", "more"),
-    [
-        ("stack", {"friction": 0.0}),
-        ("pyramid", {"base": 3, "friction": 0.0}),
-        ("four_bar", {"motor": 1.0}),
-        ("chain", {}),
-        ("ramp", {}),
-        ("table", {}),
-    ],
-)
-def test_exported_problems_can_be_solved_to_the_floor(name, more):
-    problem = after(5, name, **more).constraint_problem()
-    if problem.law in ("linear", "lcp"):
-        solution = lv.solve(problem, "direct", tol=1e-10)
-        other = lv.solve(problem, "osqp", tol=1e-9)
-        # Both within 1e-9 of velocities near 0.1 m/s, times the conditioning of a few boxes.
-        np.testing.assert_allclose(
-            problem.velocity(other.impulse), problem.velocity(solution.impulse), rtol=0, atol=1e-7
-        )
-    else:
-        solution = lv.solve(problem, "sequential_impulses", tol=0, max_iter=8000)
-    assert solution.residual.relative <= max(1e-10, 2.0 * solution.residual.floor)
-
-
 def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     sim, twin = (lv.Simulation(lv.Scene("ramp")) for _ in range(2))
     paths = sim.record(tmp_path / "ramp", 3)
@@ -396,15 +354,6 @@ def test_recorded_problems_are_the_problems_of_the_steps(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(lv.InputError, match="is no folder"):
         sim.record(tmp_path / "file", 1)
-
-
-def test_setting_places_are_those_of_the_kernels():
-    sim = lv.Simulation(lv.Scene("stack", dt=0.02, substeps=2, gravity=3.0))
-    assert sim.state.setting[SETTING["h"]] == 0.01
-    sim.step()
-    # free fall of the top box over two substeps, had it nothing below: v = -g h at least once
-    assert sim.state.a["v_free"][:, 2].min() <= -0.03 + 1e-12
-    assert sim.state.head[HEAD["contacts"]] == 24 and sim.state.head[HEAD["step"]] == 2
 
 
 def test_the_motion_is_not_computed_for_those_who_do_not_ask(monkeypatch):

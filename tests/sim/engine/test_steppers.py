@@ -68,30 +68,7 @@ def test_boxes_stand_for_ten_seconds(name):
     np.testing.assert_allclose(seen["positions"][1:, 2], np.arange(scene.n_bodies - 1) + 0.5, atol=0.01)
 
 
-@pytest.mark.parametrize("name", ["impulses", "soft_step", "xpbd"])
-def test_bodies_that_meet_keep_their_momentum(name):
-    scene = lv.Scene(stepper=name, dt=1 / 240, gravity=0.0)
-    scene.add_box(mass=3.0, velocity=(1, 0, 0.1), angular_velocity=(0.2, 0, 0))
-    scene.add_sphere(0.4, 1.0, position=(1.2, 0.3, 0.1), velocity=(-2, 0, 0))
-    before = np.array([3 * 1 - 2, 0, 0.3])
-    sim, _ = run(scene, 120)
-    v = sim.step()[0]["velocities"][:, :3]
-    assert np.abs(v[1] - [-2, 0, 0]).max() > 0.1  # they met
-    np.testing.assert_allclose(3 * v[0] + v[1], before, atol=1e-12)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_ball_that_lands_at_any_speed_stays_on_the_ground(name):
-    for speed in np.linspace(0.0, 5.0, 11):
-        scene = lv.Scene(stepper=name, dt=1 / 240, friction=0.3)
-        scene.add_plane()
-        scene.add_sphere(0.167, position=(0, 0, 1.3), velocity=(0.7, 0, -speed))
-        sim = lv.Simulation(scene)
-        height = [sim.step()[0]["positions"][1][2] - 0.167 for _ in range(240)]
-        assert min(height) > -0.02, speed  # a step's way at 5 m/s; what is left of it goes slowly
-
-
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", NAMES)
 def test_thrown_bodies_gain_no_energy_and_fall_through_nothing(name, seed):
     rng = np.random.default_rng(seed)
@@ -321,15 +298,6 @@ def test_what_a_stepper_cannot_do_is_refused_before_the_first_step(name):
             lv.Scene("stack", stepper=name, stepper_options={option: -1})
     with pytest.raises(lv.UnknownName, match="nonsense"):
         lv.Scene("stack", stepper=name, stepper_options={"nonsense": 1})
-
-
-def test_names_are_checked_at_the_door():
-    with pytest.raises(lv.UnknownName, match="soft_step"):
-        lv.Scene("stack", stepper="softstep")
-    with pytest.raises(lv.InputError, match="mapping"):
-        lv.Scene("stack", stepper_options=3)
-    with pytest.raises(lv.InputError, match="position_iterations"):
-        lv.Scene("stack", stepper="soft_step", position_iterations=2)
 
 
 def test_a_stopped_prepare_leaves_no_softness_behind():
