@@ -78,9 +78,9 @@ def over_velocities(m, nv, seed=0):
     return lv.Problem.from_jacobian(rng.normal(size=(m, nv)), mass, rng.normal(size=nv), cones=cones)
 
 
-def impulses(problem, packs=True, **options):
-    """Sequential impulses of a problem, prepared, perhaps never in pairs."""
-    prepared = lv.prepare(problem, "sequential_impulses", **options)
+def impulses(problem, packs=True, name="sequential_impulses", **options):
+    """Sweeps of a problem, prepared, perhaps never in pairs."""
+    prepared = lv.prepare(problem, name, **options)
     if not packs:
         prepared.state.sweeps.alone()
     return prepared
@@ -109,10 +109,8 @@ def packed(problem, order, counts, start):
 
 def swept(problem, name, counts, *, packs=True, tol=0.0, **options):
     """Impulse and velocities after runs of those many iterations each, and how many pairs there were."""
-    prepared = lv.prepare(problem, name, **options)
+    prepared = impulses(problem, packs, name, **options)
     solver, state = prepared.solver, prepared.state
-    if not packs:
-        state.sweeps.alone()
     rng = np.random.default_rng(problem.m)
     lam = 0.05 * np.abs(rng.normal(size=problem.m))
     for n in counts:

@@ -24,9 +24,9 @@ for variable in ("COLUMNS", "LINES"):
     os.unsetenv(variable)
 
 # Timings say nothing on a shared machine, so no deadline, of an example or of drawing it; the same examples every run,
-# so a failure repeats. HYPOTHESIS_PROFILE=search draws new ones.
+# so a failure repeats: no more of them than meet every branch. HYPOTHESIS_PROFILE=search draws new ones, and many.
 timeless = hypothesis.settings(deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow])
-hypothesis.settings.register_profile("repeat", timeless, derandomize=True, print_blob=True)
+hypothesis.settings.register_profile("repeat", timeless, derandomize=True, print_blob=True, max_examples=40)
 hypothesis.settings.register_profile("search", timeless, max_examples=1000)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeat"))
 

@@ -1,8 +1,6 @@
 """What no solver can talk the judge into: claims need finite numbers, and the problem is out of its reach."""
 
-from dataclasses import fields, replace
-from fractions import Fraction
-from itertools import product
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -29,37 +27,27 @@ ANEW = {
 }  # fmt: skip
 
 
-def test_a_claim_of_floor_needs_finite_numbers(plug_in):
-    name = plug_in(lambda problem, impulse: says(lv.Status.FLOOR))
-    solution = lv.solve(
-        lv.Problem.linear(np.eye(2), [1.0, 1.0]), name, impulse=[1e300, 1e300]
-    )  # whose error is no number
-    assert solution.contradicted
-    with pytest.raises(lv.errors.SolveFailed):
-        solution.raise_for_status()
-
-
 @pytest.mark.parametrize("name", lv.available(external=False))
 def test_no_claim_is_contradicted_where_m_is_nearly_singular(name):
     """A formed of J and M has lost what J and M still tell: claims hold in the form that was given."""
     count, wrong = 0, []
-    for seed in range(80):
+    for seed in range(40):
         problem = nearly_singular(seed)
         if registry.get(name).refuses(problem):
             continue
-        for tol in (1e-6, 1e-10, 1e-14):
+        for tol in (1e-6, 1e-14):
             solution = lv.solve(problem, name, tol=tol)
             count += 1
             if solution.contradicted:
                 wrong.append((seed, tol, str(solution)))
     assert not wrong, wrong[:3]
-    assert count >= 30 or "matrix" not in registry.get(name).operators, "nearly all were refused"
+    assert count >= 15 or "matrix" not in registry.get(name).operators, "nearly all were refused"
 
 
 @pytest.mark.parametrize("name", lv.available(external=False, resumable=True))
 def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
     """From what it returned, with nothing remembered: what had only lost its way would end below half."""
-    for seed in range(260):
+    for seed in range(100):
         problem = nearly_singular(seed)
         if registry.get(name).refuses(problem):
             continue
@@ -71,43 +59,6 @@ def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
                 str(solution),
                 str(again),
             )
-
-
-def test_infeasible_and_a_success_exclude_each_other():
-    # No impulse meets the second row, and doing nothing is within a tolerance of 1 of it.
-    problem = lv.Problem.lcp([[1.0, 0.0], [0.0, 0.0]], [0.0, 1.0])
-    assert lv.solve(problem, "pgs").status is lv.Status.INFEASIBLE
-    assert not lv.solve(problem, "pgs").success
-    loose = lv.solve(problem, "pgs", tol=1.0)
-    assert loose.success
-    assert loose.status is lv.Status.CONVERGED
-    assert loose.certificate is None
-
-
-@pytest.mark.parametrize(
-    "error", [FloatingPointError("underflow"), np.linalg.LinAlgError("singular"), MemoryError()]
-)
-@pytest.mark.parametrize("where", ["prepare", "run"])
-def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
-    class Breaks:
-        def prepare(self, problem):
-            if where == "prepare":
-                raise error
-
-        def update(self, state, problem):
-            return self.prepare(problem)
-
-        def run(self, state, impulse, n, tol, time_limit=None):
-            impulse[0] = np.nan
-            raise error
-
-    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
-    solver = lv.prepare(random_lcp(4), "breaks")
-    for _ in range(2):
-        solution = solver.solve()
-        assert solution.status is lv.Status.NUMERICAL_ERROR
-        assert type(error).__name__ in solution.message
-        assert np.isfinite(solution.impulse).all()
 
 
 def test_a_solver_that_does_nothing_is_stopped(plug_in):
@@ -139,33 +90,6 @@ def test_every_array_of_a_problem_is_read_only(form):
         data = matrix.data if sp.issparse(matrix) else matrix
         with pytest.raises(ValueError, match="read-only"):
             data[...] = 0.0
-
-
-@pytest.mark.parametrize("form", GIVEN)
-def test_a_matrix_exchanged_by_a_solver_changes_no_verdict(form, plug_in):
-    """The arrays of a sparse matrix cannot be written, but exchanged: the judge does not look there."""
-    honest = given_by(form)
-    before = lv.solve(honest, "block_gauss_seidel", tol=1e-9)
-
-    def run(problem, impulse):
-        problem.csr.data = np.zeros_like(problem.csr.data)
-        y = np.zeros(problem.m)
-        y[int(problem.cones.ptr[problem.n_blocks - 1])] = 1.0
-        impulse[:] = before.impulse
-        return says(lv.Status.INFEASIBLE, certificate=y)
-
-    solution = lv.solve(given_by(form), plug_in(run), tol=1e-300)
-    assert "INFEASIBLE" in solution.contradicted
-    assert solution.residual.relative == before.residual.relative
-
-
-def test_the_error_of_doing_nothing_cannot_be_raised(plug_in):
-    def run(problem, impulse):
-        problem.data.set_start(1e300, 1e300)
-        return says(lv.Status.CONVERGED)
-
-    with pytest.raises(ValueError, match="known already"):
-        lv.solve(random_lcp(8), plug_in(run))
 
 
 def test_a_verdict_on_another_problem_is_not_taken(plug_in):
@@ -288,24 +212,6 @@ def test_what_is_no_claim_is_a_numerical_error_that_names_the_solver(plug_in, cl
     assert lv.solve_many([problem], name)[0].status is lv.Status.NUMERICAL_ERROR
 
 
-@pytest.mark.parametrize("field", [f.name for f in fields(lv.Claim)])
-def test_no_word_of_a_claim_changes_the_verdict_on_its_impulse(plug_in, field):
-    problem, wild = (
-        random_lcp(12),
-        (None, "a", -1, 1.5, 10**30, True, [], {}, {"sweeps": np.inf}, [1.0, 2.0], [[1], 2]),
-    )
-    answer = lv.solve(problem, "pgs", tol=1e-9)
-    for value, resumable in product(wild, (False, True)):
-
-        def run(problem, impulse, value=value):
-            impulse[:] = answer.impulse
-            return lv.Claim(**{"status": lv.Status.CONVERGED, "iterations": 1} | {field: value})
-
-        solution = lv.solve(problem, plug_in(run, resumable=resumable))
-        assert isinstance(solution.status, lv.Status) and isinstance(solution.message, str) and str(solution)
-        assert solution.success and solution.residual.relative == answer.residual.relative
-
-
 @pytest.mark.parametrize("resumable", [False, True])
 @pytest.mark.parametrize("way", ["kept", "nan", "shape", "dtype", "best"])
 def test_what_a_plug_in_does_to_its_impulse_reaches_no_earlier_solution(register, way, resumable):
@@ -362,15 +268,6 @@ def test_the_short_way_of_few_rows_is_for_solvers_of_this_package_alone(register
 HIDDEN = lv.Problem.lcp([[1.0, -3.0], [-3.0, 9.0]], [1.0, 0.0], [-2.0, -np.inf])  # b is not in A's range
 
 
-def test_a_slack_that_rounding_hides_is_no_solution():
-    runaway = np.array([7881299347898371.0, 2627099782632790.0])
-    A, b = HIDDEN.dense(), HIDDEN.b
-    exact = [sum(Fraction(a) * Fraction(x) for a, x in zip(A[i], runaway, strict=True)) for i in range(2)]
-    assert exact[1] - Fraction(b[1]) == -3  # m/s, as much as doing nothing leaves of energy
-    found = lv.residual(HIDDEN, runaway)
-    assert found.slack[1] == 0.0 and found.relative == found.floor > 1.0
-
-
 def along(ray, b, mu):
     """Two contacts along one ray, which no impulse meets both: larger ones only cost more digits."""
     return lv.Problem.contact(np.outer(ray, ray), b, mu)
@@ -404,22 +301,6 @@ def test_nobody_solves_what_has_no_solution_by_running_away(name, problem):
         if name == "auto":
             assert solution.status is lv.Status.INFEASIBLE
             assert solution.iterations <= budget.get("max_iter", np.inf)
-
-
-@pytest.mark.parametrize("tangents", [1, 2])
-def test_a_certificate_of_normals_is_found_where_there_is_one_and_nowhere_else(tangents):
-    """Two contacts push against each other, or let go of each other."""
-    rng = np.random.default_rng(tangents)
-    jac = rng.normal(size=(2 * (1 + tangents), 3))
-    jac[1 + tangents] = -2.0 * jac[0]  # the second normal, against the first
-    b = 0.1 * rng.normal(size=len(jac))
-    for push, solved in ((-1.0, True), (1.0, False)):
-        b[0], b[1 + tangents] = push, push
-        problem = lv.Problem.contact(jac @ jac.T, b, [0.05, 0.02])
-        solution = lv.solve(problem)
-        assert not solution.contradicted
-        assert solution.success is solved
-        assert (solution.status is lv.Status.INFEASIBLE) is not solved, solution
 
 
 def test_every_test_of_the_floor_has_one_limit():

@@ -64,16 +64,6 @@ def test_what_makes_no_cone_is_refused_with_its_reason(name):
         make()
 
 
-def test_sizes_and_kinds():
-    free, boxed = lv.Cones.free(3), lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
-    contacts = lv.Cones.contacts(np.array([0.5, 0.2]), patch_radius=np.array([0.1, 0.0]))
-    assert (free.n_rows, free.n_blocks, free.is_free, free.is_bounded_rows) == (3, 3, True, True)
-    assert (boxed.is_free, boxed.is_bounded_rows) == (False, True)
-    assert (contacts.n_rows, contacts.n_blocks, contacts.is_bounded_rows) == (8, 2, False)
-    assert contacts.n_tangents.tolist() == [2, 2]
-    assert lv.Cones.contacts(np.array([0.0]), tangents=0).is_bounded_rows
-
-
 def test_bounds_of_contact_rows_are_spelled_in_one_way():
     # They are never read: cones that differ there alone are equal.
     one = lv.Cones([0, 3], [1], [0.0, -1.0, -1.0], [9.0, 1.0, 1.0], [0.5], [0.0])
@@ -149,23 +139,3 @@ def test_quick_ways_make_what_the_long_way_makes(first, second):
         assert cones.has_round == bool(np.any(kind == 3))
         for name in FIELDS:
             assert not getattr(cones, name).flags.writeable
-
-
-def test_arrays_that_are_given_stay_the_givers_own():
-    lower, upper = np.zeros(2), np.ones(2)
-    ptr, kind, zero = np.arange(3, dtype=np.int32), np.zeros(2, np.int32), np.zeros(2)
-    for cones in (lv.Cones.bounded(lower, upper), lv.Cones(ptr, kind, lower, upper, zero, zero)):
-        lower[0] = upper[0] = 5.0
-        assert cones.lower[0] == 0.0
-        assert cones.upper[0] == 1.0
-        lower[0], upper[0] = 0.0, 1.0
-        assert lower.flags.writeable
-        assert ptr.flags.writeable
-
-
-@pytest.mark.parametrize("count", [-1, 2**31 - 1, 2**40])
-def test_counts_beyond_32_bits_are_refused(count):
-    with pytest.raises(lv.InputError, match=str(count)):
-        lv.Cones.free(count)
-    with pytest.raises(lv.InputError, match=str(count)):
-        lv.Cones.contacts(0.5, count=count)

@@ -125,7 +125,7 @@ def fits(numbers, sizes):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("kind", KINDS)
 @given(seed=seeds, exponent=exponents | near)
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_a_problem_in_any_units_is_refused_by_name_or_judged_alike(kind, form, seed, exponent):
     problem, turns = drawn(kind, form, seed)
     lam = np.random.default_rng(seed).normal(size=problem.m)

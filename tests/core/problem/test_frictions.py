@@ -30,22 +30,3 @@ def test_one_mu_for_each_contact_and_a_scalar_for_all():
     )
     assert lv.Problem.contact(np.eye(8), np.ones(8), mu=0.5, patch_radius=0.1).n_blocks == 2
     assert lv.Problem.contact(np.eye(2), np.ones(2), mu=0.5).n_blocks == 1
-
-
-@pytest.mark.parametrize(
-    ("tensor", "sign"),
-    [
-        (np.diag([1.0, 1.0, -1.0]), "not positive semidefinite"),
-        (np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not positive semidefinite"),
-        (np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), "not symmetric"),
-    ],
-)
-def test_an_inertia_that_no_body_has_is_refused(tensor, sign):
-    with pytest.raises(lv.InputError, match=rf"inv_inertia\[1\] is {sign}"):
-        touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), tensor]), **TWO)
-    with pytest.raises(lv.InputError, match="both are static"):
-        touching([[-1, 0], [-1, -1]], **TWO)
-    for fine in (np.zeros((3, 3)), np.diag([1.0, 0.0, 0.0]), 1e-60 * np.eye(3), 1e60 * np.eye(3)):
-        touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), fine]), **TWO)
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    touching([[-1, 0]], inv_inertia=np.stack([np.eye(3), turn @ np.diag([1.0, 1e-12, 1e3]) @ turn.T]), **TWO)

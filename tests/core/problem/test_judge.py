@@ -15,7 +15,7 @@ from random_trees import random_general
 import lavender as lv
 from lavender.judge import residuals
 from lavender.judge.certificates import check_certificate
-from lavender.judge.measures import natural_map, qp_residual
+from lavender.judge.measures import natural_map, qp_residual, siconos_error
 from lavender.judge.residuals import judged, known, remember
 
 # -- the twin --------------------------------------------------------------------------------------
@@ -45,7 +45,7 @@ def equals_the_twin(problem, lam):
 
 @pytest.mark.parametrize("friction", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", CONTACTS)
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(seed=seeds)
 def test_the_judge_equals_its_twin_in_every_form(kind, friction, seed):
     base = CONTACTS[kind](seed, friction)
@@ -83,58 +83,7 @@ def test_every_form_has_one_matrix_one_slack_and_one_velocity(seed, kind):
             np.testing.assert_allclose(p.velocity(lam).ravel(), free + minv @ jac.T @ lam, atol=10 * atol)
 
 
-# -- zero at solutions made by hand ------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("friction", ["coulomb", "cone"])
-@pytest.mark.parametrize("spin", [False, True])
-def test_zero_at_a_solution_made_by_hand(friction, spin):
-    """Choose lambda and a matching slack for open, sticking and sliding contacts; b follows."""
-    rng = np.random.default_rng(5)
-    size = 3 + spin
-    mu, r = np.array([0.5, 0.5, 0.8]), np.array([0.3, 0.3, 0.2])
-    m = 3 * size
-    g = rng.normal(size=(m, m))
-    a = g @ g.T
-    lam, w = np.zeros((3, size)), np.zeros((3, size))
-    w[0, 0] = 0.7  # open: lambda = 0, separating
-    if friction == "cone":
-        w[0, 0] = 10.0  # deep inside the dual cone, so that tangential velocity asks nothing
-    w[0, 1:3] = 0.1, -0.2
-    lam[1, 0], lam[1, 1:3] = 2.0, (0.3, 0.1)  # sticking, inside the disk
-    lam[2, 0] = 1.5  # sliding: tangent impulse opposite to slip, on the disk
-    slip = np.array([0.6, -0.8])
-    lam[2, 1:3] = -mu[2] * 1.5 * slip
-    w[2, 1:3] = 0.9 * slip
-    if friction == "cone":
-        w[2, 0] = mu[2] * 0.9  # the relaxation lifts a slider by mu |slip|
-    if spin:
-        lam[1, 3] = 0.01
-        lam[2, 3], w[2, 3] = mu[2] * r[2] * 1.5, -0.4
-        if friction == "cone":
-            w[2, 0] += mu[2] * r[2] * 0.4
-    b = a @ lam.ravel() - w.ravel()
-    problem = lv.Problem.contact(a, b, mu, patch_radius=r if spin else None, friction=friction)
-    judged = lv.residual(problem, lam.ravel())
-    # b is rounded once when it is formed, w once more: the floor says what that costs.
-    assert judged.relative <= 4 * judged.floor
-
-
 # -- invariance ----------------------------------------------------------------------------------------
-
-
-def test_mass_ratio_hides_neither_the_light_nor_the_heavy_body():
-    """Two resting bodies, 1 kg and 1e6 kg; one of them ignored: its error is as large as doing nothing."""
-    a, b = np.diag([1.0, 1e-6]), np.array([0.1, 0.1])
-    problem = lv.Problem.lcp(a, b)
-    exact = np.array([0.1, 1e5])
-    assert lv.residual(problem, exact).relative <= lv.residual(problem, exact).floor
-    light_wrong, heavy_wrong = exact * [0.0, 1.0], exact * [1.0, 0.0]
-    light, heavy = lv.residual(problem, light_wrong), lv.residual(problem, heavy_wrong)
-    assert light.relative == pytest.approx(1.0)  # V sees it, E alone would say 1e-3
-    assert light.energy / light.energy_start < 2e-3
-    assert heavy.relative == pytest.approx(1.0)
-    assert (light.worst_row, heavy.worst_row) == (0, 1)
 
 
 # -- diagonals, b = 0, floor ---------------------------------------------------------------------------
@@ -222,6 +171,14 @@ def test_qp_residual_checks_the_sign_of_multipliers():
     assert qp_residual(problem, [0.0], [0.0]).worst == 0.0
 
 
+def test_siconos_error_is_zero_at_the_solution_alone():
+    base = random_contact_problem(31, spin=False, rolling=True, joints=0)
+    problem = as_matrix(dataclasses.replace(base, compliance=base.compliance + 0.3))
+    found = lv.solve(problem, "newton", tol=1e-12)
+    assert siconos_error(problem, found.impulse)["relative"] < 1e-10
+    assert siconos_error(problem, found.impulse + 0.01)["relative"] > 1e-3
+
+
 @given(seed=seeds)
 def test_natural_map_is_the_plain_formula(seed):
     problem = random_lcp(seed)
@@ -234,7 +191,7 @@ def test_natural_map_is_the_plain_formula(seed):
 @pytest.mark.parametrize("law", ["coulomb", "cone"])
 @pytest.mark.parametrize("kind", ["bounded rows", "normals", *CONTACTS])
 @given(seed=seeds)
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_certificates_are_what_the_twin_says_they_are(kind, law, seed):
     """A y = 0, or not; y a tenth off the border of its cone to either side, or along normals alone."""
     rng = np.random.default_rng(seed)
@@ -278,30 +235,6 @@ def test_a_sum_that_rounds_to_zero_proves_nothing():
         cones, target = lv.Cones.bounded([0.0, 0.0], [np.inf, np.inf]), [1.0, -1.0 + 1e-10]
         opposed = lv.Problem.from_jacobian(jac, [[1.0]], [0.0], target=target, cones=cones)
         assert (check_certificate(opposed, [1.0, 1.0]) is None) is proves
-
-
-def test_certificates_hold_for_any_matrix_and_every_law():
-    # A^T y = 0 and y.w >= 0 on every row: nothing about symmetry, definiteness or friction is needed.
-    a = np.array([[0.0, 0.0, 0.0], [3.0, 1.0, -2.0], [1.0, 4.0, 1.0]])
-    b, y = [1.0, 2.0, -1.0], [1.0, 0.0, 0.0]
-    assert check_certificate(lv.Problem.lcp(a, b, [0.0, -1.0, -2.0], [np.inf, 1.0, 5.0]), y) is None
-    assert check_certificate(lv.Problem.contact(a, b, [0.5]), y) is None
-    assert check_certificate(lv.Problem.contact(a, b, [0.5], friction="cone"), y) is None
-    # z = A^T y may pull towards finite bounds, or into the polar cone: then what they give counts.
-    box = [np.array([[-1.0, 1.0], [0.0, 1.0]]), [2.0, 1.0], 0.0]
-    assert check_certificate(lv.Problem.lcp(*box, [np.inf, 1.5]), [1.0, 0.0]) is None
-    assert "can meet" in check_certificate(lv.Problem.lcp(*box, [np.inf, 2.5]), [1.0, 0.0])
-    slope = np.array([[-1.0, 0.6], [0.0, 1.0]])
-    assert check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [1.5]), [1.0, 0.0]) is None
-    assert "can meet" in check_certificate(lv.Problem.contact(slope, [1.0, 0.0], [2.0]), [1.0, 0.0])
-
-
-def test_a_nearly_singular_matrix_gives_no_certificate():
-    # lambda = (-99, 100) solves it; A y is small beside |A| |y|, but no smaller than what b asks of it.
-    h = 1e-11
-    problem = lv.Problem.linear([[1.0, 1.0], [1.0, 1.0 + h]], [1.0, 1.0 + 100.0 * h])
-    assert lv.residual(problem, [-99.0, 100.0]).relative < 1e-6
-    assert check_certificate(problem, [-1.0, 1.0]) is not None
 
 
 def test_bounds_that_are_huge_beside_the_step_are_seen():

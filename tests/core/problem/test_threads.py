@@ -1,7 +1,6 @@
 """Threads: a problem is shared freely, a prepared solver serves one of them at a time and says so."""
 
 import os
-import re
 import sys
 import sysconfig
 import threading
@@ -39,20 +38,6 @@ def test_a_prepared_solver_refuses_a_second_thread():
             leave.set()
         assert first.result().status is lv.Status.INTERRUPTED
     assert solver.solve(tol=1e-6, max_iter=10_000).success  # free again
-
-
-def test_a_prepared_solver_refuses_its_own_callback():
-    solver = lv.prepare(random_lcp(2), "pgs")
-    with pytest.raises(InUse):
-        solver.solve(callback=lambda *_: solver.solve())
-    assert solver.solve(max_iter=10_000).success
-
-
-def test_an_error_leaves_a_prepared_solver_free():
-    solver = lv.prepare(random_lcp(3), "pgs")
-    with pytest.raises(lv.InputError):
-        solver.solve(tol=-1.0)
-    assert solver.solve(max_iter=10_000).success
 
 
 def at_once(function, n=8):
@@ -125,15 +110,6 @@ def test_threads_read_worlds_whose_turn_came_too_late(often):
     assert all(status is lv.Status.TIME_LIMIT for status in late.status)
     for found in at_once(lambda: late.relative.copy()):
         assert found.tobytes() == alone.tobytes()
-
-
-def test_no_object_has_a_property_of_functools():
-    imported = re.compile(r"functools import (\([^)]*|.*)\bcached_property|functools\.cached_property")
-    files = set(Path(lv.__file__).parent.rglob("*.py"))
-    files -= {
-        path for path in files if path.name == "cut.py"
-    }  # run without the package; no user holds its objects
-    assert [path.name for path in files if imported.search(path.read_text(encoding="utf-8"))] == []
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="forks are of POSIX")

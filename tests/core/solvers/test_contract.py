@@ -10,7 +10,7 @@ import pytest
 from enumeration import enumerate_lcp, random_bounds
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, random_lcp, seeds, touching
+from random_problems import CONTACTS, FORMS, as_matrix, random_contact_problem, seeds, touching
 from random_trees import random_general
 
 import lavender as lv
@@ -20,7 +20,6 @@ from lavender.judge.certificates import check_certificate
 from lavender.problem import LAWS, operators
 from lavender.solvers import steps
 
-NAMES = sorted(registry.specs())
 HERE = [
     pytest.param(name, marks=pytest.mark.slow) if registry.specs()[name].external else name
     for name in lv.available()
@@ -89,33 +88,6 @@ TRUSTED = {"osqp", "clarabel", "piqp", "daqp", "clarabel_cone"}
 
 def budget(spec):
     return max(spec.max_iter, 20_000) if spec.resumable else None
-
-
-@pytest.mark.parametrize(
-    "name", [n for n, spec in registry.specs().items() if spec.own and not spec.missing()]
-)
-def test_a_solver_has_no_methods_but_those_of_the_contract(name):
-    """What hosts ask of solvers stands in one place, typed: no name is looked for on an object."""
-    made = registry.get(name).load()()
-    asked = {n for n in dir(made) if not n.startswith("_") and callable(getattr(made, n))}
-    assert isinstance(made, registry.Solver) and asked <= set(dir(registry.Solver))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_spec_says_what_it_is(name):
-    spec = registry.specs()[name]
-    assert spec.name == name
-    assert spec.summary
-    assert spec.max_iter > 0
-    reason = spec.missing()
-    if reason is not None:
-        assert "pip install" in reason
-        with pytest.raises(lv.SolverUnavailable, match="pip install"):
-            registry.get(name)
-
-
-def test_only_auto_may_delegate():
-    assert [n for n in NAMES if registry.specs()[n].delegates] in ([], ["auto"])
 
 
 @pytest.mark.parametrize("name", HERE)
@@ -232,17 +204,9 @@ def test_where_it_stalls_depends_on_no_cut(name):
     assert (done, status, parts.tobytes()) == (one.iterations, one.status, whole.tobytes())
 
 
-@pytest.mark.parametrize("name", RESUMABLE)
-def test_tol_zero_is_an_exact_budget(name):
-    for problem in examples(registry.get(name)):
-        solution = lv.solve(problem, name, tol=0.0, max_iter=5)
-        assert (solution.status, solution.iterations) == (lv.Status.MAX_ITERATIONS, 5)
-        assert sum(solution.work.values()) >= 5
-
-
 @pytest.mark.parametrize("name", OURS)
 def test_a_budget_is_kept_and_never_leaves_more_than_the_start(name):
-    """Of none the start comes back; few iterations are no more than that, whatever one of them is."""
+    """Of none the start comes back; few iterations are no more than that; without a tolerance all are spent."""
     for problem in examples(registry.get(name)):
         none = lv.solve(problem, name, tol=1e-12, max_iter=0)
         assert (none.status, none.iterations) == (lv.Status.MAX_ITERATIONS, 0)
@@ -252,6 +216,10 @@ def test_a_budget_is_kept_and_never_leaves_more_than_the_start(name):
             assert few.iterations <= n and not few.contradicted
             # Jacobi, mixing and proximal steps may leave the best of their sweeps for a while.
             assert few.residual.relative <= 1.0 or registry.get(name).resumable
+        if registry.get(name).resumable:
+            exact = lv.solve(problem, name, tol=0.0, max_iter=5)
+            assert (exact.status, exact.iterations) == (lv.Status.MAX_ITERATIONS, 5)
+            assert sum(exact.work.values()) >= 5
 
 
 @pytest.mark.parametrize("name", OURS)
@@ -323,17 +291,6 @@ def test_a_normal_that_moves_nothing_bears_friction_of_the_relaxed_law(name, for
     assert kept.impulse.tolist() == impulse.tolist()
     cold = lv.solve(problem, name, tol=1e-9)
     assert cold.success, cold
-
-
-@pytest.mark.parametrize("name", lv.available(impulse=True, resumable=True))
-def test_a_warm_start_is_used_and_not_modified(name):
-    for problem in examples(registry.get(name)):
-        near = lv.solve(problem, name, tol=1e-4, max_iter=20_000).impulse
-        kept = near.copy()
-        cold = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
-        warm = lv.solve(problem, name, tol=1e-6, max_iter=20_000, impulse=near)
-        assert warm.iterations <= cold.iterations
-        np.testing.assert_array_equal(near, kept)
 
 
 @pytest.mark.parametrize("name", lv.available(order=True))
@@ -439,7 +396,7 @@ def test_legal_oddities_are_solved_or_refused_by_reason(name):
 @pytest.mark.parametrize("name", ["auto", "direct", "lemke", "newton"])
 @pytest.mark.parametrize("kind", ["definite", "semidefinite", "asymmetric"])
 @given(seed=seeds, m=st.integers(1, 7), whole=st.booleans())
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m, whole):
     """`whole`: small whole numbers, so that w = 0 and lambda = 0 at once. A semidefinite A leaves w alone unique."""
     rng = np.random.default_rng(seed)
@@ -466,18 +423,9 @@ def test_small_bounded_rows_have_the_solution_of_enumeration(name, kind, seed, m
             np.testing.assert_allclose(solution.impulse, x, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["auto", "direct", "lemke", "newton"])
-@given(seed=seeds, rank=st.integers(2, 12))
-@settings(max_examples=30)
-def test_bounded_rows_of_any_rank_are_solved(name, seed, rank):
-    solution = lv.solve(random_lcp(seed, m=12, rank=rank), name, tol=1e-9)
-    assert solution.status in (lv.Status.CONVERGED, lv.Status.FLOOR), solution
-    assert not solution.contradicted
-
-
 @pytest.mark.parametrize("name", OURS)
 @given(seed=seeds, m=st.integers(1, 6))
-@settings(max_examples=60)
+@settings(max_examples=30)
 def test_any_matrix_a_claim_is_a_solution(name, seed, m):
     """No claim that the judge contradicts, and no proof that there is none where enumeration finds a solution."""
     rng = np.random.default_rng(seed)

@@ -17,9 +17,8 @@ from lavender.judge import residuals
 from lavender.judge.residuals import judging_time
 from lavender.solvers import factors
 from lavender.solvers.auto import Auto
-from lavender.solvers.newton_systems import general
 from lavender.solvers.setup_times import forming
-from lavender.solvers.small import AUTO, DIRECT, NEWTON
+from lavender.solvers.small import AUTO
 
 
 def test_set_up_is_inside(clock, monkeypatch):
@@ -67,16 +66,6 @@ def test_nothing_runs_after_a_set_up_that_took_the_whole_limit(name, clock, monk
     assert worse.residual.relative == nothing  # who brings a start has it weighed
 
 
-def test_a_set_up_that_was_late_is_done_by_the_next_call():
-    problem, other = dense(200, "lcp"), dense(200, "lcp", 1)
-    lv.residual(problem, problem.start())
-    prepared = lv.prepare(problem, "newton")
-    for asked in (other, problem, None):
-        late = prepared.solve(asked, time_limit=1e-6)
-        assert late.status is lv.Status.TIME_LIMIT
-        assert prepared.solve(asked).success
-
-
 @pytest.mark.parametrize("name", ["auto", "newton", "pgs"])
 def test_where_the_judge_would_be_late_the_start_goes_back_unjudged(name, clock):
     """What he reads of a large A takes longer than a short limit: he is asked when somebody looks."""
@@ -112,23 +101,6 @@ def test_the_analysis_of_what_fills_in_ends_in_time(name, clock, monkeypatch):
     assert 3e-3 < clock.now < 0.3 and done[0] > 40_000
 
 
-def test_a_of_j_and_m_is_counted_by_its_products():
-    """Of a sparse J they are few; by rows that share a tree, all of them, forming A was counted 30 times too dear."""
-    rng = np.random.default_rng(0)
-    jac = np.zeros((900, 300))
-    jac[np.arange(900)[:, None], rng.integers(0, 300, (900, 3))] = 1.0
-    mass = np.eye(300) + 1e-3 * (np.eye(300, k=1) + np.eye(300, k=-1))  # one tree
-    cones = lv.Cones.contacts(np.full(300, 0.5), 2)
-    sparse = lv.Problem.from_jacobian(jac, mass, np.ones(300), cones=cones)
-    full = over_velocities(900, 300)
-    for problem in (sparse, full):
-        whole = problem.metric.whitened()
-        columns = np.bincount(whole[1], minlength=300)
-        assert problem.metric.products_of_a >= np.sum(columns.astype(float) ** 2)
-    assert full.metric.products_of_a == 300 * 900**2
-    assert forming(sparse) < forming(full)
-
-
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
 def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeypatch):
@@ -156,31 +128,6 @@ def test_a_limit_that_does_not_bind_takes_the_same_small_call(form, law, monkeyp
     assert any(ended) and not all(ended)
 
 
-def test_steps_that_factor_nothing_are_cheap():
-    """Each was counted as one that does: bounded rows over J and M were ended at a third of their limit."""
-    rng = np.random.default_rng(0)
-    for _ in range(5):
-        low = rng.uniform(-2.0, 0.0, 48)
-        cones = lv.Cones.bounded(low, low + rng.uniform(0.0, 3.0, 48))
-        jac, free = rng.normal(size=(48, 30)), rng.normal(size=30)
-        problem = lv.Problem.from_jacobian(jac, np.diag(rng.uniform(0.1, 10.0, 30)), free, cones=cones)
-        steps, factored, _, _ = AUTO.attempt(problem, None, 1e-6)[1]
-        of_step = AUTO.limits.cost(problem.metric, general.prepare(problem).work, 1)[1]
-        most = 1.25 * factored * of_step
-        assert most < 0.8 * steps * of_step
-        assert AUTO.attempt(fresh(problem), None, 1e-6, most)[0].relative <= 1e-6
-
-
-@pytest.mark.parametrize("small", [AUTO, DIRECT, NEWTON], ids=lambda small: small.name)
-def test_more_counted_cost_of_a_small_call_ends_more_problems(small):
-    ends = []
-    for most in (1e2, 1e4, 1e6, 1e9):
-        found = [small.attempt(dense(48, "lcp", seed), None, 1e-9, most)[0] for seed in range(10)]
-        ends.append(sum(x is not None and x.relative <= 1e-9 for x in found))
-    assert ends == sorted(ends)
-    assert ends[-1] == 10 or (small.limits is not None and not small.pivots)
-
-
 def test_the_limit_of_many_is_of_the_whole_call(clock, monkeypatch):
     problems = [dense(100, "lcp", seed) for seed in range(6)]
     run = Auto.run
@@ -202,9 +149,9 @@ def test_the_limit_of_many_is_of_the_whole_call(clock, monkeypatch):
 def test_a_limit_of_many_that_does_not_bind_costs_none_of_them(form, threads, clock):
     """The judge's time was kept free for each: of 1,000 problems under 0.1 s nothing was solved."""
     drawn = (FORMS[form](random_contact_problem(seed, "cone", 2, False)) for seed in range(20))
-    small = [fresh(p) for p in drawn if p.m <= registry.SMALL_ROWS for _ in range(50)]
+    small = [fresh(p) for p in drawn if p.m <= registry.SMALL_ROWS for _ in range(10)]
     without = lv.solve_many(small, threads=threads)
-    within = lv.solve_many([fresh(p) for p in small], time_limit=0.3, threads=threads)
+    within = lv.solve_many([fresh(p) for p in small], time_limit=0.06, threads=threads)
     assert all(a.impulse.tobytes() == b.impulse.tobytes() for a, b in zip(without, within, strict=True))
     assert [a.status for a in within] == [b.status for b in without]
 
@@ -246,15 +193,6 @@ def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
         )
     with pytest.raises(lv.CapabilityError):
         lv.solve_many([problems[0], dense(30, "cone")], "direct", time_limit=0.5)
-
-
-@pytest.mark.parametrize("name", ["auto", "newton", "pgs", "admm"])
-def test_a_world_of_j_and_m_whose_turn_comes_too_late_says_so(name):
-    """Its numbers are the compiled loop's; a solver without a compiled call of its own had no words for them."""
-    worlds = [over_velocities(6, 4, seed) for seed in range(3)]
-    for late in lv.solve_many(worlds, name, time_limit=1e-9):
-        assert (late.status, late.iterations, dict(late.work)) == (lv.Status.TIME_LIMIT, 0, {})
-        assert "time limit" in late.message and not late.impulse.any() and str(late)
 
 
 def test_the_first_solve_imports_nothing():

@@ -1,4 +1,4 @@
-"""De Saxce's interior point and the augmented system: against dense algebra, and on scenes at rest and sliding."""
+"""De Saxce's interior point and the augmented system: against dense algebra."""
 
 import dataclasses
 from unittest import mock
@@ -57,7 +57,7 @@ def test_slip_is_de_saxces_term_and_psi_its_derivative(seed):
 @pytest.mark.parametrize("compliant", [True, False])
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse", "augmented"])
 @given(seed=seeds)
-@settings(max_examples=15)
+@settings(max_examples=8)
 def test_the_system_of_a_step_is_solved(form, compliant, seed):
     problem = problem_of(seed, compliant)
     with mock.patch.multiple(systems, DENSE_ROWS=0 if form == "sparse" else 150, DENSE_FILL=2.0):

@@ -15,7 +15,6 @@ from lavender.judge.residuals import judging_time
 from lavender.solvers import pivoting
 from lavender.solvers.direct import Direct
 from lavender.solvers.pivoting import DenseFactor, PivotState
-from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.pivot import direct, principal
 from lavender_ext.pivot.principal import SMALL
 
@@ -77,12 +76,6 @@ def test_every_factorisation_reaches_rounding(case):
     assert solution.work["factorisations"] >= 1
 
 
-@pytest.mark.parametrize("a", [tridiagonal(400), sp.csr_array(tridiagonal(400) @ tridiagonal(400))])
-def test_bounded_rows_of_a_strip_are_a_band_whatever_they_are_called(a):
-    problem = lv.Problem.lcp(shuffled(np.random.default_rng(2), a), np.ones(400))
-    assert lv.solve(problem, "direct").solver.form == "band"
-
-
 @example(seed=0, m=6, band=0, bound=63)  # at a bound every row: its zeros would be pivots at rounding
 @example(seed=0, m=6, band=1, bound=63)
 @given(seed=seeds, m=st.integers(1, 9), band=st.integers(0, 3), bound=st.integers(0, 511))
@@ -103,23 +96,6 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
         expected[free] = np.linalg.solve(a[np.ix_(free, free)], problem.b[free])
         # Condition of 1 + L L^T with |L| of a few: far below 1e4.
         np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
-
-
-@pytest.mark.parametrize("m", [90, 300])
-@pytest.mark.parametrize("shape", ["dense", "sparse"])
-def test_larger_semidefinite_problems_need_descent(m, shape):
-    rng = np.random.default_rng(m)
-    if shape == "dense":
-        g = rng.normal(size=(m, m // 2))
-    else:
-        g = np.where(rng.random((m, m // 2)) < 3.0 / m, rng.random((m, m // 2)), 0.0)
-    a = sp.csr_array(g @ g.T)
-    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
-    problem = lv.Problem.lcp(a, b)
-    solution = lv.solve(problem, "direct", tol=1e-9)
-    assert solution.success, solution
-    assert "singular" in solution.message
-    assert solution.work["shifts"] >= 1
 
 
 def test_a_stack_takes_one_factorisation():
@@ -158,7 +134,7 @@ def test_singular_linear_systems_say_their_rank(m):
     ("kind", "solver"), [("symmetric", "direct"), ("symmetric", "newton"), ("asymmetric", "direct")]
 )
 @given(seed=seeds, m=st.integers(2, 12))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, solver, seed, m):
     rng = np.random.default_rng(seed)
     g = rng.normal(size=(m, m - 1))
@@ -173,7 +149,7 @@ def test_inconsistent_linear_systems_are_infeasible_with_a_certificate(kind, sol
 
 @pytest.mark.parametrize("solver", ["direct", "lemke", "newton", "auto"])
 @given(seed=seeds, m=st.integers(2, 14))
-@settings(max_examples=40)
+@settings(max_examples=15)
 def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
     problem = without_solution(seed, m)
     left = np.abs(np.linalg.svd(problem.dense())[0][:, -1])
@@ -182,14 +158,6 @@ def test_an_lcp_without_a_solution_gets_a_certificate(solver, seed, m):
     assert solution.status is lv.Status.INFEASIBLE, solution
     assert check_certificate(problem, solution.certificate) is None
     assert solver != "lemke" or "ray" in solution.message or "row of A is zero" in solution.message
-
-
-def test_warm_starts_choose_among_solutions():
-    """Two equal contacts share a load: the answer stays at the split it is given."""
-    problem = lv.Problem.lcp(np.ones((2, 2)), [1.0, 1.0])
-    for share in (0.25, 0.5, 0.9):
-        solution = lv.solve(problem, "direct", impulse=[share, 1.0 - share])
-        np.testing.assert_allclose(solution.impulse, [share, 1.0 - share], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -249,7 +217,7 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
         1.0,
         1.0,
     ]
-    for seed in range(20):
+    for seed in range(6):
         a, b = skew(seed)
         solution = lv.solve(lv.Problem.lcp(a, b, -1.0, 1.0), "direct")
         assert not solution.contradicted
@@ -293,15 +261,6 @@ def test_the_first_lu_of_what_fills_is_expected_to_take_long():
     band = sp.diags_array([np.ones(2999), np.full(3000, 3.0), np.full(2999, 0.5)], offsets=[-1, 0, 1])
     narrow = PivotState(lv.Problem.lcp(sp.csr_array(band), b))
     assert scattered.outside.seconds > 20.0 * narrow.outside.seconds
-
-
-def test_refusals_and_indefinite_matrices():
-    solution = lv.solve(lv.Problem.lcp([[1.0, 3.0], [3.0, 1.0]], [1.0, 1.0]), "direct")
-    assert not solution.contradicted
-    solution = lv.solve(lv.Problem.lcp(-np.eye(3), [1.0, 1.0, 1.0]), "direct")
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert "indefinite" in solution.message
-    assert np.isfinite(solution.impulse).all()
 
 
 def test_all_rows_free_is_tried_first_only_where_that_is_cheap():
@@ -376,24 +335,6 @@ def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
     assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_many_asymmetric_joints_take_one_factor_by_panels(seed):
-    rng = np.random.default_rng(seed)
-    n = 150
-    a = sp.csr_array(
-        laplacian(30) if seed % 2 else spd(rng, n) * (rng.random((n, n)) < 0.03) + 9.0 * np.eye(n)
-    )
-    a = sp.csr_array(a + a.T)
-    a.data *= 1.0 + 10.0 ** rng.uniform(-5.0, -0.5) * rng.normal(size=a.nnz)
-    x = rng.normal(size=a.shape[0])
-    problem = lv.Problem.linear(a, a @ x)
-    solution = lv.solve(problem, "direct", tol=1e-9)
-    assert solution.success and good(solution)
-    assert (solution.solver.form, solution.message) == ("LU", "A is not symmetric")
-    assert solution.work["factorisations"] == 1
-    assert lv.solve(problem, "auto").message.startswith("direct 1 factorisation")
-
-
 def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
     """Without a diagonal rows must change places across panels."""
     rng = np.random.default_rng(5)
@@ -440,33 +381,6 @@ def test_a_panel_that_lost_a_pivot_is_counted_and_named():
     assert solution.work["factorisations"] == 2  # panels and the LU that tells the rank
     words = "A is not symmetric; LU by panels lost a pivot; A is singular, rank 99 of 100"
     assert solution.message == words
-
-
-@pytest.mark.parametrize("m", [41, 71])
-def test_the_rank_in_work_is_that_of_the_message(m):
-    """A Cholesky factor of an indefinite A loses pivots that say nothing of its rank."""
-    a = np.zeros((m, m))
-    i = np.arange(0, m - 1, 2)
-    a[i, i + 1] = a[i + 1, i] = 1.0
-    solution = lv.solve(lv.Problem.linear(sp.csr_array(a), np.r_[np.ones(m - 1), 0.0]), "direct")
-    assert f"rank {m - 1} of {m}" in solution.message
-    assert solution.work.get("rank", m - 1) == m - 1
-
-
-@pytest.mark.parametrize("even", [False, True])
-def test_auto_does_not_begin_a_factor_that_fills(even):
-    """A graph without short separators: nearly all of its factor fills, while a few sweeps end it."""
-    rng = np.random.default_rng(0)
-    m = 3000
-    i, j = rng.integers(0, m, (2, 4 * m))
-    x, y = rng.normal(size=(2, 4 * m))
-    a = sp.coo_array((np.r_[x, x if even else y], (np.r_[i, j], np.r_[j, i])), shape=(m, m)).tocsr()
-    a = sp.csr_array(a + sp.diags_array(2.0 * np.abs(a).sum(axis=1) + 1.0))
-    problem = lv.Problem.linear(0.5 * (a + a.T) if even else a, rng.normal(size=m))
-    factor = SparsePanels(problem.csr.indptr, problem.csr.indices, not even)
-    assert factor.work > 1e8
-    solution = lv.solve(problem, "auto", tol=1e-6)
-    assert solution.success and "factorisations" not in solution.work, solution
 
 
 @pytest.mark.parametrize("bound", [np.inf, 0.05])

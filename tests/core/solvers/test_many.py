@@ -3,15 +3,11 @@
 import copy
 import pickle
 import threading
-from itertools import product
 
 import numpy as np
 import pytest
-from random_problems import as_matrix, random_contact_problem, random_lcp
 
 import lavender as lv
-from benchmarks.made import fresh
-from lavender.solvers import registry
 from lavender.solving import many as many_module
 
 DISKS = lv.Cones.contacts(0.5, count=4)
@@ -187,16 +183,6 @@ def test_worlds_of_several_sizes_of_velocities():
         assert_same(many, i, lv.solve(lv.Problem.from_jacobian(j, m, v, cones=cones, friction="cone")))
 
 
-@pytest.mark.parametrize("solver", ["newton", "pgs", "admm"])
-def test_other_solvers_and_budgets_go_the_same_way(solver):
-    jac, mass, free = worlds(6)
-    batch = lv.Batch(jac, mass, free, cones=DISKS)
-    for options in ({}, {"tol": 0.0, "max_iter": 3}):
-        many = lv.solve_many(batch, solver, threads=2, **options)
-        for i in range(6):
-            assert_same(many, i, lv.solve(batch[i], solver, **options))
-
-
 def test_a_batch_starts_where_it_is_told():
     jac, mass, free = worlds(6)
     batch = lv.Batch(jac, mass, free, cones=DISKS, friction="cone")
@@ -364,33 +350,6 @@ def test_matrices_and_bodies_go_the_same_way():
     assert many.impulse.shape == (3, 3) and many.success.all()
     assert many.impulse[:, 0] == pytest.approx([2.2, 2.1, 1.55], rel=1e-5)  # m (v + 0.1), s
     assert many.velocity.reshape(3, 6)[:, 2] == pytest.approx(0.1, rel=1e-5)
-
-
-@pytest.mark.parametrize("solver", ["auto", "direct", "newton"])
-@pytest.mark.parametrize("tol", [1e-6, 1e-10])
-def test_a_list_of_matrices_and_bodies_has_the_bits_of_single_solves(solver, tol):
-    """Fresh, and with all that a single solve works out; warm from anywhere, from a solution, from nothing."""
-    drawn = [random_lcp(seed, m=4 + 3 * seed, rank=3 if seed % 3 == 0 else None) for seed in range(9)]
-    drawn += [lv.Problem.linear(p.matrix, p.b) for p in drawn[:4]]
-    drawn += [lv.Problem.lcp(p.matrix + np.triu(p.matrix, 1), p.b) for p in drawn[:4]]
-    for seed, law in product(range(5), ("coulomb", "cone")):
-        rows = random_contact_problem(seed, law, spin=seed % 2 == 0, contacts=3 + 4 * seed, rolling=seed == 3)
-        drawn += [rows, as_matrix(rows)]
-    drawn += [random_contact_problem(seed, tangents=0, spin=False, joints=seed) for seed in range(3)]
-    drawn += [lv.Problem.lcp(np.zeros((2, 2)), [0.0, -1.0]), lv.Problem.lcp([[1e13]], [1.0], [1.5], [1.5])]
-    given = [p for p in drawn if not registry.get(solver).refuses(p)]
-    rng = np.random.default_rng(0)
-    starts = [
-        (None, rng.standard_normal(p.m), lv.solve(p, solver, tol=tol).impulse)[i % 3]
-        for i, p in enumerate(given)
-    ]
-    singles = [lv.solve(fresh(p), solver, tol=tol, impulse=x) for p, x in zip(given, starts, strict=True)]
-    for problems in (given, [fresh(p) for p in given]):
-        many = lv.solve_many(problems, solver, tol=tol, impulses=starts, threads=2)
-        found = lv.residual_many(problems, [s.impulse for s in many])
-        assert found.relative.tobytes() == many.relative.tobytes()
-        for i, single in enumerate(singles):
-            assert_same(many, i, single)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from calls import dense_h, system_in
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from random_problems import FORMS, as_matrix, general, good, random_contact_problem, seeds
+from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
 from twins import block_diagonal
 from worked import python
@@ -44,51 +44,13 @@ def test_rows_that_outnumber_velocities_take_an_interior_point_no_longer(seed, f
     assert solution.success, str(solution)
 
 
-@pytest.mark.parametrize("form", ["velocity", "impulse"])
-@given(seed=seeds)
-@settings(max_examples=30)
-def test_a_problem_is_scaled_by_its_definition(form, seed):
-    """Rows that stay, g, theta and openings from A, bounds and reach alone; contacts that spin, roll, or do not rub."""
-    rng = np.random.default_rng(seed)
-    base = random_contact_problem(seed, "cone", 2, bool(seed % 2), bodies=4, joints=2, contacts=6)
-    cones, soft = base.cones, rng.uniform(0.1, 1.0, base.m) * base.d
-    mu = np.where(rng.random(base.n_blocks) < 0.3, 0.0, cones.mu)
-    upper = np.where(
-        (cones.kind[np.repeat(np.arange(base.n_blocks), np.diff(cones.ptr))] == ROW), 0.3, np.inf
-    )
-    free = np.isposinf(upper) | (rng.random(base.m) < 0.5)
-    lower = np.where(free, cones.lower, 0.3)
-    cones = replace(cones, mu=mu, lower=lower, upper=np.where(free, cones.upper, 0.3))
-    problem = replace(base, cones=cones, compliance=soft if seed % 3 else base.compliance)
-    sc = make_system(problem, form).solve
-    reach, contact = cones.reach, np.repeat(cones.kind != ROW, np.diff(cones.ptr))
-    first = np.isin(np.arange(problem.m), cones.ptr[:-1])
-    stays = (cones.lower == cones.upper) | (contact & ~first & (reach == 0.0))
-    assert np.array_equal(sc.keep, np.flatnonzero(~stays))
-    np.testing.assert_array_equal(sc.fixed, np.where(stays & ~contact, cones.lower, 0.0))
-    root, pushed = np.sqrt(problem.d), problem.dense() @ sc.fixed
-    size = np.abs(problem.b) + np.abs(problem.dense()) @ np.abs(sc.fixed)
-    np.testing.assert_allclose(
-        sc.g, ((problem.b - pushed) / root)[sc.keep], rtol=0, atol=1e-13 * (size / root).max()
-    )
-    theta = problem.compliance / problem.d if form == "velocity" else np.zeros(problem.m)
-    np.testing.assert_allclose(sc.theta, theta[sc.keep], rtol=1e-13)
-    for i, at in enumerate(sc.ptr[:-1]):
-        rows = sc.keep[at : sc.ptr[i + 1]]
-        open_ = reach[rows] * root[rows] / root[rows[0]]
-        own = sc.reach[sc.part[i] : sc.part[i + 1]]
-        bounds = open_[1:] if contact[rows[0]] else []
-        assert own == pytest.approx([a for k, a in enumerate(bounds) if k != 1 or len(bounds) < 2], rel=1e-13)
-        assert np.all(cones.ptr[sc.block[i]] <= rows) and np.all(rows < cones.ptr[sc.block[i] + 1])
-
-
 # -- linear algebra ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("law", [LAWS["cone"], LAWS["coulomb"]])
 @pytest.mark.parametrize("form", ["velocity", "augmented", "impulse", "sparse"])
 @given(seed=seeds)
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     problem = random_contact_problem(
         seed, friction="cone" if law == LAWS["cone"] else "coulomb", bodies=6, contacts=10
@@ -201,16 +163,6 @@ def test_velocities_of_free_bodies_are_told_and_factored_as_theirs(spins, seed):
     np.testing.assert_allclose(solve.times(x), whole @ x, atol=1e-12 * np.abs(whole).sum(axis=1).max())
 
 
-@pytest.mark.parametrize("law", ["cone", "coulomb"])
-def test_many_rigid_contacts_over_j_and_m_take_the_steps_of_their_bodies(law):
-    p = bricks(6, 5e-3)
-    p = p if law == "coulomb" else p.relaxed("cone")
-    solutions = [lv.solve(x, "newton") for x in (p, general(p))]
-    assert [s.solver.form for s in solutions] == 2 * ["velocity"] and all(s.success for s in solutions)
-    steps = [s.work["factorisations"] for s in solutions]
-    assert steps[1] <= 1.5 * steps[0]  # other last bits, another path
-
-
 @given(seed=seeds)
 @settings(max_examples=10)
 def test_no_bodies_are_told_where_three_meet(seed):
@@ -262,25 +214,6 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
             assert np.linalg.norm(t) <= sc.reach[sc.part[i]] * z[i] * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
-@given(seed=seeds)
-@settings(max_examples=20)
-def test_a_step_knows_the_judges_errors(form, seed):
-    problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
-    system = system_in(problem, form)
-    system.solve.begin(1e-6)
-    for _ in range(4):
-        went, _, _, energy, velocity = system.solve.advance()
-        assert went
-    sc = system.solve
-    lam = sc.fixed.copy()
-    lam[sc.keep] = sc.point[0] * sc.scale
-    truth = lv.residual(problem, lam)
-    # The running slack against one computed afresh; fixed rows are right by construction.
-    assert energy == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_start)
-    assert velocity == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_start)
-
-
 @pytest.mark.parametrize("n", [1, 7, 48, 49, 150])
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_dense_factors_solve_what_numpy_solves_with_the_same_bits_at_any_width(n, symmetric):
@@ -309,29 +242,6 @@ def test_dense_factors_solve_what_numpy_solves_with_the_same_bits_at_any_width(n
         np.testing.assert_allclose(found[0], expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
-def test_the_first_interior_point_keeps_what_the_linear_system_says_of_each_row():
-    """Inside every bound; duals differ by H z0 - g where a row has two bounds, else all by one shift, as z does."""
-    rng = np.random.default_rng(8)
-    m = 24
-    j = rng.normal(size=(m, 2 * m))
-    lower, upper = np.full(m, -0.4), np.full(m, 0.3)
-    low, high = slice(0, 8), slice(8, 16)
-    upper[low], lower[high] = np.inf, -np.inf
-    problem = lv.Problem.lcp(j @ j.T, 30.0 * rng.normal(size=m), lower, upper)
-    solve = make_system(problem, "impulse").solve
-    solve.begin(1e-10)
-    z, u1, u2 = solve.point
-    z0 = np.linalg.solve(dense_h(problem) + 1e-6 * np.eye(m), solve.g)
-    slack = -1e-6 * z0  # H z0 - g
-    assert (z > solve.lower).all() and (z < solve.upper).all()
-    assert (u1[np.isfinite(solve.lower)] > 0.0).all() and (u2[np.isfinite(solve.upper)] > 0.0).all()
-    np.testing.assert_allclose((u1 - u2)[16:], slack[16:], rtol=1e-6, atol=1e-15)
-    shifts = np.concatenate([u1[low] - slack[low], u2[high] + slack[high]])
-    np.testing.assert_allclose(shifts, shifts[0], rtol=1e-12)
-    moves = np.concatenate([(z - z0)[low], (z0 - z)[high]])
-    np.testing.assert_allclose(moves, moves[0], rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("n", [3, 30, 150])
 def test_a_circle_of_exchanges_ends_by_count(n):
     """Newton's method on min(z, H z - g) goes round among single rows here (Ben Gharbia, Gilbert 2012)."""
@@ -341,12 +251,6 @@ def test_a_circle_of_exchanges_ends_by_count(n):
     assert good(solution, 1e-9), solution
     counts = dict(reversed(part.split(" ", 1)) for part in solution.message.split(", "))
     assert int(counts["exchanges"]) <= 30, solution.message
-
-
-def test_no_row_free_is_no_factor():
-    problem = lv.Problem.lcp(np.eye(3), -np.ones(3))
-    finite, z, relative, _ = make_system(problem, "impulse").solve.exchange(-np.ones(3))
-    assert finite and relative == 0.0 and not z.any()
 
 
 def on_bodies(k, layout, lu, wide=True):
@@ -510,24 +414,6 @@ def test_pivots_inside_panels_are_refined_or_given_up():
     assert x is None or np.abs(made.rows @ x - r).max() <= 1e-10 * np.abs(r).max()
 
 
-def test_a_factor_that_fills_is_not_begun_where_time_is_short():
-    """Its work is counted first: a graph without short separators."""
-    problem = sparse_rows(4, 8000, near=6)
-    assert system_in(problem, "sparse").work > 1e10
-    solution = lv.solve(problem, "newton", tol=1e-12, time_limit=0.3)
-    assert solution.status is lv.Status.TIME_LIMIT and solution.work.get("factorisations", 0) == 0
-
-
-def test_rows_are_exchanged_where_an_interior_point_stops_short():
-    """An asymmetric A, most rows beyond their bounds at H z = g: not tried first, but tried."""
-    rng, m = np.random.default_rng(41), 80
-    g = rng.normal(size=(m, m))
-    a = g - g.T + np.diag(rng.uniform(0.1, 1.0, m))
-    b = rng.normal(size=m)
-    problem = lv.Problem.lcp(a, b, -rng.uniform(0.0, 1.0, m), rng.uniform(0.0, 1.0, m))
-    assert good(lv.solve(problem, "newton", tol=1e-10), 1e-10)
-
-
 @pytest.mark.parametrize("form", FORMS)
 @given(seed=seeds)
 @settings(max_examples=4)
@@ -561,12 +447,12 @@ def pinched(seed, form, **kind):
 def test_cones_without_a_solution_are_proven_to_have_none(form, kind):
     """The way of the interior point is a proof on nearly all: 352 of 360 disks, spinning and rolling contacts."""
     proven = 0
-    for seed in range(20):
+    for seed in range(10):
         problem = pinched(seed, form, **kind)
         solution = lv.solve(problem, "newton", max_iter=150)
         assert not solution.success and not solution.contradicted
         proven += solution.status is lv.Status.INFEASIBLE
-    assert proven >= 18
+    assert proven >= 9
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -582,17 +468,6 @@ def test_cones_with_a_solution_are_never_proven_to_have_none(form, seed):
     w[normal] = rng.uniform(0.0, 2.0, 8) + np.hypot(w[normal + 1], w[normal + 2]) * mu
     problem = FORMS[form](replace(p, b=p.dense() @ lam - w))
     assert lv.solve(problem, "newton", max_iter=300).status is not lv.Status.INFEASIBLE
-
-
-@given(seed=seeds)
-@settings(max_examples=4)
-def test_what_rolls_or_rubs_at_one_contact_alone_is_friction(seed):
-    """Over J and M: mu = 0 but rolling, or one mu of many above 0, is no convex problem."""
-    p = random_contact_problem(seed, bodies=4, joints=1, contacts=6, spin=False, rolling=True)
-    for mu, rolling in ((0.0, 0.2), (np.eye(p.n_blocks)[-1], 0.0)):
-        cones = replace(p.cones, mu=mu + np.zeros(p.n_blocks), rolling=rolling * (p.cones.kind != ROW))
-        solution = lv.solve(general(replace(p, cones=cones)), "newton", tol=1e-9)
-        assert good(solution, 1e-9) and "Coulomb rounds" in solution.work, solution
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -48,29 +48,6 @@ def test_a_spec_that_makes_no_sense_is_refused(wrong):
         dataclasses.replace(SPEC, **wrong)
 
 
-def test_laws_and_forms_are_taken_from_any_collection():
-    spec = dataclasses.replace(SPEC, laws=["lcp", "cone"], operators=("matrix",), boxes={"cone": 1})
-    assert (spec.laws, spec.operators, spec.boxes) == ({"lcp", "cone"}, {"matrix"}, {"cone"})
-
-
-def test_what_cannot_be_resumed_has_no_callback_and_no_history():
-    spec = dataclasses.replace(SPEC, resumable=False, callback=True, history=True)
-    assert (spec.callback, spec.history) == (False, False)
-
-
-def test_accepted_options_are_its_own_and_those_of_its_capabilities():
-    plain = dataclasses.replace(SPEC, order=False, seed=False, threads=False, options={"omega": "damping"})
-    assert plain.accepts == {"omega"}
-    assert dataclasses.replace(plain, order=True).accepts == {"omega", "order", "ground"}
-    assert dataclasses.replace(plain, seed=True, threads=True).accepts == {"omega", "seed", "threads"}
-
-
-def test_a_missing_package_is_named_with_what_installs_it():
-    spec = dataclasses.replace(SPEC, requires=("numpy", "no_such_module_1"), install="no-such-package")
-    assert spec.missing() == "needs no_such_module_1: pip install no-such-package"
-    assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
-
-
 def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
@@ -110,18 +87,6 @@ def test_what_a_plug_in_says_stands_on_one_line(plug_in):
         raise ArithmeticError("two\nlines")
 
     assert lv.solve(TINY, plug_in(fails)).message == "ArithmeticError: two lines"
-
-
-@pytest.mark.parametrize("resumable", [True, False])
-def test_what_breaks_down_keeps_the_iterate_of_the_last_call_that_returned(resumable, plug_in):
-    def fails(problem, impulse):
-        impulse[:] = 1e3
-        raise np.linalg.LinAlgError("singular")
-
-    start = 0.5 * np.ones(TINY.m)
-    solution = lv.solve(TINY, plug_in(fails, resumable=resumable), impulse=start)
-    assert solution.status is lv.Status.NUMERICAL_ERROR
-    assert solution.impulse.tolist() == start.tolist()
 
 
 @pytest.mark.parametrize("counted", ["long", -1.0, float("nan")])
@@ -167,12 +132,6 @@ def test_refused_is_no_claim_of_a_solver(plug_in):
     assert "claims the status REFUSED" in solution.message
 
 
-def test_a_certificate_of_complex_numbers_is_none(plug_in):
-    claim = lv.Claim(lv.Status.INFEASIBLE, 1, certificate=np.full(TINY.m, 1j))
-    solution = lv.solve(TINY, plug_in(lambda problem, impulse: claim))
-    assert solution.status is lv.Status.NUMERICAL_ERROR and "no array of 2 numbers" in solution.message
-
-
 @pytest.mark.parametrize("where", ["prepare", "update", "run"])
 def test_a_plug_in_that_would_end_the_process_raises_an_error(where, register):
     def method(name, result):
@@ -185,21 +144,6 @@ def test_a_plug_in_that_would_end_the_process_raises_an_error(where, register):
     register(named("exits", factory=type("Exits", (), {n: method(n, r) for n, r in results.items()})))
     with pytest.raises(RuntimeError, match=rf"'exits' called sys.exit\(3\) in {where}"):
         lv.prepare(TINY, "exits").solve(lv.Problem.lcp(np.eye(2), [2.0, 1.0]))
-
-
-def test_a_plug_in_without_update_is_prepared_anew(register):
-    class Bare:
-        def prepare(self, problem):
-            return problem
-
-        def run(self, state, impulse, n, tol, time_limit):
-            impulse[:] = state.b  # of A = 1
-            return lv.Claim(lv.Status.CONVERGED, 1)
-
-    register(named("bare", factory=Bare))
-    solver = lv.prepare(TINY, "bare")
-    assert solver.solve().success
-    assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
 def test_a_refusal_names_the_way_round():

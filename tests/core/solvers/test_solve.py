@@ -12,7 +12,6 @@ import pytest
 from random_problems import FORMS, random_contact_problem
 
 import lavender as lv
-from lavender import registry
 from lavender.judge import many as loop
 from lavender.solving import many
 
@@ -70,30 +69,6 @@ def test_a_senseless_request_is_refused_with_its_reason(name):
     call, error, sign = REFUSED[name]
     with pytest.raises(error, match=sign):
         call()
-
-
-def test_nothing_ran_where_a_request_is_refused(register):
-    ran = []
-    spec = dataclasses.replace(registry.get("pgs"), factory=lambda **options: ran.append(options))
-    register(spec)
-    with pytest.raises(lv.LavenderError):
-        lv.solve(TINY, "pgs", nothing=1)
-    assert ran == []
-
-
-def test_the_start_is_the_impulse_given_then_the_guess_then_zero_within_bounds():
-    problem = lv.Problem.lcp(np.eye(2), [5.0, 5.0], lower=1.0, upper=9.0, guess=[2.0, 3.0])
-    at_start = lambda p, **more: lv.solve(p, "pgs", max_iter=0, tol=0.0, **more).impulse.tolist()  # noqa: E731
-    assert at_start(problem, impulse=[4.0, 4.5]) == [4.0, 4.5]
-    assert at_start(problem) == [2.0, 3.0]
-    assert at_start(dataclasses.replace(problem, guess=None)) == [1.0, 1.0]
-
-
-def test_what_was_done_is_printed_in_words():
-    problem = lv.Problem.lcp([[2.0, 1.0], [1.0, 2.0]], [1.0, -1.0])
-    assert ", 1 sweep, " in str(lv.solve(problem, "pgs"))
-    assert ", 3 sweeps, " in str(lv.prepare(problem, "pgs").solve(tol=0.0, max_iter=3))
-    assert lv.prepare(problem).solve().solver.name == "auto"
 
 
 @pytest.mark.parametrize("budget", [{}, {"max_iter": 500}, {"time_limit": 10.0}])

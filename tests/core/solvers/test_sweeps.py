@@ -1,4 +1,4 @@
-"""Sweep solvers against a dense slow twin, each other, and closed forms."""
+"""Sweep solvers against a dense slow twin and each other."""
 
 import judge_twin
 import numpy as np
@@ -12,7 +12,7 @@ from lavender.problem.ordering import ORDERS
 
 
 @pytest.mark.parametrize("kind", CONTACTS)
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
     problem = CONTACTS[kind](seed)
@@ -29,7 +29,7 @@ def test_a_sweep_is_the_update_written_densely_in_every_form(kind, seed):
 
 
 @pytest.mark.parametrize("order", ORDERS)
-@settings(max_examples=30)
+@settings(max_examples=8)
 @given(seed=seeds)
 def test_sequential_impulses_equal_pgs_on_every_order(order, seed):
     """Twenty sweeps: where strong friction makes the sweeps chaotic, roundings grow tenfold in five."""
@@ -76,66 +76,3 @@ def test_gauss_seidel_sor_and_jacobi_are_their_formulas(seed):
             for i in range(len(b)):
                 lam[i] -= omega * (a[i] @ seen - b[i]) / a[i, i]
         np.testing.assert_allclose(sweeps(linear, name, 3, **options), lam, atol=1e-12 * np.abs(lam).max())
-
-
-# -- tangent blocks -------------------------------------------------------------------------------------
-
-BLOCKS = {
-    "diag(1, 10)": np.diag([1.0, 10.0]),
-    "diag(1, 100)": np.diag([1.0, 100.0]),
-    "rank 1": np.outer([1.0, 2.0], [1.0, 2.0]),
-    "nearly rank 1": np.outer([1.0, 2.0], [1.0, 2.0]) + 1e-3 * np.eye(2),
-}
-
-
-@pytest.mark.parametrize("name", BLOCKS)
-@pytest.mark.parametrize("slip", [0.0, 0.2, 30.0], ids=["rest", "stick", "slide"])
-@pytest.mark.parametrize("solver", ["pgs", "jacobi"])
-def test_anisotropic_tangents_converge_to_the_right_point(solver, name, slip):
-    a = np.zeros((3, 3))
-    a[0, 0], a[1:, 1:] = 1.0, BLOCKS[name]
-    # Tangential velocity in the range of the block, so that sticking is possible where it is singular.
-    b = np.concatenate([[1.0], -BLOCKS[name] @ [0.6 * slip, 0.3 * slip]])
-    solution = lv.solve(lv.Problem.contact(a, b, [0.5]), solver, tol=1e-12, max_iter=200_000)
-    assert solution.success, solution
-    bound = 0.5 * solution.impulse[0]
-    size = np.linalg.norm(solution.impulse[1:])
-    w = solution.slack[1:]
-    if slip == 30.0:
-        assert size == pytest.approx(bound, rel=1e-12)
-        # Sliding: the tangent impulse opposes the slip.
-        cross = solution.impulse[1] * w[1] - solution.impulse[2] * w[0]
-        assert abs(cross) <= 1e-9 * size * np.linalg.norm(w)
-        assert solution.impulse[1:] @ w < 0.0
-    else:
-        assert size <= bound
-
-
-# -- laws (closed forms) ----------------------------------------------------------------------------------
-
-
-def stacked_boxes(n):
-    """n equal masses, one point contact each, normals only: tridiagonal A = 1, 2, 2, ... / m."""
-    a = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    a[0, 0] = 1.0
-    b = np.zeros(n)
-    b[0] = 0.1
-    return lv.Problem.lcp(a, b)
-
-
-def contraction(problem, name, first, last, **options):
-    exact = np.linalg.solve(problem.dense(), problem.b)
-    x, y = (sweeps(problem, name, n, **options) - exact for n in (first, last))
-    return (np.linalg.norm(y) / np.linalg.norm(x)) ** (1.0 / (last - first))
-
-
-@pytest.mark.parametrize("n", [2, 5, 10, 20])
-@pytest.mark.parametrize("order", ["given", "reverse"])
-def test_stack_contracts_by_cos_squared(n, order):
-    """n equal boxes, one point each: the asymptotic Gauss-Seidel factor is cos^2(pi / 2n)."""
-    problem = stacked_boxes(n)
-    rate = contraction(problem, "pgs", 2 * n * n, 3 * n * n, order=order)
-    jacobi = np.eye(n) - problem.matrix / np.diag(problem.matrix)[:, None]
-    # Consistently ordered: the Gauss-Seidel factor is the square of the Jacobi one (Young 1971).
-    assert rate == pytest.approx(np.abs(np.linalg.eigvals(jacobi)).max() ** 2, rel=1e-3)
-    assert rate == pytest.approx(np.cos(np.pi / (2 * n)) ** 2, rel=2e-3)

@@ -49,14 +49,6 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
         )
 
 
-def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
-    monkeypatch.setattr(layout, "LARGE", 1)
-    solver = lv.prepare(pile, "sequential_impulses", order="local")
-    solver.solve(tol=1e-30, max_iter=40)
-    relative, impulse = solver.state.best
-    assert lv.residual(pile, impulse).relative == pytest.approx(relative, rel=1e-9)
-
-
 def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
     monkeypatch.setattr(layout, "LARGE", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
@@ -93,12 +85,6 @@ def test_a_leader_needs_no_helper(pile):
     np.testing.assert_array_equal(lam, before)
 
 
-def test_small_problems_stay_on_one_thread():
-    problem = lattice_pile(60)
-    solver = lv.prepare(problem, "sequential_impulses", order="colored", threads=2)
-    assert not sweeping.gains_from_threads(solver.state)
-
-
 def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     """A lattice whose bodies and contacts were shuffled: the differences of numbers shrink by more than half."""
     monkeypatch.setattr("lavender.problem.ordering.NEAR", 0)
@@ -111,13 +97,6 @@ def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     blocks = block_order(pile, "local").blocks
     low = np.where(body < 0, len(rank), rank[body]).min(axis=1)[blocks]
     assert (np.diff(low) >= 0).all()
-
-
-def test_local_takes_a_matrix_too(pile):
-    matrix = lv.Problem.contact(pile.delassus(), pile.b, pile.cones.mu)
-    blocks = block_order(matrix, "local").blocks
-    assert sorted(blocks.tolist()) == list(range(matrix.n_blocks))
-    assert lv.solve(matrix, "pgs", order="local", tol=1e-6, max_iter=5000).success
 
 
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
