@@ -40,9 +40,9 @@ def test_a_full_disk_behind_stdout_is_one_line():
 
 
 @pytest.mark.skipif(os.name != "posix", reason="a call in the child is of POSIX")
-@pytest.mark.parametrize("command", [("solvers",), ("run", "stack", "--steps", "2")])
-def test_a_stdout_that_was_closed_is_no_error(command):
-    assert python("-m", "lavender", *command, preexec_fn=lambda: os.close(1), **TOLD).stderr == ""
+def test_a_stdout_that_was_closed_is_no_error():
+    command = ("-m", "lavender", "run", "stack", "--steps", "2")
+    assert python(*command, preexec_fn=lambda: os.close(1), **TOLD).stderr == ""
 
 
 def test_solve_prints_one_line_and_writes_the_answer(lavender, path, tmp_path):
@@ -78,12 +78,9 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "no/such.npz"), "no such file"),
         (("report", "stak(n=8)"), "did you mean"),
         (("report", "--levels", "0"), "level is 0;"),
-        (("report", "--budgets", "-4"), "budget is -4"),
-        (("report", "--orders", "sideways"), "sideways"),
         (("report", "a.jsonl", "b.npz"), "shown alone"),
         (("report", "missing.jsonl"), "cannot read"),
         (("solve", "stack(n=4)", "--solver", "nobody"), "unknown solver 'nobody'"),
-        (("solve", "stack(n=4)", "--solver", "pgs", "--tol", "-1"), "tol"),
         (("solve", "stack(n=4)", "--solver", "direct", "--order", "reverse"), "order"),
         (("solve", "stack(n=4)", "--solver", "pgs", "--output", "no/such/folder.npz"), "cannot write"),
         (("check", "nothing.npz"), "no such file"),
@@ -99,33 +96,20 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "a.jsonl", "--levels", "1e-3"), "--levels has no effect where records are shown again"),
         (("report", "stack(n=4)", "--solvers", "pgs", "--memory", "3"), "--memory has no effect"),
         (("run", "stack", "--replace"), "--replace has no effect without --record"),
-        (
-            ("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"),
-            "--seed has no effect without --controls random",
-        ),
-        (
-            ("report", "a.xml", "--seed", "3", "--controls", "zero"),
-            "--seed has no effect without --controls random",
-        ),
+        (("record", "a.xml", "--out", "o", "--seed", "3", "--controls", "zero"), "without --controls random"),
+        (("report", "a.xml", "--seed", "3", "--controls", "zero"), "without --controls random"),
         (("report", "stack(n=4)", "--seed", "3"), "--seed has no effect without a MODEL.xml"),
         (("check", ""), "an empty argument"),
         (("report", "stack(n=4)", "--out", ""), "an empty argument"),
-        (("check", "stack(n=4)", "--solvers", "pgs", "--tol=-1"), "tol is"),
         (("check", "stack(n=4)", "--reference", "nobody"), "unknown solver 'nobody'"),
-        (("explain", "stack(n=4)", "--tol", "0"), "tol"),
-        (("prove", "stack(n=2)", "--solver", "foo"), "unknown solver 'foo'"),
         (("run", "stac"), "did you mean 'stack'"),
         (("run", "stack", "--set", "n"), "NAME=VALUE"),
         (("run", "stack", "--iterations", "3"), "solver_iterations"),
-        (("run", "stack", "--solver", "newtn"), "did you mean 'newton'"),
-        (("run", "stack", "--solver", "newton", "--order", "bottom_up"), "order"),
         (("run", "stack", "--order", "given", "--set", "order=reverse"), "order"),
-        (("run", "stack", "--stepper", "xpbd", "--solver", "newton"), "xpbd"),
         (("phenomena", "nothing"), "unknown phenomenon"),
         (("phenomena", "stick", "--set", "slope=3"), "0 to 0.99 is needed"),
         (("phenomena", "stick", "--set", "slope"), "NAME=VALUE"),
         (("phenomena", "stick", "--steppers", "fast"), "unknown stepper"),
-        (("phenomena", "stick", "--engines", "fast"), "unknown engine"),
         (("phenomena", "stick", "--steppers", "none"), "no stepper and no engine"),
         (("phenomena", "stick", "--out", "no/such/folder/x.json"), "is not there; make it first"),
         (("nonsense",), "unknown command 'nonsense'"),
@@ -258,10 +242,8 @@ sys.meta_path.insert(0, Finder())
 @pytest.mark.parametrize(
     ("way", "module"),
     [
-        (("-m", "lavender"), "numpy"),
         (("-m", "lavender"), "lavender.cli.solvers"),
         (("-m", "lavender.cli"), "lavender.problem"),
-        (("-m", "lavender.cli"), "lavender.cli.options"),
     ],
 )
 def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_path):
@@ -274,26 +256,28 @@ def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_pat
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX")
-@pytest.mark.parametrize(
-    "error", ["ValueError('Invalid bounding box')", "lv.InputError('mujoco cannot be imported')"]
-)
-def test_ctrl_c_that_a_library_makes_another_error_of_ends_with_130(error):
-    code = f"""
+def test_ctrl_c_that_a_library_makes_another_error_of_ends_with_130():
+    code = """
 import signal, click, lavender as lv
 from lavender.cli import cases, main
-def swallowing(**words):
+for error in (ValueError("Invalid bounding box"), lv.InputError("mujoco cannot be imported")):
+    def swallowing(**words):
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise error from None
+    cases.cases.callback = swallowing
     try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        raise {error} from None
-cases.cases.callback = swallowing
-main(["cases"])
+        main(["cases"])
+    except SystemExit as end:
+        assert end.code == 130, error
 """
-    said = python("-c", code, status=130).stderr
-    assert "lavender: stopped" in said and eval(error, {"lv": lv}).args[0] in said and "Traceback" not in said
+    said = python("-c", code).stderr
+    assert said.count("lavender: stopped") == 2 and "Traceback" not in said
+    assert "Invalid bounding box" in said and "mujoco cannot be imported" in said
 
 
-@pytest.mark.parametrize("columns", ["0", "1", "19"])
+@pytest.mark.parametrize("columns", ["0", "19"])
 @pytest.mark.parametrize(
     "words", [("solvers",), ("cases", "stack"), ("check", "stack(n=4)", "--solvers", "pgs")]
 )
@@ -389,16 +373,15 @@ def _unread(*words):
     return done.stderr
 
 
-@pytest.mark.parametrize("words", ["solvers", "--help", "explain toy_stack"])
+@pytest.mark.parametrize("words", ["solvers", "explain toy_stack"])
 def test_a_pipe_that_nobody_reads_ends_a_command_quietly(words):
     assert _unread(*words.split()) == ""
 
 
 def test_files_are_written_whoever_reads(path, tmp_path):
-    made = [tmp_path / name for name in ("x.csv", "x.svg", "x.npz")]
-    words = ("run", "stack", "--steps", 3, "--trace", made[0], "--plot", made[1])
-    assert _unread(*words) == ""
-    assert _unread("solve", path, "--output", made[2]) == ""
+    made = [tmp_path / name for name in ("x.csv", "x.npz")]
+    assert _unread("run", "stack", "--steps", 3, "--trace", made[0]) == ""
+    assert _unread("solve", path, "--output", made[1]) == ""
     assert _unread("reference", path) == ""
     assert all(p.is_file() for p in (*made, path.with_name(path.name + ".reference")))
 

@@ -31,19 +31,6 @@ def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_p
     assert [load(p).n_blocks for p in sorted(paths[2].iterdir())] == 12 * [8]
 
 
-@pytest.mark.parametrize(
-    ("words", "last"),
-    [
-        (["--solver", "newton"], "newton, "),
-        (["--solver", "pgs", "--order", "bottom_up"], "pgs, order bottom_up, "),
-        (["--stepper", "xpbd", "--order", "reverse"], "order reverse, "),
-    ],
-)
-def test_the_last_line_says_solver_and_order(words, last, lavender):
-    code, out, _ = lavender("run", "stack", "--set", "n=2", "--steps", "3", *words)
-    assert not code and f" s, {last}" in out.splitlines()[-1]
-
-
 def test_lavender_run_writes_films_and_pictures(lavender, tmp_path):
     for name in ("a.film", "a.gif"):
         code, out, _ = lavender("run", "spinner", "--steps", "5", "--film", tmp_path / name)

@@ -27,20 +27,7 @@ WORDS = (
     ("solve", "two_particles", "--max-iter", "{}"), ("solve", "two_particles", "--time-limit", "{}"),
     ("check", "two_particles", "--tol", "{}", "--solvers", "pgs"), ("view", "{}"), ("record", "{}", "--out", "{}"),
 )  # fmt: skip
-ASKED = (
-    "0",
-    "-1",
-    "-2",
-    "1000000000",
-    "1000000000000",
-    "1e400",
-    "nan",
-    "",
-    "a",
-    "10000000",
-    "1:",
-    "0x10",
-)
+ASKED = ("0", "-1", "-2", "1000000000", "1000000000000", "1e400", "nan", "", "a", "10000000", "1:", "0x10")
 TOLD = ("kinetic", "energy", "speed", "spin", "rows", "bound", "bound_speed", "bound_spin", "moved", "spread",
         "spread_speed")  # fmt: skip
 

@@ -10,11 +10,7 @@ pytest.importorskip("pydrake", reason="needs Drake: pip install 'lavender-contac
 
 from pydrake.geometry import HalfSpace, Sphere
 from pydrake.math import RigidTransform
-from pydrake.multibody.plant import (
-    AddMultibodyPlantSceneGraph,
-    CoulombFriction,
-    DiscreteContactApproximation,
-)
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction, DiscreteContactApproximation
 from pydrake.multibody.tree import FixedOffsetFrame, PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder

@@ -219,11 +219,7 @@ def test_unknown_scenes_and_parameters_name_the_nearest():
 
 @pytest.mark.parametrize(
     ("solver", "velocity", "spin"),  # of the second, rows whose impulses are far from all others
-    [
-        ("sequential_impulses", (1e60, 0, 0), 0),
-        ("pgs", (1e60, 0, -1e55), 1e55),
-        ("newton", (1e60, 0, 0), 0),
-    ],
+    [("sequential_impulses", (1e60, 0, 0), 0), ("pgs", (1e60, 0, -1e55), 1e55), ("newton", (1e60, 0, 0), 0)],
 )
 def test_a_state_that_is_lost_is_named_and_ends_the_simulation(solver, velocity, spin):
     scene = lv.Scene(solver=solver)

@@ -145,12 +145,7 @@ def record(folder, steps=STEPS):
     writer = Writer()
     scenes = [record_scene(writer, *scene, steps=steps) for scene in SCENES]
     newton = [record_newton(writer, *scene) for scene in NEWTON_SCENES]
-    contents = {
-        "layout": layout(),
-        "body_arrays": BODY_ARRAYS,
-        "scenes": scenes,
-        "newton": newton,
-    }
+    contents = {"layout": layout(), "body_arrays": BODY_ARRAYS, "scenes": scenes, "newton": newton}
     path = Path(folder) / "recording.json"
     path.write_text(json.dumps(contents, allow_nan=False), encoding="utf-8")
     path.with_suffix(".bin").write_bytes(b"".join(writer.parts))

@@ -186,12 +186,7 @@ def test_node_finds_every_bit_the_same(module_file, recording):
 
 @pytest.mark.parametrize(
     ("what", "sign"),
-    [
-        ("values", "eight values"),
-        ("states", "x,q,v"),
-        ("hashes", "other array"),
-        ("newton", "what it said"),
-    ],
+    [("values", "eight values"), ("states", "x,q,v"), ("hashes", "other array"), ("newton", "what it said")],
 )
 def test_node_sees_one_wrong_bit(module_file, recording, tmp_path, what, sign):
     contents = json.loads((recording / "recording.json").read_text())
