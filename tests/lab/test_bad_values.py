@@ -196,14 +196,6 @@ NUMBERS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("door", NUMBERS)
-def test_what_is_no_number_is_refused_by_name(door):
-    call, good = NUMBERS[door]
-    call(good)
-    for what, x in WRONG_NUMBERS.items():
-        refused(call, x, door, what)
-
-
 COUNTS = {
     "solve: max_iter": (lambda x: of_options(x, "max_iter"), 7),
     "auto: max_iter": (lambda x: lv.solve(LCP, max_iter=x), 7),
@@ -227,15 +219,6 @@ COUNTS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("door", COUNTS)
-def test_what_is_no_whole_number_is_refused_by_name(door):
-    call, good = COUNTS[door]
-    call(good)
-    for what, x in WRONG_COUNTS.items():
-        if repr(x) != repr(good):  # a seed may be very large
-            refused(call, x, door, what)
-
-
 FLAGS = {
     "solve: history": (lambda x: of_options(x, "history"), True),
     "scene: static": (lambda x: scene("add_box")(x, "static"), True),
@@ -252,12 +235,23 @@ FLAGS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("door", FLAGS)
-def test_what_is_neither_true_nor_false_is_refused_by_name(door):
-    call, good = FLAGS[door]
+KINDS = {
+    "number": (NUMBERS, WRONG_NUMBERS),
+    "whole number": (COUNTS, WRONG_COUNTS),
+    "true or false": (FLAGS, WRONG_FLAGS),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "door"), [(kind, door) for kind, (doors, _) in KINDS.items() for door in doors]
+)
+def test_what_is_none_of_its_kind_is_refused_by_name(kind, door):
+    doors, wrong = KINDS[kind]
+    call, good = doors[door]
     call(good)
-    for what, x in WRONG_FLAGS.items():
-        refused(call, x, door, what)
+    for what, x in wrong.items():
+        if repr(x) != repr(good):  # a seed may be very large
+            refused(call, x, door, what)
 
 
 @pytest.mark.parametrize(

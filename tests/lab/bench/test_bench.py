@@ -128,9 +128,9 @@ def test_exact_solvers_run_once_and_hopeless_levels_are_left_out():
 def test_a_solver_that_raises_costs_its_own_record(plug_in):
     plug_in(broken, "fake_raise"), plug_in(lost, "fake_nan")
     plug_in(lambda problem, impulse: lv.Claim(lv.Status.CONVERGED, 1), "fake_lie")
-    records = bench.run(
-        [stack(4, "one"), stack(5, "two")], ["fake_raise", "fake_nan", "fake_lie", "pgs"], QUICK
-    )
+    plug_in(lambda problem, impulse: sys.exit(3), "fake_exit")
+    fakes = ["fake_raise", "fake_nan", "fake_lie", "fake_exit"]
+    records = bench.run([stack(4, "one"), stack(5, "two")], [*fakes, "pgs"], QUICK)
     by = {(r.case, r.solver): r for r in records}
     for case in ("one", "two"):
         assert by[case, "fake_raise"].status == "ERROR"
@@ -138,6 +138,7 @@ def test_a_solver_that_raises_costs_its_own_record(plug_in):
         assert by[case, "fake_nan"].status == "NUMERICAL_ERROR"
         assert by[case, "fake_nan"].relative == math.inf
         assert by[case, "fake_lie"].contradicted
+        assert not by[case, "fake_exit"].success
         assert by[case, "pgs"].status == "MAX_ITERATIONS"  # the last: a budget
     assert sum(r.solver == "fake_raise" for r in records) == 2  # one each: no level after it can be better
 
@@ -222,13 +223,6 @@ def test_another_version_or_cpu_is_another_run(tmp_path, monkeypatch):
     assert len(bench.read(path).latest()) == len(first)
 
 
-def test_a_solver_that_calls_exit_costs_its_own_record(plug_in):
-    plug_in(lambda problem, impulse: sys.exit(3), "fake_exit")
-    records = bench.run([chain(2)], ["fake_exit", "pgs"], QUICK)
-    assert {r.status for r in records if r.solver == "pgs"} == {"CONVERGED", "MAX_ITERATIONS"}
-    assert not any(r.solver == "fake_exit" and r.success for r in records)
-
-
 def test_ctrl_c_keeps_what_there_is(tmp_path, plug_in):
     plug_in(interrupted, "fake_interrupt")
     path, into = tmp_path / "records.jsonl", []
@@ -306,6 +300,7 @@ def test_infinite_and_undefined_numbers_survive_json():
         ({"repeats": 0}, "repeats is 0"),
         ({"time_limit": 0.0}, "time_limit is 0"),
         ({"pass_limit": 0.0}, "pass_limit is 0"),
+        *(({"speed_levels": (level,)}, "speed level") for level in (0.0, -1.0, math.nan)),
     ],
 )
 def test_a_senseless_plan_is_refused(change, sign):

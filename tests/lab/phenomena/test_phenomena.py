@@ -109,11 +109,23 @@ def test_what_the_page_says_of_a_stepper_is_what_it_does(stepper):
                 assert (float(x), unit) == (pytest.approx(float(y), rel=0.05, abs=1e-10), other), key
 
 
-@pytest.mark.parametrize("name", sorted({*NAMES} - {*QUICK, "pendulum"}))
+@pytest.mark.parametrize("name", sorted({*NAMES} - {"pendulum"}))
 def test_the_exact_solver_keeps_every_bound_of_the_first_case(name):
     # it dissipates what swings, at first order in the step: a pendulum it does not keep
     (record,) = run([name], steppers=["impulses newton"], parameters=dict(PHENOMENA[name].cases[0]))
     assert record.passed, tables.line(record)
+
+
+@pytest.mark.parametrize(
+    ("name", "of"),
+    [("slide", "mu"), ("stop", "mu"), ("roll", "mu"), ("roll_to_rest", "rolling"), ("spin_down", "mu")],
+)
+def test_friction_of_four_fifths_is_out_of_a_bound(name, of):
+    p, values = PHENOMENA[name], PHENOMENA[name].values()
+    weak = {of: 0.8 * values[of]} | ({"slope": values["slope"] / 0.8} if name == "slide" else {})  # of mu
+    scene = p.scene(values | weak, stepper="impulses")
+    track = follow(make(WAYS["impulses newton"], scene), p.seconds(values), p.interval)
+    assert not judged(p, "weak", values, track).passed
 
 
 @pytest.mark.parametrize("stepper", STEPPERS)

@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 from scipy.special import ellipk
 
 import lavender as lv
-from lavender.lab.phenomena import PHENOMENA, Track
+from lavender.lab.phenomena import PHENOMENA
 from lavender.lab.phenomena.joints import flip_of, moments_of_inertia, period_of, spin_of
 from lavender.lab.phenomena.truths import arch_thrust, elliptic, thinnest_arch, tipping_time
 
@@ -124,55 +124,3 @@ def test_slopes_by_the_linear_program(slope, holds):
     assert stands("tipping", slope=slope) == holds
     # along one tangent the square of friction is its disk
     assert stands("stick", slope=min(slope, 0.99)) is True
-
-
-# -- laws of one body, by small steps -------------------------------------------------------------
-
-
-def one_body(name, wrong=1.0):
-    """Coulomb's law on one body in steps of 2e-5 s, friction `wrong` times what it should be, as a track."""
-    p = PHENOMENA[name].values({})
-    h, look = 2e-5, 1 / 60
-    mu = wrong * p["mu"]
-    angle = math.atan(p["slope"] * p["mu"]) if name in ("stick", "slide") else 0.0
-    g, down = G * math.cos(angle), G * math.sin(angle)
-    x, v, w, s = 0.0, p.get("speed", 0.0), 0.0, p.get("spin", 0.0)
-    radius, inertia = 0.5, 0.4 * 0.25
-    w = v / radius if name == "roll_to_rest" else w
-    moment = wrong * p.get("rolling", 0.0) * g
-    rows, every = [], round(look / h)
-    for i in range(int(PHENOMENA[name].seconds(p) / h) + every):
-        if i % every == 0:
-            rows.append((i * h, x, v, w, s))
-        v += h * down
-        w -= math.copysign(min(h * moment / inertia, abs(w)), w)
-        slip = v - radius * w
-        if name in ("roll", "roll_to_rest"):
-            most = abs(slip) / (1 + radius**2 / inertia)
-            push = -math.copysign(min(h * mu * g, most), slip)
-            v, w = v + push, w - radius * push / inertia
-        else:
-            v -= math.copysign(min(h * mu * g, abs(v)), v)
-        s -= math.copysign(min(h * mu * p.get("patch", 0.0) * g / inertia, abs(s)), s)
-        x += h * v
-    t, x, v, w, s = np.array(rows).T
-    place, speed = np.zeros((len(t), 2, 3)), np.zeros((len(t), 2, 6))
-    place[:, 1, 0], speed[:, 1, 0], speed[:, 1, 4], speed[:, 1, 5] = x, v, w, s
-    turn = np.zeros((len(t), 2, 4))
-    turn[..., 0] = 1.0
-    return p, Track(t, place, turn, speed)
-
-
-@pytest.mark.parametrize("name", ["stick", "slide", "stop", "roll", "roll_to_rest", "spin_down", "lift"])
-def test_small_steps_of_coulombs_law_are_within_every_bound(name):
-    phenomenon = PHENOMENA[name]
-    p, track = one_body(name)
-    for q in phenomenon.quantities:
-        assert phenomenon.measure(p, track)[q.name] <= 0.1 * q.bound, q.name
-
-
-@pytest.mark.parametrize("name", ["slide", "stop", "roll", "roll_to_rest", "spin_down"])
-def test_friction_of_four_fifths_is_out_of_a_bound(name):
-    phenomenon = PHENOMENA[name]
-    p, track = one_body(name, wrong=0.8)
-    assert any(phenomenon.measure(p, track)[q.name] > q.bound for q in phenomenon.quantities)
