@@ -3,7 +3,6 @@
 import copy
 import gc
 import weakref
-from time import thread_time_ns
 
 import numpy as np
 import pytest
@@ -45,14 +44,6 @@ def test_friction_slides_and_sticks_in_the_scene():
     ]
     assert max(ratio) == pytest.approx(1.0, abs=1e-9)  # on the cone, to rounding
     assert min(ratio) < 0.99
-
-
-def test_sweeps_of_mujoco_are_judged_too():
-    model, data = state(solver="PGS")
-    assert lv.residual(lv.io.from_mujoco(model, data), adapter.impulse(model, data)).relative < PGS
-    model.opt.iterations, model.opt.tolerance, data.qacc_warmstart[:] = 2, 0.0, 0.0
-    mj.mj_forward(model, data)
-    assert lv.residual(lv.io.from_mujoco(model, data), adapter.impulse(model, data)).relative > 1e-3
 
 
 def test_what_solvers_here_find_is_the_acceleration_of_mujoco():
@@ -199,6 +190,7 @@ def test_where_mujoco_stopped_early_the_problem_is_the_same_and_its_answer_is_ju
     problem = lv.io.from_mujoco(model, data)
     assert problem == whole
     found = lv.residual(problem, adapter.impulse(model, data))
+    assert done.relative < (NEWTON if solver == "NEWTON" else PGS)
     assert found.velocity > max(1e-3, 1e3 * done.velocity)  # m/s
     assert found.verdict != "at its floor"
     mj.mj_step(model, data)
@@ -362,17 +354,8 @@ def test_after_a_step_of_rk4_the_accelerations_are_the_mean_of_four_passes(cone)
 
 # -- data that were changed -----------------------------------------------------------------------------
 
-WRONG = (-1, -(2**31), 2**31 - 1, 2**20, 1000)
-INDICES = (
-    "efc_id",
-    "efc_J_colind",
-    "efc_J_rowadr",
-    "efc_J_rownnz",
-    "contact.dim",
-    "M_colind",
-    "M_rowadr",
-    "M_rownnz",
-)
+INDICES = ("efc_id", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "contact.dim", "M_colind", "M_rowadr",
+           "M_rownnz")  # fmt: skip
 
 
 def entry(model, data, name):
@@ -382,7 +365,7 @@ def entry(model, data, name):
     return getattr(model if name.startswith("M_") else data, name)
 
 
-@pytest.mark.parametrize("value", WRONG)
+@pytest.mark.parametrize("value", [-1, 2**31 - 1, 1000])
 @pytest.mark.parametrize("name", INDICES)
 @pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
 def test_an_index_that_names_what_is_not_there_is_refused_before_it_is_followed(cone, name, value):
@@ -499,32 +482,6 @@ def test_data_of_a_step_and_of_a_forward_pass_agree_with_themselves(jacobian, in
             assert np.array_equal(stepped.b, problem.b)
         mj.mj_forward(model, data)
         problem = lv.io.from_mujoco(model, data)
-
-
-def test_a_state_after_a_step_is_imported_in_about_the_time_of_one_after_a_forward_pass():
-    ball = (
-        '<body pos=".3 0 0"><joint type="ball"/><joint type="slide"/><geom size=".1" pos=".1 0 .2"/>{}</body>'
-    )
-    arm = ball.format(ball.format('<body pos=".2 0 0"><joint axis="1 2 3"/><geom size=".1"/></body>'))
-    model = mj.MjModel.from_xml_string(
-        '<mujoco><worldbody><geom type="plane" size="9 9 1"/>'
-        f'<body pos="0 0 .09"><freejoint/><geom size=".1"/>{arm}</body></worldbody></mujoco>'
-    )
-    data = mj.MjData(model)
-    data.qvel[:] = np.random.default_rng(0).normal(size=model.nv)
-    before = data.qvel.copy()
-    least = {}
-    for made, run in ("forward", mj.mj_forward), ("step", mj.mj_step):
-        run(model, data)
-        problem, times = lv.io.from_mujoco(model, data), []
-        for _ in range(30):
-            start = thread_time_ns()
-            lv.io.from_mujoco(model, data)
-            times.append(thread_time_ns() - start)
-        least[made] = min(times)
-        found = problem.generalized.v_free - model.opt.timestep * data.qacc_smooth
-        np.testing.assert_allclose(found, before, atol=1e-12, rtol=0)
-    assert least["step"] < 2 * least["forward"]
 
 
 def test_joints_that_move_one_body_alike_hide_the_velocity_before_a_step():
