@@ -12,7 +12,7 @@ On a problem with rows, joints stay before contacts under every name.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,6 @@ class Order:
     def is_fixed(self) -> bool:
         """Every sweep runs in the same order."""
         return self.mode == GIVEN
-
-    def fresh(self) -> Order:
-        """A copy that can be swept without touching this one."""
-        return replace(self, blocks=self.blocks.copy(), rng=self.rng.copy())
 
 
 def block_order(

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from calls import BACKENDS, DEFINITE, installed
-from random_problems import as_matrix, random_contact_problem, random_rows, spd
+from random_problems import as_matrix, random_contact_problem, random_rows, spd, touching
 from worked import python
 
 import lavender as lv
@@ -169,6 +169,15 @@ def test_infeasible_is_claimed_with_a_proof_or_marked(name, linear):
         assert solution.contradicted == ""
     if solution.status in (lv.Status.CONVERGED, lv.Status.INFEASIBLE) and solution.certificate is None:
         assert solution.contradicted
+
+
+@pytest.mark.parametrize("name", installed("osqp", "clarabel", "qpalm"))
+def test_contradicting_rows_are_proved_in_the_velocity_form(name):
+    rows = touching([[-1, 0], [-1, 0]], normal=np.array([[0.0, 0, 1], [0, 0, -1.0]]))
+    problem = lv.Problem.from_rows(rows, [1.0, 1.0])  # up and down at 1 m/s
+    solution = lv.solve(problem, name, form="velocity")
+    assert solution.status is lv.Status.INFEASIBLE, str(solution)
+    assert check_certificate(problem, solution.certificate) is None
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -340,6 +349,12 @@ def test_an_unknown_setting_is_an_input_error(name):
 # -- failures of a backend ----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("name", ["osqp", "clarabel_cone"])
+def test_settings_must_be_a_mapping(name):
+    with pytest.raises(lv.InputError, match="mapping"):
+        lv.solve(lv.Problem.lcp(*spd(3)), name, settings=[1])
+
+
 @pytest.mark.parametrize(
     ("error", "status"),
     [
@@ -409,6 +424,12 @@ def test_tests_of_other_norms_are_no_false_claim(off, max_iter, status, words, r
     assert solution.iterations == 7 * solution.work["backend_calls"]
 
 
+def test_tol_zero_runs_at_the_tightest_tolerance():
+    solution = lv.solve(lv.Problem.lcp(*spd(10)), "clarabel", tol=0.0)
+    assert solution.status in (lv.Status.STALLED, lv.Status.FLOOR)
+    assert solution.residual.relative <= 1e-10
+
+
 def test_dense_backends_refuse_what_would_not_fit(monkeypatch):
     monkeypatch.setattr(qp_solver, "DENSE_LIMIT", 8 * 10 * 10)
     problem = lv.Problem.lcp(*spd(11))
@@ -438,6 +459,14 @@ def test_units_do_not_reach_the_backend():
         assert (one.P != two.P).nnz == 0 and (one.A != two.A).nnz == 0
     # A residual is relative to speeds.
     assert target(made[0], 1e-6) == target(made[1], 1e-6)
+
+
+def test_a_linear_system_as_equalities_has_its_solution():
+    a, b = spd(5)
+    qp = impulse_form(lv.Problem.linear(a, b), equality=True)
+    x, _, _ = qp.start(np.linalg.solve(a, b))
+    assert qp.n_zero == 5 and not qp.q.any()
+    np.testing.assert_allclose(qp.A @ x, qp.b, rtol=1e-10)
 
 
 def test_auto_takes_the_form_by_size_mass_ratio_and_backend():

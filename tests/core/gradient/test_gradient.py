@@ -295,6 +295,11 @@ def test_batches_of_another_length_are_refused():
         lv.derivatives([p], [s]).vjp(velocity=[1, 2])
     with pytest.raises(lv.InputError, match="a list of them is needed"):
         lv.derivatives(p, s)
+    found = lv.derivatives([p], [s]).vjp(impulse=[np.ones(p.m)])
+    with pytest.raises(AttributeError, match=r"gradients have no 'M' of all problems; \[i\]"):
+        found.M  # noqa: B018 - read
+    with pytest.raises(lv.InputError, match="full is of A, J, M; 'mu' is no matrix"):
+        found[0].full("mu")
     assert len(lv.derivatives([], [])) == 0 and lv.derivatives([], []).vjp(impulse=[]).b.tolist() == []
 
 

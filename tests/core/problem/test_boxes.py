@@ -93,6 +93,11 @@ def test_a_findex_that_is_none_is_told(lower, upper, findex, words):
         lv.Problem.from_findex(np.eye(3), np.ones(3), lower, upper, findex)
 
 
+def test_fixed_normals_make_constant_bounds():
+    boxed = free(1, contacts=1, mu=[(0.25, 0.5)]).boxed(2.0)
+    assert boxed.cones.upper.tolist() == [np.inf, 0.5, 1.0]
+
+
 def test_what_findex_cannot_hold_is_told():
     with pytest.raises(lv.InputError, match="3 rows follow row 0"):
         lv.Problem.from_findex(np.eye(4), np.ones(4), [0, -1, -1, -1], [np.inf, 1, 1, 1], [-1, 0, 0, 0])

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from random_problems import FORMS, as_matrix, random_contact_problem, touching
+from random_problems import FORMS, as_matrix, general, random_contact_problem, touching
 
 import lavender as lv
 from lavender import registry
@@ -180,3 +180,16 @@ def test_dust_beside_the_numbers_that_made_it_asks_nothing(form, name):
             assert lv.solve(problem, name, tol=1e-20).status is not lv.Status.INFEASIBLE
     real = walking(0, dust=1e-3)
     assert lv.solve(as_matrix(real) if form == "matrix" else real, name).status is lv.Status.INFEASIBLE
+
+
+def test_an_empty_row_of_bodies_may_be_dust_as_well():
+    rows = random_contact_problem(3, tangents=0, spin=False).rows
+    jac = rows.jac.copy()
+    jac[0] = 0.0
+    for form in (lambda p: p, as_matrix, general):
+        for dust, status in ((1e-17, "CONVERGED"), (1e-2, "INFEASIBLE")):
+            target = np.zeros(len(jac) + rows.n_contacts)
+            given = lv.Rows(**{f: getattr(rows, f) for f in rows.__dataclass_fields__ if f != "jac"}, jac=jac)
+            target[0] = dust
+            problem = form(lv.Problem.from_rows(given, target=target, tangents=0))
+            assert lv.solve(problem).status.name == status

@@ -61,6 +61,30 @@ def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
             )
 
 
+@pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
+@pytest.mark.parametrize("where", ["prepare", "run"])
+def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
+    class Breaks:
+        def prepare(self, problem):
+            if where == "prepare":
+                raise error
+
+        def update(self, state, problem):
+            return self.prepare(problem)
+
+        def run(self, state, impulse, n, tol, time_limit=None):
+            impulse[0] = np.nan
+            raise error
+
+    register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
+    solver = lv.prepare(random_lcp(4), "breaks")
+    for _ in range(2):
+        solution = solver.solve()
+        assert solution.status is lv.Status.NUMERICAL_ERROR
+        assert type(error).__name__ in solution.message
+        assert np.isfinite(solution.impulse).all()
+
+
 def test_a_solver_that_does_nothing_is_stopped(plug_in):
     name = plug_in(lambda problem, impulse: says(lv.Status.MAX_ITERATIONS).__class__(lv.Status.MAX_ITERATIONS, 0),
                    resumable=True)  # fmt: skip

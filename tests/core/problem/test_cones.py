@@ -119,6 +119,14 @@ PARTS = st.one_of(
 )  # fmt: skip
 
 
+@pytest.mark.parametrize("count", [-1, 2**31 - 1, 2**40])
+def test_counts_beyond_32_bits_are_refused(count):
+    with pytest.raises(lv.InputError, match=str(count)):
+        lv.Cones.free(count)
+    with pytest.raises(lv.InputError, match=str(count)):
+        lv.Cones.contacts(0.5, count=count)
+
+
 @given(first=PARTS, second=PARTS)
 def test_quick_ways_make_what_the_long_way_makes(first, second):
     both = first + second

@@ -224,6 +224,16 @@ def test_updated_is_the_same_structure_with_new_numbers():
         problem.updated(J=jac[:, 1:], target=0.0)
 
 
+@pytest.mark.parametrize(
+    "jac", [[[1.0, 1.0], [1.0, -1.0]], [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]]
+)
+def test_entries_of_a_that_vanish_are_left_out(jac):
+    """Colours and islands are told by entries: of rows that all meet in the same columns, and of others."""
+    n = len(jac)
+    problem = lv.Problem.from_jacobian(jac, np.eye(n), np.zeros(n), cones=lv.Cones.free(n))
+    assert problem.csr.nnz == n
+
+
 def test_nothing_of_the_judge_forms_a(monkeypatch):
     problem = random_general(6, "cone")
     monkeypatch.setattr("lavender.problem.operators.assemble.gram", None)  # which A = Y Y^T is formed by

@@ -122,6 +122,10 @@ BAD_PROBLEMS = {
         lambda: lv.Problem(np.ones(2), lv.Cones.free(2), I2, rows=random_rows(np.random.default_rng(0))),
         "one of them",
     ),
+    "round cones under Coulomb's law": (
+        lambda: lv.Problem(np.ones(4), lv.Cones.contacts(0.5, 3), np.eye(4)),
+        "more than two tangents has no Coulomb law",
+    ),
     "neither form": (lambda: lv.Problem(np.ones(2), lv.Cones.free(2)), "one of them"),
     "cones": (lambda: lv.Problem(np.ones(2), None, I2), "a Cones is needed"),
     "masked b": (lambda: lv.Problem.lcp(I2, GAP), r"b \[m/s\] has no value at \[1\], 1 masked in all"),

@@ -1,37 +1,21 @@
 """Rows at the door: the quick checks refuse and accept what the long way does."""
 
-from dataclasses import replace
+import dataclasses
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from random_problems import random_rows
 
 import lavender as lv
 from lavender_ext.core import checks
 
 
-def fields(seed, bodies=3, contacts=4, joints=2):
-    """Arrays of legal rows: joints of 1 to 5 rows, contacts between random bodies or a body and the ground."""
-    rng = np.random.default_rng(seed)
-    ptr = np.concatenate([[0], np.cumsum(rng.integers(1, 6, joints))]).astype(np.int32)
-    turn = np.linalg.qr(rng.normal(size=(contacts, 3, 3)))[0]
-    root = rng.normal(size=(bodies, 3, 3))
-    pairs = [rng.permutation(np.arange(-1, bodies))[:2] for _ in range(contacts + joints)]
-    pairs = np.array(pairs, np.int32).reshape(-1, 2)
-    return {
-        "inv_mass": rng.uniform(0.1, 2.0, bodies),
-        "inv_inertia": root @ root.transpose(0, 2, 1) + 0.01 * np.eye(3),
-        "v_free": rng.normal(size=(bodies, 6)),
-        "jac": rng.normal(size=(ptr[-1], 12)),
-        "joint_ptr": ptr,
-        "joint_body": pairs[contacts:],
-        "normal": np.ascontiguousarray(turn[:, 0]),
-        "tangent": np.ascontiguousarray(turn[:, 1]),
-        "arm_a": rng.normal(size=(contacts, 3)),
-        "arm_b": rng.normal(size=(contacts, 3)),
-        "contact_body": pairs[:contacts],
-    }
+def fields(seed):
+    """Arrays of legal rows: joints of 1 to 3 rows, contacts between random bodies or a body and the ground."""
+    rows = random_rows(np.random.default_rng(seed), bodies=3, joints=2, contacts=4)
+    return {f.name: np.array(getattr(rows, f.name)) for f in dataclasses.fields(rows) if f.name != "copy"}
 
 
 SPOILT = {
@@ -156,16 +140,16 @@ def test_impulses_are_carried_by_key_and_new_blocks_start_from_nothing():
     impulse = np.arange(1.0, 8.0)
     wanted = [7.0, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 0.0]  # 2 has lost its tangents: it starts anew
     assert now.carry((before, impulse)).tolist() == wanted
-    assert replace(now, key=None).carry((before, impulse), keys=[9, 5, 7, 2]).tolist() == wanted
+    assert dataclasses.replace(now, key=None).carry((before, impulse), keys=[9, 5, 7, 2]).tolist() == wanted
     solution = lv.solve(before, tol=1e-9)
     assert np.array_equal(before.carry(solution), solution.impulse)
     three, four = (lv.Problem.lcp(np.eye(n), np.ones(n)) for n in (3, 4))  # without keys, by the same blocks
     assert three.carry((three, np.ones(3))).all() and not four.carry((three, np.ones(3))).any()
-    assert np.array_equal(replace(before, key=None).carry(solution), solution.impulse)
+    assert np.array_equal(dataclasses.replace(before, key=None).carry(solution), solution.impulse)
     for bad, keys, words in (
         (np.zeros(7), None, "a Solution"),
         (solution, [1, 2], "2"),
-        ((replace(before, key=None), impulse), [9, 5, 7, 2], "has no keys"),
+        ((dataclasses.replace(before, key=None), impulse), [9, 5, 7, 2], "has no keys"),
     ):
         with pytest.raises(lv.InputError, match=words):
             now.carry(bad, keys)

@@ -195,6 +195,15 @@ def test_those_whose_turn_comes_too_late_keep_their_start(clock, monkeypatch):
         lv.solve_many([problems[0], dense(30, "cone")], "direct", time_limit=0.5)
 
 
+@pytest.mark.parametrize("name", ["auto", "pgs"])
+def test_a_world_of_j_and_m_whose_turn_comes_too_late_says_so(name):
+    """Its numbers are the compiled loop's; a solver without a compiled call of its own had no words for them."""
+    worlds = [over_velocities(6, 4, seed) for seed in range(3)]
+    for late in lv.solve_many(worlds, name, time_limit=1e-9):
+        assert (late.status, late.iterations, dict(late.work)) == (lv.Status.TIME_LIMIT, 0, {})
+        assert "time limit" in late.message and not late.impulse.any() and str(late)
+
+
 def test_the_first_solve_imports_nothing():
     """0.2 to 0.45 s went into it, in the first call of a control loop."""
     code = """

@@ -98,6 +98,29 @@ def test_the_compiled_factorisation_solves_any_free_set(seed, m, band, bound):
         np.testing.assert_allclose(rows.best.impulse, expected, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.parametrize("a", [tridiagonal(400), sp.csr_array(tridiagonal(400) @ tridiagonal(400))])
+def test_bounded_rows_of_a_strip_are_a_band_whatever_they_are_called(a):
+    problem = lv.Problem.lcp(shuffled(np.random.default_rng(2), a), np.ones(400))
+    assert lv.solve(problem, "direct").solver.form == "band"
+
+
+@pytest.mark.parametrize("m", [90, 300])
+@pytest.mark.parametrize("shape", ["dense", "sparse"])
+def test_larger_semidefinite_problems_need_descent(m, shape):
+    rng = np.random.default_rng(m)
+    if shape == "dense":
+        g = rng.normal(size=(m, m // 2))
+    else:
+        g = np.where(rng.random((m, m // 2)) < 3.0 / m, rng.random((m, m // 2)), 0.0)
+    a = sp.csr_array(g @ g.T)
+    b = a @ np.maximum(rng.uniform(-0.3, 1.0, m), 0.0) - np.where(rng.random(m) < 0.5, rng.random(m), 0.0)
+    problem = lv.Problem.lcp(a, b)
+    solution = lv.solve(problem, "direct", tol=1e-9)
+    assert solution.success, solution
+    assert "singular" in solution.message
+    assert solution.work["shifts"] >= 1
+
+
 def test_a_stack_takes_one_factorisation():
     """Impulses pass through the whole stack in the sweeps that guess the free rows."""
     m = 2000

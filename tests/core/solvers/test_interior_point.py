@@ -11,6 +11,8 @@ from kkt_truth import of_program as kkt
 import lavender as lv
 from lavender.base.deadline import NEVER, Deadline
 from lavender.solvers import interior_point
+from lavender_ext.core.assemble import mirrored, transposed
+from lavender_ext.newton.program import Iterate, balanced, scaled
 
 
 def chained(seed, n=150, singular=False):
@@ -68,6 +70,26 @@ def test_controls_that_are_coupled_from_stage_to_stage_are_solved_by_an_interior
     answer = lv.solve_qp(problem, tol=1e-6)
     assert answer.found and "interior point" in answer.solution.message
     np.testing.assert_allclose(answer.x, lv.solve_qp(problem, "newton", tol=1e-6).x, atol=1e-4)
+
+
+def linear_program(seed, n):
+    """min q.x, A x = b, x >= 0 with sparse rows, of a known solution x and multipliers."""
+    rng = np.random.default_rng(seed)
+    A = sp.random_array(
+        (n // 2, n), density=5.0 / n, rng=rng, data_sampler=lambda size: rng.normal(size=size)
+    )
+    x = rng.random(n) * (rng.random(n) < 0.5)
+    q = A.T @ rng.normal(size=n // 2) + rng.random(n) * (x == 0.0)
+    return {"P": sp.csr_array((n, n)), "q": q, "A": A.tocsr(), "b": A @ x, "lb": np.zeros(n)}, q @ x
+
+
+@pytest.mark.parametrize(("seed", "n"), [(0, 300), (1, 800)])
+def test_linear_programs_of_many_variables_reach_their_optimum(seed, n):
+    """A tenth of the error is the objective's: x and multipliers are of size 1 to 100 in q.x - b.y."""
+    program, optimum = linear_program(seed, n)
+    answer = lv.solve_qp(lv.Problem.from_qp(**program))
+    assert answer.found and [turn.solver for turn in answer.solution.turns] == ["interior point"]
+    assert abs(answer.objective - optimum) <= 1e-7 * (1.0 + abs(optimum))
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -164,3 +186,92 @@ def test_a_second_factor_is_not_begun_where_the_first_tells_that_it_ends_too_lat
     monkeypatch.setattr(point.system, "factor", lambda theta: (time.sleep(0.05), factor(theta)))
     point.run(1e-9, Deadline(0.08), lambda impulse: None)
     assert point.factorisations == 1 and point.late
+
+
+def laid_out(seed):
+    """P (n, n), J (m, n) full, as matrices in compressed rows, q and target; some rows and columns empty."""
+    rng = np.random.default_rng(seed)
+    n, m = int(rng.integers(1, 9)), int(rng.integers(1, 12))
+    root = rng.normal(size=(n, n)) * (rng.random((n, n)) < 0.4)
+    P, J = root.T @ root, rng.normal(size=(m, n)) * (rng.random((m, n)) < 0.5)
+    lower = sp.csr_array(np.tril(P) + np.eye(n))  # each has its diagonal
+    lower.data[lower.indptr[1:] - 1] -= 1.0
+    j = sp.csr_array(J)
+    j = tuple(x.astype(t) for x, t in zip((j.indptr, j.indices, j.data), "iid", strict=True))
+    p = mirrored(
+        *(x.astype(t) for x, t in zip((lower.indptr, lower.indices, lower.data), "iid", strict=True))
+    )
+    return P, J, p, j, rng.normal(size=n), rng.normal(size=m), rng
+
+
+def full(matrix, shape):
+    return sp.csr_array(matrix[::-1], shape=shape).toarray()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_balanced_rows_and_columns_have_entries_near_1(seed):
+    P, J, p, j, _, _, rng = laid_out(seed)
+    m, n = J.shape
+    units = 10.0 ** rng.uniform(-4, 4, n), 10.0 ** rng.uniform(-4, 4, m)
+    column, row = balanced(scaled(p, units[0], units[0]), scaled(j, units[1], units[0]), 30)
+    P, J = (
+        (column * units[0])[:, None] * P * column * units[0],
+        (row * units[1])[:, None] * J * column * units[0],
+    )
+    whole = np.abs(np.block([[P, J.T], [J, np.zeros((m, m))]]))
+    largest = whole.max(axis=0)
+    # Ruiz halves the logarithm in each pass: 30 leave 2^-30 of a factor of 1e16.
+    np.testing.assert_allclose(largest[largest > 0.0], 1.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_iterate_measures_and_steps_as_its_formulas_say(seed):
+    """And what is left of a solution with rho and delta in it."""
+    _, J, p, j, q, target, rng = laid_out(seed)
+    m, n = J.shape
+    P, free = full(p, (n, n)), int(rng.integers(0, m + 1))
+    at = Iterate(p, j, transposed(*j, n), q, target, free)
+    assert at.theta.tolist() == [0.0] * free + [1.0] * (m - free)
+    at.begin(rng.normal(size=n + m))
+    x, lam, w = at.x.copy(), at.lam.copy(), at.w.copy()
+    assert (w[:free] == 0.0).all() and min(w[free:].min(initial=1.0), lam[free:].min(initial=1.0)) > 0.0
+    rows, forces, gap, left, proves = at.measure()
+    dual, primal = P @ x + q - J.T @ lam, J @ x - target - w
+    short = np.minimum(w, lam)[free:].max(initial=0.0)
+    mean = w @ lam / m
+    sizes = [np.abs(v).max() for v in (P @ x, q, J.T @ lam)]
+    along = max(np.abs(J @ x).max(), np.abs(target).max())
+    terms = np.array([x @ P @ x, q @ x, -target @ lam])
+    np.testing.assert_allclose(rows, max(short, np.abs(primal).max()) / along, rtol=1e-12)
+    np.testing.assert_allclose(forces, np.abs(dual).max() / max(sizes), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(gap, abs(terms.sum()) / np.abs(terms).max(), rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(left, max(np.abs(dual).max(), np.abs(primal).max(), mean), rtol=1e-12)
+    sums = (np.abs(J.T) @ np.abs(lam)).max()
+    if target @ lam > 0.0:
+        np.testing.assert_allclose(proves, sizes[2] / sums if sums > 0.0 else 0.0, rtol=1e-9, atol=1e-15)
+    else:
+        assert proves == np.inf
+    theta = at.theta.copy()
+    np.testing.assert_allclose(theta[free:], (w / lam)[free:], rtol=1e-15)
+    system = np.block([[P + 1e-3 * np.eye(n), J.T], [J, -np.diag(theta + 1e-3)]])
+    u = np.linalg.solve(system, at.right)
+    whole = system - 1e-3 * np.diag(np.r_[np.ones(n), -np.ones(m)])
+    rest = at.right - whole @ u
+    np.testing.assert_allclose(at.left_of(u), np.abs(rest).max() / np.abs(at.right).max(), rtol=1e-9)
+    np.testing.assert_allclose(at.rest, rest, atol=1e-12 * (1.0 + np.abs(rest).max()))
+    if free < m:
+        z, dz = lam[free:], -u[n + free :]
+        ds = -w[free:] - theta[free:] * dz
+        ways = [1.0, *(-v / d for v, d in zip([*w[free:], *z], [*ds, *dz], strict=True) if d < 0.0)]
+        t, mu = min(ways), w[free:] @ z / (m - free)
+        after = (w[free:] + t * ds) @ (z + t * dz) / (m - free)
+        second = (ds * dz - mu * (after / mu) ** 3) / z
+        right = at.right.copy()
+        at.correct(u)
+        right[n + free :] -= second
+        np.testing.assert_allclose(at.right, right, rtol=1e-9, atol=1e-12 * np.abs(right).max())
+    at.step(u)
+    moved = np.r_[at.x - x, lam - at.lam]
+    t = moved @ u / (u @ u)
+    np.testing.assert_allclose(moved, t * u, atol=1e-9 * (1.0 + np.abs(u).max()))
+    assert 0.0 < t <= 1.0 and min(at.w[free:].min(initial=1.0), at.lam[free:].min(initial=1.0)) > 0.0

@@ -23,6 +23,16 @@ def worlds(n, m=12, nv=18, seed=0, dtype=np.float64):
     return jac.astype(dtype), mass.astype(dtype), free.astype(dtype)
 
 
+def balls(inv_mass, **more):
+    """Fields of one ball on the ground in each world."""
+    ball = {
+        "inv_mass": inv_mass, "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)), "contact_body": [(-1, 0)],
+        "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)], "arm_a": [(0.0, 0.0, 0.0)],
+        "arm_b": [(0.0, 0.0, -0.1)],
+    }  # fmt: skip
+    return ball | more
+
+
 def assert_same(many, i, single):
     """The arrays and the Solution of world i have the bits of a single solve."""
     own, found = many[i], single.residual
@@ -44,13 +54,8 @@ def test_what_came_of_many_is_copied_and_pickled(again):
     """Solutions, verdicts and derivatives, of a batch and of a list in which each goes another way."""
     batch = lv.Batch(*worlds(3), cones=DISKS)
     mixed = [batch[0], lv.Problem.contact(np.eye(3), np.ones(3), mu=[(0.5, 0.2)]), batch[1]]
-    ball = {
-        "inv_mass": np.ones((3, 1)), "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)),
-        "contact_body": [(-1, 0)], "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)],
-        "arm_a": [(0.0, 0.0, 0.0)], "arm_b": [(0.0, 0.0, -0.1)],
-    }  # fmt: skip
     matrices = lv.Batch.of_matrices(np.array([np.eye(12)] * 3), np.ones((3, 12)), cones=DISKS)
-    for given in (batch, mixed, matrices, lv.Batch.of_bodies(ball, mu=0.5)):
+    for given in (batch, mixed, matrices, lv.Batch.of_bodies(balls(np.ones((3, 1))), mu=0.5)):
         many = lv.solve_many(given, tol=1e-10)
         found = lv.residual_many(given, [s.impulse for s in many])
         twin, verdicts = again(many), again(found)
@@ -340,13 +345,10 @@ def test_matrices_and_bodies_go_the_same_way():
     assert many.impulse.shape == (4, 6)
     for i in range(4):
         assert_same(many, i, lv.solve(lv.Problem.contact(a[i], b[i], [0.4, 0.4], friction="cone")))
-    fields = {
-        "inv_mass": np.array([[0.5], [1.0], [2.0]]), "inv_inertia": np.eye(3)[None], "contact_body": [(-1, 0)],
-        "v_free": np.array([[[0.5, 0.0, -v, 0.0, 0.0, 0.0]] for v in (1.0, 2.0, 3.0)]),
-        "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)], "arm_a": [(0.0, 0.0, 0.0)],
-        "arm_b": [(0.0, 0.0, -0.1)],
-    }  # fmt: skip
-    many = lv.solve_many(lv.Batch.of_bodies(fields, mu=0.5, target=0.1))
+    v = np.array([[[0.5, 0.0, -v, 0.0, 0.0, 0.0]] for v in (1.0, 2.0, 3.0)])
+    many = lv.solve_many(
+        lv.Batch.of_bodies(balls(np.array([[0.5], [1.0], [2.0]]), v_free=v), mu=0.5, target=0.1)
+    )
     assert many.impulse.shape == (3, 3) and many.success.all()
     assert many.impulse[:, 0] == pytest.approx([2.2, 2.1, 1.55], rel=1e-5)  # m (v + 0.1), s
     assert many.velocity.reshape(3, 6)[:, 2] == pytest.approx(0.1, rel=1e-5)
@@ -388,11 +390,7 @@ def test_bodies_in_arrays_have_the_bits_of_single_solves(mu, friction, monkeypat
 
 def test_bodies_whose_rows_differ_between_worlds_are_told_so():
     """No mu, no tangents, unless they are asked for: ten rows went into the place of twelve."""
-    ball = {
-        "inv_mass": np.ones((2, 1)), "inv_inertia": np.eye(3)[None], "v_free": -np.ones((1, 6)),
-        "contact_body": [(-1, 0)], "normal": [(0.0, 0.0, 1.0)], "tangent": [(1.0, 0.0, 0.0)],
-        "arm_a": [(0.0, 0.0, 0.0)], "arm_b": [(0.0, 0.0, -0.1)],
-    }  # fmt: skip
+    ball = balls(np.ones((2, 1)))
     mu = np.array([[0.5], [0.0]])
     with pytest.raises(lv.InputError, match="friction is 'wet'"):
         lv.Batch.of_bodies(ball, friction="wet")

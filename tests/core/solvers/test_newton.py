@@ -186,7 +186,7 @@ def test_a_compliance_costs_interior_points_no_more_steps(compliance):
 @pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
 @given(seed=seeds)
 @settings(max_examples=20)
-def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
+def test_interior_point_system_is_solved_and_its_steps_stay_inside_and_know_the_judges_errors(form, seed):
     problem = random_contact_problem(seed, friction="cone", bodies=6, contacts=10)
     system = system_in(problem, form)
     solve = sc = system.solve
@@ -202,9 +202,16 @@ def test_interior_point_system_is_solved_and_its_steps_stay_inside(form, seed):
         expected = np.linalg.solve(np.eye(sc.m) + v @ h, v @ r)
         # With delta = 1e-6 V is at most 1e6: ten digits are lost at most.
         np.testing.assert_allclose(x, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-        assert solve.advance()[0]
+        went, _, _, energy, velocity = solve.advance()
+        assert went
         row = np.diff(sc.part) == 0
         whole = solve.point[0]
+        lam = sc.fixed.copy()
+        lam[sc.keep] = whole * sc.scale
+        truth = lv.residual(problem, lam)
+        # The running slack against one computed afresh; fixed rows are right by construction.
+        assert energy == pytest.approx(truth.energy, rel=1e-6, abs=1e-9 * truth.energy_start)
+        assert velocity == pytest.approx(truth.velocity, rel=1e-6, abs=1e-9 * truth.velocity_start)
         z = whole[sc.ptr[:-1]]
         assert np.all(z[row] > sc.lower[sc.ptr[:-1]][row])
         assert np.all(z[row] < sc.upper[sc.ptr[:-1]][row])

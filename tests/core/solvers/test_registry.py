@@ -48,6 +48,12 @@ def test_a_spec_that_makes_no_sense_is_refused(wrong):
         dataclasses.replace(SPEC, **wrong)
 
 
+def test_a_missing_package_is_named_with_what_installs_it():
+    spec = dataclasses.replace(SPEC, requires=("numpy", "no_such_module_1"), install="no-such-package")
+    assert spec.missing() == "needs no_such_module_1: pip install no-such-package"
+    assert dataclasses.replace(SPEC, requires=("numpy",)).missing() is None
+
+
 def test_a_factory_that_is_not_there_or_makes_no_solver_is_named(register, tmp_path, monkeypatch):
     for factory in ("no_such_module_1:Solver", "math:Solver"):
         register(lv.SolverSpec("absent", factory, {"lcp"}, summary="of a test"), replace=True)
@@ -144,6 +150,21 @@ def test_a_plug_in_that_would_end_the_process_raises_an_error(where, register):
     register(named("exits", factory=type("Exits", (), {n: method(n, r) for n, r in results.items()})))
     with pytest.raises(RuntimeError, match=rf"'exits' called sys.exit\(3\) in {where}"):
         lv.prepare(TINY, "exits").solve(lv.Problem.lcp(np.eye(2), [2.0, 1.0]))
+
+
+def test_a_plug_in_without_update_is_prepared_anew(register):
+    class Bare:
+        def prepare(self, problem):
+            return problem
+
+        def run(self, state, impulse, n, tol, time_limit):
+            impulse[:] = state.b  # of A = 1
+            return lv.Claim(lv.Status.CONVERGED, 1)
+
+    register(named("bare", factory=Bare))
+    solver = lv.prepare(TINY, "bare")
+    assert solver.solve().success
+    assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
 
 
 def test_a_refusal_names_the_way_round():

@@ -49,6 +49,14 @@ def test_writing_out_keeps_joints_spin_and_warm_starts(seed, monkeypatch):
         )
 
 
+def test_a_stalled_run_gives_its_best_iterate_in_the_problems_order(pile, monkeypatch):
+    monkeypatch.setattr(layout, "LARGE", 1)
+    solver = lv.prepare(pile, "sequential_impulses", order="local")
+    solver.solve(tol=1e-30, max_iter=40)
+    relative, impulse = solver.state.best
+    assert lv.residual(pile, impulse).relative == pytest.approx(relative, rel=1e-9)
+
+
 def test_an_array_that_mixes_joints_and_contacts_is_not_written_out(monkeypatch):
     monkeypatch.setattr(layout, "LARGE", 1)
     problem = random_contact_problem(1, bodies=6, joints=3, contacts=9)
@@ -97,6 +105,13 @@ def test_local_brings_bodies_that_touch_together(pile, monkeypatch):
     blocks = block_order(pile, "local").blocks
     low = np.where(body < 0, len(rank), rank[body]).min(axis=1)[blocks]
     assert (np.diff(low) >= 0).all()
+
+
+def test_local_takes_a_matrix_too(pile):
+    matrix = lv.Problem.contact(pile.delassus(), pile.b, pile.cones.mu)
+    blocks = block_order(matrix, "local").blocks
+    assert sorted(blocks.tolist()) == list(range(matrix.n_blocks))
+    assert lv.solve(matrix, "pgs", order="local", tol=1e-6, max_iter=5000).success
 
 
 @pytest.mark.parametrize("order", ("given", *ORDERS, "symmetric", "random"))
