@@ -110,7 +110,7 @@ def test_every_motion_of_the_example_is_a_solution_and_they_differ():
 
 def test_drift_follows_the_motion_error_over_runs(monkeypatch):
     module = example("motion_over_a_run")
-    monkeypatch.setattr(module, "STEPS", 30)
+    monkeypatch.setattr(module, "STEPS", 12)
     monkeypatch.setattr(module, "SWEEPS", (4, 64))
     found = module.numbers()
     assert all(value > 0.8 for value in module.ranks(found).values())

@@ -265,7 +265,7 @@ def test_every_import_is_declared():
         "qoco",
         "siconos",
         "warp",
-    }  # peers, used where they are installed
+    }  # if installed
     known |= {"flint"}  # python-flint, of the extra `proof`
     known |= {"ray"}  # a cluster that campaigns can use where it is installed
     known |= set(sys.stdlib_module_names) | {"lavender", "lavender_ext"}
@@ -336,12 +336,8 @@ def test_what_is_being_written_is_in_no_distribution(tmp_path):
     code = "from setuptools.command.egg_info import FileList; files = FileList(); "
     code += f"[files.process_template_line(line) for line in {rules}]; print(*sorted(files.files))"
     done = python("-c", code, cwd=tmp_path)
-    assert done.stdout.split() == [
-        "docs/a.h",
-        "docs/a.wasm",
-        "lavender/sim/web/a.h",
-        "lavender/sim/web/a.wasm",
-    ]
+    kept = ("docs/a.h", "docs/a.wasm", "lavender/sim/web/a.h", "lavender/sim/web/a.wasm")
+    assert done.stdout.split() == [*kept]
 
 
 def test_a_build_that_is_killed_leaves_no_word_that_its_files_are_current(tmp_path):

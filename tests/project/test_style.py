@@ -63,8 +63,9 @@ def private_names(tree):
             taken = taken if taken[0] in ("lavender", "lavender_ext", "benchmarks") else []
         elif isinstance(node, ast.Import):
             taken = [part for name in node.names for part in name.name.split(".")[1:]]
-        elif isinstance(node, ast.Attribute) and ast.unparse(node.value) not in ("self", "cls"):
-            taken = [node.attr]
+        elif isinstance(node, ast.Attribute):
+            own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
+            taken = [] if own else [node.attr]
         elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
             "setattr",
             "getattr",
