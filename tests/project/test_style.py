@@ -24,11 +24,16 @@ def classes_with_fields():
     return names
 
 
+def called(node):
+    """The last word of what a call calls."""
+    return getattr(node.func, "attr", getattr(node.func, "id", ""))
+
+
 def long_calls(tree, names):
     """Line and name of every construction of more than MOST fields by place."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Call) and len(node.args) > MOST:
-            name = ast.unparse(node.func).rpartition(".")[2]
+            name = called(node)
             if name in names and not ast.unparse(node.func).startswith("qpsolvers."):
                 yield node.lineno, name
 
@@ -66,10 +71,7 @@ def private_names(tree):
         elif isinstance(node, ast.Attribute):
             own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
             taken = [] if own else [node.attr]
-        elif isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in (
-            "setattr",
-            "getattr",
-        ):
+        elif isinstance(node, ast.Call) and called(node) in ("setattr", "getattr"):
             words = [a.value for a in node.args if isinstance(a, ast.Constant) and isinstance(a.value, str)]
             taken = [part for word in words[:1] for part in word.split(".")]
         if any(PRIVATE.fullmatch(part) and part not in DOCUMENTED for part in taken):

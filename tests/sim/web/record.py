@@ -19,14 +19,14 @@ from newton_steps import NewtonSteps
 import lavender as lv
 from lavender.sim.web.scenes import describe, layout
 
-STEPS = 600
+STEPS = 300
 BODY_ARRAYS = ("x", "q", "v")
 
 #: Gallery scene, parameters, and what is changed before which step.
 SCENES = [
-    ("stack", {}, {200: {"warm_start": 0}, 400: {"warm_start": 1}}),
+    ("stack", {}, {100: {"warm_start": 0}, 200: {"warm_start": 1}}),
     ("stack", {"substeps": 1}, {}),
-    ("pyramid", {"base": 8}, {300: {"iterations": 4}}),
+    ("pyramid", {"base": 8}, {150: {"iterations": 4}}),
     ("chain", {"tip_mass": 5.0}, {}),
     ("spinner", {}, {}),
     ("pile", {"n": 60, "kind": "mixed", "substeps": 2}, {}),
@@ -46,9 +46,9 @@ SCENES = [
 
 
 #: The same for Newton's method on both sides of the border: joints and contacts alone and together, spin, cold starts.
-NEWTON_STEPS = 120
+NEWTON_STEPS = 80
 NEWTON_SCENES = [
-    ("stack", {}, {40: {"warm_start": 0}, 80: {"warm_start": 1}}),
+    ("stack", {}, {20: {"warm_start": 0}, 60: {"warm_start": 1}}),
     ("pyramid", {"base": 5, "friction": 0.15}, {}),
     ("pile", {"n": 12, "kind": "mixed"}, {}),
     ("pyramid", {"base": 4, "friction_shape": "box"}, {}),
