@@ -12,7 +12,7 @@ import problems
 import lavender as lv
 from lavender import io
 
-WHAT = ("memory", "far", "far", "command")
+WHAT = ("memory", "memory", "far", "far", "command")
 INDICES = ("efc_id", "efc_type", "efc_J_colind", "efc_J_rowadr", "efc_J_rownnz", "dim", "geom", "M_colind", "M_rowadr",
            "M_rownnz")  # fmt: skip
 NUMBERS = ("efc_J", "efc_R", "efc_D", "efc_aref", "efc_force", "efc_frictionloss", "efc_vel", "efc_b", "qacc",
@@ -101,6 +101,7 @@ def memory(spec):
     data = mj.MjData(made)
     data.qpos[:], data.qvel[:] = qpos, qvel
     mj.mj_forward(made, data)
+    right = io.from_mujoco(made, data)
     before = {name: np.array(getattr(made, name)) for name in INDICES if name.startswith("M_")}
     options = {name: getattr(made.opt, name) for name in OPTIONS if hasattr(made.opt, name)}
     try:
@@ -115,11 +116,36 @@ def memory(spec):
                 continue
             if isinstance(found, lv.Problem) and not np.isfinite(found.b).all():
                 yield "wrong number", "a problem from changed memory is not finite"
+            if (
+                isinstance(found, lv.Problem)
+                and not any(map(another, spec["edits"]))
+                and not alike(found, right)
+            ):
+                yield "wrong number", f"another problem from memory with {spec['edits'][0][0]} changed"
     finally:
         for name, values in before.items():
             getattr(made, name)[:] = values
         for name, value in options.items():
             setattr(made.opt, name, value)
+
+
+def another(edit):
+    """Whether a change may make another problem that is one: an option, a bound, a number of what is there.
+
+    An entry of M or J that nothing moves or pushes has made nothing that it could be held to.
+    """
+    name, _, value = edit
+    there = name in ("efc_id", "efc_type", "dim") and 0 <= value < 100
+    return name in OPTIONS or name in ("efc_frictionloss", "efc_J", "M") or there
+
+
+def alike(found, right):
+    """The same but for rounding."""
+    if found.cones != right.cones:
+        return False
+    of = [(p.b, p.compliance, p.generalized.v_free, p.jacobian.toarray(), p.generalized.mass.toarray())
+          for p in (found, right)]  # fmt: skip
+    return all(np.allclose(x, y, rtol=1e-5, atol=1e-6) for x, y in zip(*of, strict=True))
 
 
 def named(made, data):
