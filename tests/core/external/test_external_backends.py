@@ -47,6 +47,8 @@ def test_an_absent_backend_says_what_to_install():
     assert absent, "no machine has all of them"
     for backend in absent:
         assert f"pip install {backend.install}" in reasons[backend.name]
+        with pytest.raises(lv.SolverUnavailable, match="pip install"):
+            registry.get(backend.name)
 
 
 @pytest.mark.parametrize("name", BACKENDS)

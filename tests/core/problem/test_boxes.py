@@ -1,17 +1,18 @@
-"""Contacts that bound each tangent by itself: blocks, findex, pivoting, ellipses."""
+"""Two coefficients of a contact: boxes, which bound each tangent by itself, findex, pivoting; ellipses, which share."""
 
 from dataclasses import replace
 
 import hypothesis.strategies as st
 import numpy as np
 import pytest
+from calls import free as ellipses
+from calls import on_rows
 from hypothesis import given, settings
-from random_problems import dragged, random_boxes, seeds
+from random_problems import as_matrix, dragged, random_boxes, seeds
 
 import lavender as lv
 from lavender import registry
 from lavender.problem.cones import project
-from lavender.solvers.polyhedral import as_rows
 
 LAWS = ("coulomb", "cone")
 
@@ -136,21 +137,55 @@ def test_a_solver_of_others_is_not_handed_a_box_it_knows_nothing_of():
         registry.SolverSpec("theirs", lambda: None, frozenset({"coulomb"}), "", boxes=frozenset({"lcp"}))
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_the_bounded_rows_hold_what_they_stand_for(law):
-    problem = free(4, friction=law)
-    form = as_rows(problem)
-    rng = np.random.default_rng(0)
-    lam = np.abs(rng.normal(size=problem.m))
-    lam[1::3] = lam[::3] * problem.cones.coefficients[:, 0] * rng.uniform(-1, 1, 4)
-    lam[2::3] = lam[::3] * problem.cones.coefficients[:, 1] * rng.uniform(-1, 1, 4)
-    z = form.start(lam)
-    assert z.min() >= 0.0
-    np.testing.assert_allclose(form.back @ z, lam, atol=1e-13)
-    if law == "cone":  # its edges: symmetric, and no more than what the cone's dual asks
-        assert form.rows.asymmetry <= 1e-15
-    else:  # copositive, which ends Lemke's path at a solution
-        a = form.rows.csr
-        for _ in range(200):
-            x = rng.exponential(size=form.rows.m) * (rng.random(form.rows.m) < 0.7)
-            assert x @ (a @ x) >= -1e-12 * (abs(x) @ (abs(a) @ abs(x)))
+# -- ellipses --------------------------------------------------------------------------------------------------------
+
+
+def test_coefficients_come_back_and_equal_ones_are_a_disk():
+    mu = np.array([[0.5, 0.2], [0.02, 0.8], [0.3, 0.3], [0.0, 0.0]])
+    cones = lv.Cones.contacts(mu)
+    assert cones.has_ellipse
+    assert not cones.is_polyhedral
+    np.testing.assert_allclose(cones.coefficients, mu, rtol=1e-15)
+    np.testing.assert_allclose(cones.reach.reshape(-1, 3)[:, 1:], mu, rtol=1e-15)
+    np.testing.assert_allclose(cones.stretch.reshape(-1, 3)[:2], [[1, 1, 0.4], [1, 0.025, 1]], rtol=1e-15)
+    assert lv.Cones.contacts([(0.5, 0.5), (0.0, 0.0)]) == lv.Cones.contacts([0.5, 0.0])
+    assert (lv.Cones.free(2) + cones).has_ellipse
+    assert lv.Problem.contact(np.eye(3), np.ones(3), [(0.5, 0.5)]).disk.cones.kind.tolist() == [lv.CONTACT]
+    x = np.array([1.0, 3.0, 4.0, 1.0, 0.0, 0.1, 1.0, 0.3, 0.0, -1.0, 1.0, 1.0])
+    t = lv.cones.project(cones, x).reshape(-1, 3)
+    np.testing.assert_allclose(np.hypot(*(t[0, 1:] / mu[0])), 1.0)
+    np.testing.assert_allclose(t[1:, 1:], [[0, 0.1], [0.3, 0.0], [0, 0]], atol=1e-15)
+
+
+ELLIPSES = {"generalized": ellipses, "matrix": lambda *a, **k: as_matrix(ellipses(*a, **k)), "rows": on_rows}
+
+
+@pytest.mark.parametrize("form", ELLIPSES)
+def test_what_comes_back_is_in_the_rows_of_the_problem(form):
+    problem = ELLIPSES[form](3, friction="cone")
+    s, calls = problem.cones.stretch, []
+    found = lv.solve(
+        problem, "anderson", tol=1e-6, max_iter=5, callback=lambda n, x, r: calls.append((x, r)) and None
+    )
+    r = lv.residual(problem, found.impulse)
+    np.testing.assert_allclose(
+        found.slack, problem.dense() @ found.impulse - problem.b, rtol=1e-9, atol=1e-12
+    )
+    np.testing.assert_allclose(found.residual.error, r.error, rtol=1e-9, atol=1e-12)
+    assert found.residual.relative == pytest.approx(r.relative, rel=1e-9)
+    for x, at in calls:
+        np.testing.assert_allclose(at.slack, problem.dense() @ x - problem.b, rtol=1e-9, atol=1e-12)
+    single = np.float32(lv.solve(problem, tol=1e-9).impulse)
+    assert lv.residual(problem, single, "float32").verdict == "at its floor"
+    assert lv.residual(problem, 1.001 * single, "float32").verdict == "stopped early"
+    pairs = [int(i) for i in problem.cones.ptr[:-1][problem.cones.kind == lv.CONTACT_ELLIPSE]]
+    rows = r.velocity_by_row.copy()
+    for n in pairs:
+        rows[n + 1] = np.hypot(rows[n + 1], rows[n + 2])
+    assert rows.max() == pytest.approx(r.velocity, rel=1e-12)
+    p = problem.disk
+    assert not p.cones.has_ellipse
+    assert p.disk is p
+    assert lv.residual(p, problem.on_disk(found.impulse)).relative == pytest.approx(r.relative, rel=1e-12)
+    np.testing.assert_allclose(p.dense(), s[:, None] * problem.dense() * s, rtol=1e-12)
+    assert problem.row_name(r.worst_row) == r.worst_name == p.row_name(r.worst_row)

@@ -99,51 +99,9 @@ def test_projection_is_feasible_keeps_what_is_and_is_a_projection(seed, size):
             assert abs(y[end - 1]) <= cones.mu[i] * cones.patch_radius[i] * y[j]  # the reach first
 
 
-def _the_long_way(cones):
-    """The same blocks from lists, which no quick way takes."""
-    return lv.Cones(*(getattr(cones, name).tolist() for name in FIELDS))
-
-
-FIELDS = ("ptr", "kind", "lower", "upper", "mu", "patch_radius")
-PARTS = st.one_of(
-    st.builds(lv.Cones.free, st.integers(0, 4)),
-    st.integers(0, 4).map(lambda m: lv.Cones.bounded(-np.arange(float(m)), np.full(m, np.inf))),
-    st.builds(
-        lambda mu, tangents, count: lv.Cones.contacts(mu, tangents, count=count),
-        st.just(0.0) | st.floats(1e-60, 2.0), st.integers(0, 5), st.integers(0, 3),
-    ),
-    st.builds(
-        lambda mu, tangents: lv.Cones.contacts(np.array(mu), tangents, np.arange(float(len(mu)))),
-        st.lists(st.just(0.0) | st.floats(1e-60, 2.0), max_size=3), st.integers(0, 2),
-    ),
-)  # fmt: skip
-
-
 @pytest.mark.parametrize("count", [-1, 2**31 - 1, 2**40])
 def test_counts_beyond_32_bits_are_refused(count):
     with pytest.raises(lv.InputError, match=str(count)):
         lv.Cones.free(count)
     with pytest.raises(lv.InputError, match=str(count)):
         lv.Cones.contacts(0.5, count=count)
-
-
-@given(first=PARTS, second=PARTS)
-def test_quick_ways_make_what_the_long_way_makes(first, second):
-    both = first + second
-    lists = [getattr(first, name).tolist() + getattr(second, name).tolist() for name in FIELDS[1:]]
-    ptr = first.ptr.tolist() + (second.ptr[1:] + first.n_rows).tolist()
-    for cones, long in (
-        (first, _the_long_way(first)),
-        (both, _the_long_way(both)),
-        (both, lv.Cones(ptr, *lists)),
-    ):
-        assert cones == long
-        for name in ("is_free", "is_bounded_rows", "has_round", "n_rows", "n_blocks"):
-            assert getattr(cones, name) == getattr(long, name)
-        size, kind = np.diff(cones.ptr), cones.kind
-        unbounded = np.isinf(cones.lower) & np.isinf(cones.upper)
-        assert cones.is_free == (not kind.any() and bool(unbounded.all()))
-        assert cones.is_bounded_rows == bool(np.all((kind == 0) | (size == 1)))
-        assert cones.has_round == bool(np.any(kind == 3))
-        for name in FIELDS:
-            assert not getattr(cones, name).flags.writeable

@@ -301,22 +301,6 @@ def test_newton_on_rows_of_islands_that_alternate(cones, size, other, seed, step
     np.testing.assert_allclose(problem.velocity(whole), problem.velocity(apart.impulse), atol=1e-6)
 
 
-def test_a_look_at_j_changes_nothing_that_kernels_read():
-    """Velocities in an order of the factor's own: J is given back in the order given, of a copy."""
-    rng = np.random.default_rng(0)
-    mass = np.diag(np.full(120, 30.0))
-    mass[-1, :-1] = mass[:-1, -1] = rng.uniform(0.2, 0.5, 119)  # a star whose centre comes last fills in
-    jac = rng.normal(size=(4, 120))
-    problem = lv.Problem.from_jacobian(
-        jac, mass, rng.normal(size=120), cones=lv.Cones.free(4), compliance=0.1
-    )
-    assert problem.generalized.order is not None
-    lam = rng.normal(size=4)
-    before = problem.slack(lam)
-    np.testing.assert_array_equal(problem.jacobian.toarray(), jac)
-    np.testing.assert_array_equal(problem.slack(lam), before)
-
-
 def cloth(side, seed, friction="cone"):
     """Masses on a square grid, each of one velocity, stiff rows between neighbours, contacts of three rows."""
     rng = np.random.default_rng(seed)
@@ -394,19 +378,6 @@ def test_sweeps_over_j_and_m_are_those_over_a(name, seed, friction, spin, few):
     assert ("whitened J" in one.solver.form) == reads_whitened(problem)
     found = lv.solve(problem, name, tol=1e-6, max_iter=20_000)
     assert found.success or found.status is not lv.Status.CONVERGED
-
-
-@given(seed=seeds)
-def test_what_a_sweep_costs_is_counted_without_forming_a(seed):
-    problem = random_general(seed, "cone", n=int(np.random.default_rng(seed).integers(4, 90)), contacts=4)
-    entries = problem.metric.entries_of_a
-    y = problem.metric.work - 4 * problem.m
-    assert "csr" not in problem.__dict__
-    whitened = problem.whitened
-    assert y >= 2 * whitened.nnz  # zeros inside a panel are stored
-    touched = (np.abs(whitened) @ np.abs(whitened).T).nnz
-    assert touched <= entries <= touched * max(1, int(problem.generalized.trees.max()) + 1)
-    assert reads_whitened(problem) == (y < entries)
 
 
 @given(seed=seeds, same=st.sampled_from(["tree", "size", "nothing"]))

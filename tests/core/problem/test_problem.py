@@ -9,7 +9,6 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given
 from random_problems import (
-    CONTACTS,
     arrays_of,
     as_matrix,
     random_contact_problem,
@@ -74,6 +73,8 @@ def test_rows_have_names():
     assert [problem.row_name(first + i) for i in range(4)] == [
         "contact 0, normal", "contact 0, tangent 1", "contact 0, tangent 2", "contact 0, spin",
     ]  # fmt: skip
+    cone = lv.Problem(np.ones(6), lv.Cones.contacts(0.5, 5), np.eye(6), friction="cone")
+    assert [cone.row_name(i) for i in (3, 4)] == ["contact 0, spin", "contact 0, roll 1"]
     named = lv.Problem(
         problem.b,
         problem.cones,
@@ -300,15 +301,6 @@ def test_arrays_that_are_adopted_are_shared_and_read_only():
     for name, kept in (("b", problem.b), ("A", problem.matrix), ("guess", problem.guess)):
         assert kept is given[name]
         assert not kept.flags.writeable
-
-
-def test_impulses_of_another_kind_of_contact_are_not_carried():
-    disk, box = (CONTACTS[kind](1) for kind in ("disks", "boxes"))
-    disk, box = (replace(problem, key=None) for problem in (disk, box))
-    assert np.array_equal(disk.cones.ptr, box.cones.ptr)
-    impulse = np.ones(disk.m)
-    np.testing.assert_array_equal(disk.carry((disk, impulse)), impulse)
-    np.testing.assert_array_equal(box.carry((disk, impulse)), box.start())
 
 
 def test_what_loads_scipy_late_is_copied_and_asks_types_alone():

@@ -252,21 +252,6 @@ def test_superlu_is_not_asked_where_no_entries_would_do():
             assert not lv.solve(lv.Problem.linear(full, b), solver).contradicted
 
 
-@pytest.mark.parametrize("m", [2, 70])
-@pytest.mark.parametrize("make", [lv.Problem.lcp, lv.Problem.linear])
-def test_a_prepared_factorisation_follows_symmetry(make, m):
-    a = np.eye(m) + np.full((m, m), 0.5)
-    turned = a.copy()
-    turned[0, 1] = 0.25
-    for first, then in ((turned, a), (a, turned)):
-        prepared = lv.prepare(make(first, np.ones(m)), "direct")
-        prepared.solve()
-        after = prepared.solve(make(then, np.ones(m)))
-        fresh = lv.prepare(make(then, np.ones(m)), "direct").solve()
-        assert (after.solver.form, dict(after.work)) == (fresh.solver.form, dict(fresh.work))
-        assert after.impulse.tobytes() == fresh.impulse.tobytes()
-
-
 @pytest.mark.parametrize("m", [4, 70])
 def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     a = np.eye(m)
@@ -276,29 +261,6 @@ def test_a_shifted_matrix_that_is_singular_is_found_to_be(m):
     state.rows.begin(np.zeros(m), 1e-13, 0)
     assert [state.rows.turn(4) for _ in range(2)] == [SMALL, SMALL]
     assert (state.rows.n_rounds, state.rows.passes) == (2, 1)
-
-
-def test_the_first_lu_of_what_fills_is_expected_to_take_long():
-    a, b = skew(1, 3000, 3.0)
-    scattered = PivotState(lv.Problem.lcp(sp.csr_array(a + sp.eye_array(3000)), b))
-    band = sp.diags_array([np.ones(2999), np.full(3000, 3.0), np.full(2999, 0.5)], offsets=[-1, 0, 1])
-    narrow = PivotState(lv.Problem.lcp(sp.csr_array(band), b))
-    assert scattered.outside.seconds > 20.0 * narrow.outside.seconds
-
-
-def test_all_rows_free_is_tried_first_only_where_that_is_cheap():
-    """A narrow band is factored whole at once; where a row is not free, or the band is wide, sweeps guess."""
-    a, rng = tridiagonal(50), np.random.default_rng(1)
-    free = lv.solve(lv.Problem.lcp(a, a @ rng.uniform(0.5, 1.0, 50)), "direct")
-    assert (dict(free.work), free.iterations) == ({"factorisations": 1}, 1)
-    assert good(free)
-    mixed = lv.solve(lv.Problem.lcp(a, rng.normal(size=50)), "direct")
-    assert mixed.work["sweeps"] == 4
-    assert mixed.work["factorisations"] >= 2
-    assert good(mixed)
-    wide = lv.solve(lv.Problem.lcp(symmetric(spd(rng, 40)), rng.normal(size=40)), "direct")
-    assert wide.work["sweeps"] == 4
-    assert good(wide)
 
 
 def test_a_factor_that_would_end_after_the_deadline_is_not_begun():
@@ -356,24 +318,6 @@ def test_runs_of_one_state_go_on_where_the_last_one_stopped(seed, m, part):
     rows = state.pivot.rows
     assert sum(claim.iterations for claim in claims) == rows.n_rounds
     assert {kind: sum(claim.work.get(kind, 0) for claim in claims) for kind in rows.work} == rows.work
-
-
-def test_pivots_that_panels_cannot_exchange_are_left_to_superlu_and_counted():
-    """Without a diagonal rows must change places across panels."""
-    rng = np.random.default_rng(5)
-    n = 80
-    turn = sp.block_diag([np.array([[0.0, 1.0 + i], [-1.0 - i, 0.0]]) for i in range(n)])
-    lone = sp.csr_array(turn)[rng.permutation(2 * n)]
-    problem = lv.Problem.linear(lone, rng.normal(size=2 * n))
-    assert lv.solve(problem, "direct", tol=1e-9).success
-    far = np.r_[np.arange(n, 2 * n), np.arange(n)]
-    ring = sp.csr_array((np.ones(2 * n), (np.arange(2 * n), far)), shape=(2 * n, 2 * n))
-    near = sp.csr_array(ring + 1e-20 * sp.diags_array(rng.normal(size=2 * n)))
-    near.data[near.data == 1.0] += 1e-3 * rng.normal(size=2 * n)
-    problem = lv.Problem.linear(near, rng.normal(size=2 * n))
-    solution = lv.solve(problem, "direct", tol=1e-9)
-    assert solution.success, solution
-    assert solution.work["factorisations"] <= 2
 
 
 def test_ctrl_c_between_two_rounds_gives_the_best_of_them(monkeypatch):

@@ -19,12 +19,10 @@ import lavender as lv
 from benchmarks.piles import Pile
 from lavender.judge.solution import Status
 from lavender.problem.cones import ROW
-from lavender.solvers import factors
 from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import bodies_of, make_system
 from lavender_ext.core.problem import LAWS
-from lavender_ext.factor.sparse import SparsePanels
 from lavender_ext.newton.solve import COMPLIANCE, PHASES, Layout, Solve
 
 
@@ -359,31 +357,6 @@ def test_free_rows_of_few_entries_are_solved_with_all_the_others(even, seed):
     np.testing.assert_allclose(
         system.solve.solve("natural", r), expected, rtol=0, atol=1e-11 * np.abs(expected).max()
     )
-
-
-def in_contacts(problem):
-    """Its matrix under the cone law: 166 contacts and two bounded rows."""
-    cones = lv.Cones.contacts(np.full(166, 0.5), 2) + lv.Cones.bounded(np.zeros(2), np.full(2, np.inf))
-    return lv.Problem(problem.b, cones, problem.csr, friction="cone")
-
-
-@pytest.mark.parametrize("even", [True, False])
-def test_one_analysis_serves_all_factors_of_few_entries(even, monkeypatch):
-    made = []
-
-    class Counted(SparsePanels):
-        def __init__(self, *args):
-            made.append(args[4] if len(args) > 4 else None)
-            super().__init__(*args)
-
-    monkeypatch.setattr(factors, "SparsePanels", Counted)
-    problem = in_contacts(sparse_rows(1, even=even))
-    solution = lv.solve(problem, "newton", tol=1e-8)
-    assert solution.success and solution.work["factorisations"] > 5
-    assert sum(like is None for like in made) == 1
-    monkeypatch.setattr(sparse.SparseRows, "solve_panels", lambda *_: None)
-    for most in (1, 3):  # where SuperLU takes over, that is one factorisation
-        assert lv.solve(problem, "newton", tol=1e-12, max_iter=most).iterations <= most
 
 
 def test_where_panels_lose_a_pivot_or_digits_superlu_takes_over(monkeypatch):

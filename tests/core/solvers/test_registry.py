@@ -82,19 +82,6 @@ def test_a_refusal_that_raises_refuses_for_its_own_solver_alone(register):
         lv.solve(TINY, "unsure")
 
 
-def test_what_a_plug_in_says_stands_on_one_line(plug_in):
-    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {}, "two\nlines"))
-    assert lv.solve(TINY, name).message == "two lines"
-    name = plug_in(lambda problem, impulse: lv.Claim(lv.Status.STALLED, 1, {"a\nb": 1}, "", "a\nb"), "lines")
-    solution = lv.solve(TINY, name)
-    assert (solution.work, solution.solver.form) == ({"a b": 1}, "a b")
-
-    def fails(problem, impulse):
-        raise ArithmeticError("two\nlines")
-
-    assert lv.solve(TINY, plug_in(fails)).message == "ArithmeticError: two lines"
-
-
 @pytest.mark.parametrize("counted", ["long", -1.0, float("nan")])
 def test_a_set_up_time_that_is_none_is_refused_by_the_solver_s_name(counted, register):
     class Wrong:
@@ -165,22 +152,6 @@ def test_a_plug_in_without_update_is_prepared_anew(register):
     solver = lv.prepare(TINY, "bare")
     assert solver.solve().success
     assert solver.solve(lv.Problem.lcp(np.eye(2), [2.0, 3.0])).impulse.tolist() == [2.0, 3.0]
-
-
-def test_a_refusal_names_the_way_round():
-    contact = lv.Problem.contact(np.eye(3), np.ones(3), mu=[0.5])
-    lcp_only = dataclasses.replace(SPEC, laws=frozenset({"linear", "lcp"}))
-    cone_only = dataclasses.replace(SPEC, laws=frozenset({"linear", "lcp", "cone"}))
-    rows_only = dataclasses.replace(SPEC, operators=frozenset({"rows"}))
-    assert "problem.boxed" in lcp_only.refuses(contact)
-    assert "problem.relaxed('cone')" in cone_only.refuses(contact)
-    assert "from_rows" in rows_only.refuses(contact)
-    for name in ("gauss_seidel", "sor"):
-        assert "not 'lcp': 'pgs' is this method with bounds" in registry.get(name).refuses(TINY)
-    assert (
-        dataclasses.replace(SPEC, refusal=lambda p: f"{p.m} rows are unlucky").refuses(TINY)
-        == "2 rows are unlucky"
-    )
 
 
 # -- names ------------------------------------------------------------------------------------------
