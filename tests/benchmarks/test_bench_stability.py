@@ -55,11 +55,6 @@ def test_the_first_mode_leaves_where_the_gain_reaches_kappa():
         assert 0.5 * kappa < critical_gain(n, 4, H, digits=1) < 2.0 * kappa
 
 
-def test_friction_does_not_enter_while_contacts_stick():
-    one, two = (modes(3, 4, H, friction=mu).z for mu in (0.2, 0.9))
-    np.testing.assert_allclose(np.abs(one), np.abs(two), atol=1e-6)
-
-
 def test_gravity_outruns_the_sweeps_of_tall_towers_in_long_substeps():
     assert not modes(14, 8, 1 / 30).stable and modes(14, 8, 1 / 240).stable
 

@@ -62,13 +62,9 @@ def test_flipped_normals_are_told(name):
     rows["normal"][1:] *= -1.0  # one alone, which opposes the others of its pair
     found = lv.diagnose(made(SCENES[name], rows, target))
     assert ("normals", (SCENES[name].rows.n_joints,)) in [(s.kind, s.blocks) for s in found]
-
-
-@pytest.mark.parametrize("name", ["stack", "pit"])
-def test_swapped_bodies_are_told(name):
-    rows, target = given(SCENES[name])
-    rows["contact_body"] = rows["contact_body"][:, ::-1]
-    assert "normals" in kinds(made(SCENES[name], rows, target))
+    rows, _ = given(SCENES[name])  # or whose they are: bodies swapped
+    swapped = rows | {"contact_body": rows["contact_body"][:, ::-1]}
+    assert name == "bridge" or "normals" in kinds(made(SCENES[name], swapped, target))
 
 
 @pytest.mark.parametrize("name", ["stack", "pit"])
@@ -123,29 +119,6 @@ def test_masses_for_their_inverses_are_told():
     assert found[0].data["bodies"] == [3]
 
 
-def test_what_bodies_tell_is_told_of_their_j_and_m():
-    bodies = SCENES["stack"]
-    j, mass = bodies.jacobian.toarray(), np.linalg.inv(bodies.rows.inverse_mass_matrix().toarray())
-    v = bodies.rows.v_free.ravel()
-    target = (bodies.b + j @ v).reshape(-1, 3)
-    target[::4, 0] += 0.01  # some depth: what is asked of rows does not tell their order
-
-    def of(mass, order=slice(None)):
-        problem = lv.Problem.from_jacobian(
-            j[order], mass, v, target=target.ravel()[order], cones=bodies.cones
-        )
-        return [s.reason for s in lv.diagnose(problem) if s.kind in ("masses", "all normals first")]
-
-    assert of(mass) == []
-    assert "inverses for mass and inertia" in of(np.linalg.inv(mass))[0]
-    moving = np.arange(len(mass)) % 6 < 3
-    mixed = np.where(moving[:, None] & moving, np.linalg.inv(mass), mass)
-    assert "inverse mass for mass" in of(mixed)[0]
-    rows = np.arange(bodies.m).reshape(-1, 3)
-    for order in (rows.T.ravel(), np.r_[rows[:, 0], rows[:, 1:].ravel()]):
-        assert "all normals stand first" in of(mass, order)[0]
-
-
 def test_a_depth_with_the_wrong_sign_is_told():
     rows, _ = given(SCENES["stack"])
     rows["v_free"][:] = (0.0, 0.0, -9.81 / 60, 0.0, 0.0, 0.0)
@@ -181,15 +154,27 @@ def test_generalised_coordinates_out_of_order_are_told():
     j, mass, v = boxes()
     cones = lv.Cones.contacts(0.5, count=12)
 
-    def problem(j, mass=mass):
-        return lv.Problem.from_jacobian(j, mass, v, cones=cones)
+    def problem(j, mass=mass, target=0.0):
+        return lv.Problem.from_jacobian(j, mass, v, target=target, cones=cones)
 
     assert kinds(problem(j)) == set()
     last = np.arange(36).reshape(-1, 3)[:, [1, 2, 0]].ravel()
     assert kinds(problem(j[last])) == {"tangents first"}
-    grouped = np.arange(36).reshape(-1, 3).T.ravel()
-    assert kinds(problem(j[grouped])) == {"all normals first"}
-    assert kinds(problem(j, np.linalg.inv(mass))) == {"masses"}
+    rows = np.arange(36).reshape(-1, 3)
+    for grouped in (rows.T.ravel(), np.r_[rows[:, 0], rows[:, 1:].ravel()]):
+        assert kinds(problem(j[grouped])) == {"all normals first"}
+        target = (j @ v + np.where(np.arange(36) % 12 == 0, 0.01, 0.0))[
+            grouped
+        ]  # which does not tell the order
+        (found,) = lv.diagnose(problem(j[grouped], target=target))
+        assert "if all normals stand first" in found.reason
+    moving = np.arange(len(mass)) % 6 < 3
+    inverse = np.linalg.inv(mass)
+    for wrong, words in (
+        (inverse, "inverses for mass and inertia"),
+        (np.where(moving[:, None] & moving, inverse, mass), "inverse mass for mass"),
+    ):
+        assert kinds(problem(j, wrong)) == {"masses"} and words in lv.diagnose(problem(j, wrong))[0].reason
     assert (
         kinds(problem(np.concatenate([j[:-3], j[:3]]))) == set()
     )  # one of twelve: collision detection does that
@@ -251,23 +236,16 @@ def pressed(law, form):
 
 @pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
 @pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-@pytest.mark.parametrize("name", ["auto", "newton"])
-def test_who_fights_is_named(name, law, form):
+def test_who_fights_is_named_and_the_compliance_that_is_advised_gives_an_answer(law, form):
     problem = pressed(law, form)
-    solution = lv.solve(problem, "auto" if law == "coulomb" else name)
-    assert solution.status is lv.Status.INFEASIBLE
-    joints, contacts = fighting(problem, solution.certificate)
-    assert joints == (0,) and contacts == (1,)  # blocks
-    assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
-    found = [s for s in lv.diagnose(problem) if s.kind == "conflict"]
-    assert len(found) == 1 and found[0].blocks == (0, 1)
-
-
-@pytest.mark.parametrize("form", ["bodies", "J and M", "A"])
-@pytest.mark.parametrize("law", ["lcp", "coulomb", "cone"])
-def test_the_compliance_that_is_advised_gives_an_answer(law, form):
-    problem = pressed(law, form)
+    for name in ("auto",) if law == "coulomb" else ("auto", "newton"):
+        solution = lv.solve(problem, name)
+        assert solution.status is lv.Status.INFEASIBLE
+        joints, contacts = fighting(problem, solution.certificate)
+        assert joints == (0,) and contacts == (1,)  # blocks
+        assert f"row 0 against {problem.row_name(1).split(',')[0]}" in solution.message
     (found,) = (s for s in lv.diagnose(problem) if s.kind == "conflict")
+    assert found.blocks == (0, 1)
     soft = np.zeros(problem.m)
     for i in range(problem.m):
         if problem.row_name(i) in found.data["soft_rows"]:
@@ -292,8 +270,8 @@ def test_what_is_looked_for_once_is_told_anew():
 def test_contacts_that_fight_in_a_pile_are_named_with_a_compliance_that_gives_an_answer():
     """Walls leave these balls no room: several conflicts at once, of which a proof names one."""
     fights = 0
-    for step, problem in Pile(17).problems(50):
-        found = conflict_of(problem, 1e-6) if step in (0, 50) else None
+    for step, problem in Pile(17).problems(30):
+        found = conflict_of(problem, 1e-6) if step in (0, 30) else None
         if found is not None:
             fights += 1
             assert found.blocks and "contacts" in found.advice

@@ -132,7 +132,7 @@ def test_a_cluster_that_loses_a_worker_midway_loses_no_record():
     distributed = pytest.importorskip(
         "distributed", reason="a cluster needs dask.distributed (extra: cluster)"
     )
-    names = bench.seeds(["granular(n=2)"], 40)
+    names = bench.seeds(["granular(n=2)"], 16)
     plan = bench.CampaignPlan(levels=(1e-6,), budgets=(8, 64), orders=())
     expected = bench.campaign(names, ["pgs", "jacobi"], plan, workers=1)
     with (

@@ -262,18 +262,13 @@ def test_what_a_backend_writes_into_the_pipe_is_data_and_bounded(hostile, watchd
     assert not hostile.exists()
 
 
-def test_the_verdict_is_of_a_problem_that_the_backend_never_held(hostile, watchdog):
-    p = stack()
-    with Worker() as worker:
-        record, _ = worker.measure(p, task(p, "x_lie"))
-    assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
-    assert "says CONVERGED" in record.contradicted
-
-
-def test_what_a_worker_says_is_what_this_process_says():
+def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backend_held(hostile, watchdog):
     p = stack()
     start = np.linspace(0.0, 1.0, p.m)
     with Worker() as worker:
+        record, _ = worker.measure(p, task(p, "x_lie"))
+        assert record.relative == lv.residual(p, np.zeros(p.m)).relative == 1.0
+        assert "says CONVERGED" in record.contradicted
         for solver, more in (("pgs", {}), ("direct", {}), ("pgs", {"start": "carried"})):
             asked = task(p, solver, **more)
             far, there = worker.measure(p, asked, start)

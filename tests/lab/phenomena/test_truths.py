@@ -11,7 +11,7 @@ from scipy.special import ellipk
 import lavender as lv
 from lavender.lab.phenomena import PHENOMENA
 from lavender.lab.phenomena.joints import flip_of, moments_of_inertia, period_of, spin_of
-from lavender.lab.phenomena.truths import arch_thrust, elliptic, thinnest_arch, tipping_time
+from lavender.lab.phenomena.truths import elliptic, tipping_time
 
 G = 9.81
 
@@ -110,17 +110,3 @@ def test_the_longest_overhang_is_that_of_the_linear_program(bricks):
 def test_the_thinnest_arch_is_that_of_limit_analysis(stones, lean):
     assert stands("arch", stones=stones, lean=lean, thickness=1.01)
     assert not stands("arch", stones=stones, lean=lean, thickness=0.99)
-
-
-def test_the_thinnest_arch_has_one_thrust():
-    t = thinnest_arch(4, math.atan(0.5))
-    assert t == pytest.approx(0.5509, abs=1e-3)  # the root of 0.4472 t^2 - 2.6833 t + 1.3416 by hand
-    low, high = arch_thrust(4, math.atan(0.5), t)
-    assert low == pytest.approx(high, rel=1e-9)
-
-
-@pytest.mark.parametrize(("slope", "holds"), [(0.99, True), (1.01, False)])
-def test_slopes_by_the_linear_program(slope, holds):
-    assert stands("tipping", slope=slope) == holds
-    # along one tangent the square of friction is its disk
-    assert stands("stick", slope=min(slope, 0.99)) is True

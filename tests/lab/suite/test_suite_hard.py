@@ -84,31 +84,3 @@ def test_structures_stand(name):
         weaker = suite.case(name.rstrip(")") + (", " if "(" in name else "(") + "mu=0.01)")
         with pytest.raises(lv.InputError, match="at rest"):  # friction is what holds them
             assert weaker.reference is None
-
-
-@pytest.mark.parametrize("kind", ["zero", "negative", "negligible"])
-def test_diagonals_are_as_named(kind):
-    case = hard.diagonal(kind)
-    entries = case.problem.dense().diagonal()[::3]
-    assert np.all(
-        {"zero": entries == 0.0, "negative": entries < 0.0, "negligible": (entries > 0) & (entries < 1e-17)}[
-            kind
-        ]
-    )
-    assert np.all(case.problem.d > 0.5)  # the judge's metric falls back to the row's largest entry
-    lam, w = case.reference.impulse, case.problem.slack(case.reference.impulse)
-    assert lam.min() == w.min() == 0.0
-    assert np.array_equal(lam * w, np.zeros(len(lam)))
-
-
-def test_degenerate_problems_touch_without_pressing():
-    for asymmetric in (0, 1):
-        case = hard.degenerate_lcp(n=40, asymmetric=asymmetric)
-        lam, w = case.reference.impulse, case.problem.slack(case.reference.impulse)
-        assert np.count_nonzero((lam == 0.0) & (w == 0.0)) >= 5
-        assert np.array_equal(lam * w, np.zeros(40))
-        assert case.problem.is_symmetric is not bool(asymmetric)
-        a = case.problem.dense()
-        assert (
-            np.linalg.eigvalsh(a + a.T)[0] > 0.0
-        )  # positive definite: a P-matrix, so the solution is the only one
