@@ -51,7 +51,7 @@ def separation(a, b):
 box_numbers = st.tuples(*[st.floats(-1, 1)] * 10, *[st.floats(0.2, 1.5)] * 6)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(numbers=box_numbers)
 def test_box_box_agrees_with_the_slow_twin(numbers):
     x = np.array(numbers)
