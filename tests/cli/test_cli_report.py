@@ -22,6 +22,7 @@ from lavender.cli import measuring
 from lavender.cli.bench import mujoco
 from lavender.lab.bench import Event, simulators
 from lavender.lab.phenomena import PHENOMENA
+from lavender.lab.report import moved
 from lavender.out import vectors
 
 
@@ -78,14 +79,6 @@ def test_the_list_tells_truths_without_running(lavender):
         assert f"{name}: {p.title}" in out
     code, _, err = lavender("phenomena", "--list", "--out", "measured.json")
     assert code == 2 and "--out has no effect with --list" in err
-
-
-def test_the_terminal_shows_speeds_on_request(lavender, tmp_path):
-    words = ("report", "stack(n=8)", "--solvers", "pgs", "--levels", "1e-3", "--budgets", 4, "--repeats", 1)
-    code, out, _ = lavender(*words, "--speed-levels", "1e-2", "1e-3", "--out", tmp_path / "a")
-    assert code == 0
-    assert "to 1e-3 m/s" in out
-    assert "motion" not in lavender(*words, "--out", tmp_path / "b")[1]
 
 
 def test_references_are_written_beside_files_and_used(lavender, tmp_path, monkeypatch):
@@ -201,10 +194,11 @@ QUICK = ("--levels", "1e-3", "1e-6", "--budgets", "2", "4", "--repeats", "1", "-
 def test_lists_take_commas_or_blanks_and_files_may_follow(lavender, path, tmp_path):
     code, *_ = lavender(
         "report", "--levels=1e-2", "--solvers", "pgs,jacobi", "--budgets", "3", "5", path, "--orders", "reverse",
-        "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
+        "--speed-levels", "1e-2,1e-3", "--repeats", 1, "--no-figures", "--out", tmp_path / "out",
     )  # fmt: skip
     assert code == 0
     records = bench.read(tmp_path / "out")
+    assert moved.speed_levels(records) == (1e-2, 1e-3)
     assert {r.solver for r in records} == {"pgs", "jacobi"}
     assert {r.max_iter for r in records if r.mode == "budget"} == {3, 5}
     assert {r.order for r in records} == {"given", "reverse"}

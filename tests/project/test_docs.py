@@ -140,16 +140,8 @@ def test_pages_link_to_pages_that_exist():
                 assert (page.parent / target).is_file(), f"{page.name} links to {target}"
 
 
-def test_the_chapter_names_examples_tests_and_functions_that_exist():
+def test_the_chapter_names_functions_that_exist():
     text = (ROOT / "docs" / "chapter.md").read_text(encoding="utf-8")
-    examples = set(re.findall(r"python (examples/\w+\.py)", text))
-    assert len(examples) == 13
-    assert examples <= {f"examples/{path.name}" for path in (ROOT / "examples").glob("*.py")}
-    named = re.findall(r"`(tests/[\w/]+\.py)(?:::(\w+))?`", text)
-    assert len(named) > 8
-    for file, test in named:
-        source = (ROOT / file).read_text(encoding="utf-8")
-        assert not test or f"def {test}(" in source, f"{file}::{test}"
     for function, file in (
         ("prepare", "engine/substep.pyx"),
         ("finish", "engine/substep.pyx"),
