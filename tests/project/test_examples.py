@@ -8,23 +8,22 @@ import lavender as lv
 from lavender.sim.engine.layout import HEAD
 
 
-# Those of the chapter are run by test_chapter.py.
-@pytest.mark.parametrize(
-    "name",
-    [
-        "residual_or_motion", "two_motions", "what_a_row_costs", "recorded_slide", "planned_push",
-        "which_contact",
-    ],
-)  # fmt: skip
-def test_prints_its_numbers_and_saves_its_figure(name, tmp_path, capsys):
-    path = tmp_path / "figure.png"
-    example(name).main(str(path))
-    assert path.read_bytes().startswith(b"\x89PNG")
-    assert str(path) in capsys.readouterr().out
+@pytest.fixture
+def drawn(tmp_path, capsys):
+    """An example by name that has printed its numbers and saved its figure; those of the chapter: test_chapter.py."""
+
+    def draw(name):
+        path = tmp_path / "figure.png"
+        example(name).main(str(path))
+        assert path.read_bytes().startswith(b"\x89PNG")
+        assert str(path) in capsys.readouterr().out
+        return example(name)
+
+    return draw
 
 
-def test_rows_that_no_body_asks_for_are_not_there():
-    module = example("what_a_row_costs")
+def test_rows_that_no_body_asks_for_are_not_there(drawn):
+    module = drawn("what_a_row_costs")
     contacts = 4 * module.BOXES
     rows = {
         name: lv.Simulation(lv.Scene("stack", n=module.BOXES, **more)).constraint_problem().m
@@ -65,8 +64,8 @@ def test_friction_bounds_are_met_and_the_right_bounds_give_coulomb():
     np.testing.assert_allclose(found["coulomb"].impulse, rounds[-1], rtol=0.0, atol=1e-8)
 
 
-def test_residual_and_motion_error_part_as_the_theory_says():
-    module = example("residual_or_motion")
+def test_residual_and_motion_error_part_as_the_theory_says(drawn):
+    module = drawn("residual_or_motion")
     found = module.numbers()
     factors = []
     for n in module.HEIGHTS[:2]:
@@ -94,8 +93,8 @@ def test_worlds_of_a_training_loop_have_a_verdict_each(capsys, monkeypatch):
     assert "12 steps, not to learn from" in capsys.readouterr().out
 
 
-def test_every_motion_of_the_example_is_a_solution_and_they_differ():
-    module = example("two_motions")
+def test_every_motion_of_the_example_is_a_solution_and_they_differ(drawn):
+    module = drawn("two_motions")
     found = module.numbers()
     motions = found["motions"]
     i, j = module.furthest(motions)
@@ -140,24 +139,24 @@ def test_saps_impulses_on_a_box_of_drake_are_near_the_rigid_ones():
     assert force == pytest.approx(9.81 * module.MASS, rel=1e-3)
 
 
-def test_mass_and_friction_are_found_to_what_the_noise_allows():
-    module = example("recorded_slide")
+def test_mass_and_friction_are_found_to_what_the_noise_allows(drawn):
+    module = drawn("recorded_slide")
     mass, mu, left = module.numbers()["way"][-1]
     # 60 speeds of 0.01 m/s noise determine either to a percent; the fit leaves less than the noise does.
     assert abs(mass / module.TRUE["mass"] - 1.0) < 0.02 and abs(mu / module.TRUE["mu"] - 1.0) < 0.02
     assert left < 0.5 * module.NOISE**2
 
 
-def test_a_push_gets_across_the_switch_only_where_it_looks_for_it():
-    found = example("planned_push").numbers()
+def test_a_push_gets_across_the_switch_only_where_it_looks_for_it(drawn):
+    found = drawn("planned_push").numbers()
     assert (
         found["as it is"]["errors"][-1] == found["as it is"]["errors"][0]
     )  # the derivative is 0 all the way
     assert found["heeding the switches"]["errors"][-1] < 1e-9 and found["heeding the switches"]["crossed"] > 0
 
 
-def test_the_sensitivity_of_a_step_agrees_with_differences():
-    found = example("which_contact").numbers()
+def test_the_sensitivity_of_a_step_agrees_with_differences(drawn):
+    found = drawn("which_contact").numbers()
     row, block = found["at"]
     assert found["d"].exists
     assert found["target"][row] == pytest.approx(found["differences"][0], rel=1e-6)
