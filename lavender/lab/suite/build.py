@@ -105,13 +105,13 @@ def joint_problem(bodies: Bodies, body: Any, jac: Any, size: int, target: Any = 
     return Problem.from_rows(rows, target, **more)
 
 
-def manifold(body: Any, centre: Any, half_x: Any, half_y: float = 0.5) -> Contacts:
-    """Four corner points of horizontal rectangles: body (k, 2), centre (k, 3), half widths; normals up."""
+def manifold(body: Any, centre: Any, half_x: Any) -> Contacts:
+    """Four corner points of horizontal rectangles, 1 m along y: body (k, 2), centre (k, 3), half widths; normals up."""
     sign = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]], float)
     half = np.broadcast_to(np.asarray(half_x, float), (len(body),))
     point = np.repeat(np.asarray(centre, float), 4, axis=0)
     point[:, 0] += (half[:, None] * sign[:, 0]).ravel()
-    point[:, 1] += np.tile(half_y * sign[:, 1], len(body))
+    point[:, 1] += np.tile(0.5 * sign[:, 1], len(body))
     return Contacts(np.repeat(np.asarray(body), 4, axis=0), point, [0.0, 0.0, 1.0])
 
 

@@ -26,6 +26,7 @@ from lavender_ext.core.checks import LEAST
 SPLIT = 2.0**27 + 1.0
 DENSE_ROWS = 2000  # up to here singular rows are found by a singular value decomposition
 MAX_STEPS = 40
+MARGIN = 1e-6  # of the largest impulse, that a row which is free stands off its bounds
 
 Pair = tuple[FloatArray, FloatArray]
 
@@ -105,10 +106,10 @@ def solve_linear(problem: Problem) -> FloatArray:
     return hi
 
 
-def solve_boxed(problem: Problem, candidate: FloatArray, margin: float = 1e-6) -> FloatArray:
+def solve_boxed(problem: Problem, candidate: FloatArray) -> FloatArray:
     """A boxed solution near `candidate` (m,) [N s], proved.
 
-    Rows of the candidate that stand off both bounds by `margin` of the largest impulse are solved for
+    Rows of the candidate that stand off both bounds by MARGIN of the largest impulse are solved for
     w = 0, as close to the candidate as they can be; the others sit on their bounds.
 
     Raises
@@ -119,7 +120,7 @@ def solve_boxed(problem: Problem, candidate: FloatArray, margin: float = 1e-6) -
     wide, c = Wide(problem), problem.cones
     lam = np.clip(candidate, c.lower, c.upper)
     size = float(np.abs(lam).max(initial=0.0))
-    inside = (lam - c.lower > margin * size) & (c.upper - lam > margin * size)
+    inside = (lam - c.lower > MARGIN * size) & (c.upper - lam > MARGIN * size)
     nearest = np.where(lam - c.lower <= c.upper - lam, c.lower, c.upper)
     hi, lo = _solve_rows(problem, wide, inside, np.where(inside, lam, nearest))
     w = wide.slack(hi, lo)

@@ -27,13 +27,6 @@ def test_a_record_has_the_motion_error_of_its_run():
         assert from_json(to_json(r)) == r
 
 
-def test_a_solver_in_a_process_of_its_own_has_one_too():
-    records = bench.run(
-        ["box_stackF(n=2)", "stack(n=4)"], ["osqp"], bench.Plan(levels=(1e-3,), motion=True, **SHORT)
-    )
-    assert all(0.0 <= r.motion < 1.0 for r in records)
-
-
 def test_speed_levels_are_reached_by_tighter_residuals():
     plan = bench.Plan(levels=(1e-1,), speed_levels=(1e-2, 1e-4), **SHORT)
     assert plan.motion

@@ -2,7 +2,6 @@
 
 import dataclasses
 import html
-import html.parser
 import io
 import json
 import math
