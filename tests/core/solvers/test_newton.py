@@ -9,7 +9,6 @@ import pytest
 import scipy.sparse as sp
 from calls import dense_h, system_in
 from hypothesis import given, settings
-from hypothesis import strategies as st
 from random_problems import FORMS, as_matrix, good, random_contact_problem, seeds
 from stacks import bricks
 from twins import block_diagonal
@@ -23,7 +22,7 @@ from lavender.solvers.newton import Newton, NewtonState
 from lavender.solvers.newton_systems import sparse, systems
 from lavender.solvers.newton_systems.systems import bodies_of, make_system
 from lavender_ext.core.problem import LAWS
-from lavender_ext.newton.solve import COMPLIANCE, PHASES, Layout, Solve
+from lavender_ext.newton.solve import PHASES, Layout, Solve
 
 
 @pytest.mark.parametrize("friction", [False, True])
@@ -81,40 +80,6 @@ def test_newton_system_is_the_derivative_and_is_solved(form, law, seed):
     )
     # eps = 1e-3 bounds the condition number by about 1e4 for these sizes.
     np.testing.assert_allclose(matrix @ x, r, rtol=0, atol=1e-9 * (1.0 + np.abs(x).max()))
-
-
-@pytest.mark.parametrize("form", ["velocity", "impulse", "sparse"])
-@given(seed=seeds, decades=st.integers(-3, 1), wide=st.sampled_from([0.3, 1.0, 10.0]))
-@settings(max_examples=20)
-def test_a_smoothed_problem_knows_its_derivative_and_nears_the_natural_map(form, seed, decades, wide):
-    problem = random_contact_problem(seed, friction="coulomb", bodies=6, contacts=10)
-    system = system_in(problem, form)
-    solve, tau = system.solve, 10.0**decades
-    m, rng = solve.m, np.random.default_rng(seed)
-    z, dz = rng.normal(size=m), rng.normal(size=m)
-    f, ft = solve.smooth(z, tau, wide)
-    f, ft, step = f.copy(), ft.copy(), 1e-5 * min(1.0, wide) * tau
-    matrix = dense_h(problem)[np.ix_(solve.keep, solve.keep)] + COMPLIANCE * np.eye(m)
-    p = block_diagonal(system, solve.p)
-    slope = dz - p @ dz + p @ (matrix @ dz)
-    ahead, back = (solve.smooth(z + sign * step * dz, tau, wide)[0] for sign in (1.0, -1.0))
-    # Central differences: third derivatives are up to |y| / tau^2 of a unit, times step^2; rounding over step.
-    np.testing.assert_allclose(
-        (ahead - back) / (2.0 * step), slope, rtol=0, atol=1e-6 * (1.0 + np.abs(slope).max())
-    )
-    ahead, back = (solve.smooth(z, tau * np.exp(sign * 1e-5), wide)[0] for sign in (1.0, -1.0))
-    np.testing.assert_allclose((ahead - back) / 2e-5, ft, rtol=0, atol=1e-6 * (1.0 + np.abs(ft).max()))
-    # I - P + P (H + eps) is solved: on free rows, where that is H + eps, a factor over bodies feels 2^-53 / eps.
-    solve.smooth(z, tau, wide)
-    assert solve.factor("natural", COMPLIANCE)
-    x = solve.solve("natural", f)
-    np.testing.assert_allclose(x - p @ x + p @ (matrix @ x), f, rtol=0, atol=1e-5 * (1.0 + np.abs(x).max()))
-    # The path's direction is told by this sign, where who factors knows it.
-    sign = np.linalg.slogdet(np.eye(m) - p + p @ matrix)[0]
-    assert solve.sign == (0 if form == "sparse" else sign)
-    # Each map is within a few tau of what it smooths: p(x) - max(0, x) <= tau.
-    exact = solve.natural(z, matrix @ z - solve.g, LAWS["coulomb"], COMPLIANCE)
-    assert np.abs(f - exact).max() <= 4.0 * max(1.0, wide) * tau * (1.0 + problem.cones.mu.max())
 
 
 @pytest.mark.slow
