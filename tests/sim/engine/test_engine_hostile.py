@@ -2,6 +2,7 @@
 
 import _thread
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,6 @@ import lavender as lv
 from lavender.sim.engine import check
 from lavender.sim.engine.layout import HEAD
 from lavender.sim.engine.state import KEPT
-from lavender.solvers.registry import specs
 from lavender_ext.engine.arrays import lengths
 
 CARRIED = ("setting", "x", "q", "v", "cache_key", "cache_impulse", "cache_local", "joint_impulse")
@@ -146,33 +146,21 @@ def test_ctrl_c_between_very_many_substeps_is_told():
     sim.constraint_problem()
 
 
-class Caller:
-    """A solver that does something else in the middle of a step: `now` is called in its n-th run."""
-
-    now, at, runs = None, 0, 0
-
-    def prepare(self, problem):
-        return problem
-
-    update = prepare
-
-    def run(self, state, impulse, n, tol, time_limit=None):
-        type(self).runs += 1
-        if self.runs == self.at:
-            type(self).now()
-        return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
-
-
 @pytest.fixture
-def caller(register):
-    """`caller(now, at)` registers a solver that calls `now` in its run number `at`."""
+def caller(plug_in):
+    """Registers a solver that calls `now` in its run number `at`; these and its runs, which may be changed."""
 
-    def make(now, at, resumable=False):
-        solver = type("Now", (Caller,), {"now": staticmethod(now), "at": at, "runs": 0})
-        laws = {"linear", "lcp", "coulomb", "cone"}
-        spec = {"laws": laws, "parts": True, "summary": "calls", "resumable": resumable}
-        register(lv.SolverSpec("caller", solver, **spec))
-        return solver
+    def make(now, at, **more):
+        asked = SimpleNamespace(now=now, at=at, runs=0)
+
+        def run(problem, impulse):
+            asked.runs += 1
+            if asked.runs == asked.at:
+                asked.now()
+            return lv.Claim(lv.Status.MAX_ITERATIONS, 1)
+
+        plug_in(run, "caller", parts=True, **more)
+        return asked
 
     return make
 
@@ -204,15 +192,14 @@ def stop():
 @pytest.mark.parametrize("resumable", [False, True])
 @pytest.mark.parametrize("at", [1, 2, 3])
 def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, resumable):
-    caller(lambda: None, 0, resumable)
+    asked = caller(stop, 0, resumable=resumable)
     scene = lv.Scene("bridge", n=4, solver="caller", substeps=3, solver_iterations=1)
     sim, twin = lv.Simulation(scene), lv.Simulation(scene)
     trajectory(sim, 3), trajectory(twin, 3)
     for one in (sim, twin):
         one.state.head[HEAD["step"]] = 2**31 - 1  # substeps are counted in 32 bits, which begin again
     before = sim.state.copy()
-    solver = sim_solver(scene)
-    solver.now, solver.at = staticmethod(stop), solver.runs + at
+    asked.at = asked.runs + at
     with pytest.raises(KeyboardInterrupt):
         sim.step()
     assert sim.steps == 3
@@ -225,10 +212,6 @@ def test_ctrl_c_in_any_substep_leaves_the_state_of_before_the_step(caller, at, r
     assert trajectory(sim, 4) == trajectory(twin, 4)
     for name in CARRIED:
         np.testing.assert_array_equal(sim.state.a[name], twin.state.a[name], err_msg=name)
-
-
-def sim_solver(scene):
-    return specs()[scene.parameters.solver].load()
 
 
 @pytest.mark.parametrize(("solver", "calls"), [("newton", "run"), ("auto", "turn")])
