@@ -35,6 +35,7 @@ import lavender_ext
 from benchmarks import motions, stability
 from benchmarks.output import markdown as table
 from lavender import bench, registry, suite
+from lavender.base.deadline import seconds
 from lavender.lab.bench import level_name, structure_of
 from lavender.lab.report import contents, geometric_means, reaches
 from lavender.lab.report.curves import figures as report_figures
@@ -44,7 +45,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.page import page as report_page
 from lavender.lab.report.style import looks
 from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.lab.report.text import residual, seconds
+from lavender.lab.report.text import residual
 from lavender.problem import LAWS
 from lavender.problem.ordering import ORDERS
 from lavender.sim.scene.gallery import SCENES

@@ -19,16 +19,16 @@ import numpy as np
 import lavender as lv
 from lavender import registry
 from lavender.base import deadline
-from lavender.judge.residuals import judged, reference
+from lavender.judge.residuals import reference
 from lavender.judge.solution import Status
 from lavender.lab.bench.running.timing import one_thread
 from lavender.problem import Problem
-from lavender.solvers.steps import METHODS, made
+from lavender.solvers.loop import Loop
+from lavender.solvers.steps import METHODS, MOST, made
 
 __all__ = ["LEVELS", "SOLVERS", "Record", "records"]
 
 LEVELS = (1e-3, 1e-6, 1e-9)
-GROWTH = 0.25  # of the iterations so far, between two points of a curve
 SHORT = 0.03  # s of CPU time below which a run is made three times
 FAR, LEAST = 12.0, 0.05  # times the least time to the middle level, and s, after which a solver is given up
 LONG = 30.0  # times the limit of one curve, that `auto` has: a limit that may be short changes its tree
@@ -47,9 +47,8 @@ class Record:
 
     def to(self, level: float) -> tuple[float, float]:
         """(s, iterations) to that level; inf where it was not reached."""
-        return min(
-            ((t, n) for n, t, relative in self.points if relative <= level), default=(math.inf, math.inf)
-        )
+        there = ((t, n) for n, t, relative in self.points if relative <= level)
+        return min(there, default=(math.inf, math.inf))
 
 
 def takes(problem: Problem, name: str) -> bool:
@@ -70,13 +69,11 @@ def records(cases: Iterable[tuple[str, Problem]], time_limit: float = 1.0) -> It
                 run = resumed if registry.get(SOLVERS[name][0]).resumable else repeated
                 limit = min(time_limit, max(LEAST, FAR * least)) if name != "auto" else LONG * time_limit
                 found = [run(problem, name, limit)]
-                if found[0][1] and found[0][1][-1][1] < SHORT:
+                if found[0][1][-1][1] < SHORT:
                     found += [run(problem, name, limit) for _ in range(2)]
-                runs = zip(*(points for _, points in found), strict=False)
-                points = [(some[0][0], min(t for _, t, _ in some), some[0][2]) for some in runs]
-                made = Record(case, name, min(setup for setup, _ in found), points)
-                least = min(least, made.to(LEVELS[1])[0])
-                yield made
+                one = Record(case, name, *min(found, key=lambda run: run[1][-1][1]))
+                least = min(least, one.to(LEVELS[1])[0])
+                yield one
     finally:
         deadline.perf_counter = clock
 
@@ -87,21 +84,18 @@ def resumed(problem: Problem, name: str, limit: float) -> tuple[float, Points]:
     fresh = replace(problem.disk, copy=False)
     reference(fresh)
     solver: Any = made(name, fresh)
-    lam, points, best = fresh.start(), Points(), math.inf
     with one_thread():
         begun = process_time()
         state = solver.prepare(fresh)
-        spent = setup = process_time() - begun
-        while True:
-            done = points[-1][0] if points else 0
-            begun = process_time()
-            claim = solver.run(state, lam, max(1, math.ceil(GROWTH * done)), LEVELS[-1], None)
-            spent += process_time() - begun
-            best = min(best, judged(fresh, lam.copy()).relative) if np.isfinite(lam).all() else best
-            points.append((done + claim.iterations, spent, best))
-            ended = claim.status is not Status.MAX_ITERATIONS or claim.iterations < 1
-            if ended or best <= LEVELS[-1] or spent > limit:
-                return setup, points
+        setup = process_time() - begun
+        loop = Loop(
+            problem=fresh, solver=solver, state=state, impulse=fresh.start(), tol=LEVELS[-1],
+            deadline=deadline.Deadline(limit), records=[],
+        )  # fmt: skip
+        loop.run(MOST)
+    found: Any = loop.recorded()
+    least = np.fmin.accumulate(found.relative)
+    return setup, np.column_stack((found.iterations, setup + found.time, least)).tolist()
 
 
 def repeated(problem: Problem, name: str, limit: float) -> tuple[float, Points]:

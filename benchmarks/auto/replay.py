@@ -23,7 +23,6 @@ from lavender.solvers.auto import MOST, Stage, Tree
 from lavender.solvers.registry import SMALL_ROWS
 from lavender.solvers.small import who
 from lavender.solvers.steps import FIRST
-from lavender_ext.small.checked_sweeps import sweeps_left
 
 __all__ = ["RULES", "fit", "regrets", "replayed", "summary"]
 
@@ -87,18 +86,14 @@ def replayed(tree: Tree, curves: Curves, level: float, rule: Rule) -> float:
 
 def given_up(curve: Record, before: float, stage: Stage, level: float) -> float:
     """Iterations at which more than `stage.least` are predicted to be left, or all of the stage."""
-
-    def residual(n: float) -> float:
-        return min((relative for k, _, relative in curve.points if k <= n), default=1.0)
-
-    now, last = before, residual(before)
-    while now < before + stage.iterations:
-        step = min(max(now // 2, FIRST), before + stage.iterations - now)
-        now, relative = now + step, residual(now + step)
-        if relative <= level or sweeps_left(step, last, relative, level) > stage.least:
-            break
-        last = relative
-    return now
+    at, last = before, min((relative for k, _, relative in curve.points if k <= before), default=1.0)
+    for n, _, relative in curve.points:
+        if max(at + FIRST, 1.5 * at) <= n < before + stage.iterations:
+            gain = math.log(last / relative) if 0.0 < relative < last else 0.0
+            if relative <= level or gain * stage.least < (n - at) * math.log(relative / level):
+                return n
+            at, last = n, relative
+    return before + stage.iterations
 
 
 def regrets(cases: Iterable[tuple[Problem, Curves]], rule: Rule | None) -> list[tuple[float, str, float]]:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from benchmarks.output import markdown
 from benchmarks.peers.adapters import SCIPY, SCRATCH, TARGETS, Result
 from benchmarks.peers.engines import Step
+from lavender.base.deadline import seconds
 from lavender.lab.report.tables import geometric_mean
-from lavender.lab.report.text import residual, seconds
+from lavender.lab.report.text import residual
 
 LARGE = 1000  # rows from which a problem counts as large
 

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 
 from lavender.base.arrays import FloatArray, number, whole_number
+from lavender.base.deadline import seconds
 from lavender.base.errors import InputError
 from lavender.io.efc import from_mujoco_many
 from lavender.io.recording import Control
@@ -37,7 +38,7 @@ from lavender.lab.bench.running.runner import Event
 from lavender.lab.report.curves import Curve, Figure
 from lavender.lab.report.sheet import Part, Sheet
 from lavender.lab.report.table import Table
-from lavender.lab.report.text import seconds, size, times
+from lavender.lab.report.text import size, times
 from lavender.lab.worlds import Runs, flew_apart, states_of
 from lavender.problem.derived import cached_property
 

@@ -8,7 +8,7 @@ from typing import Any
 from lavender.base.errors import InputError, UnknownName
 from lavender.judge.solution import Claim
 from lavender.problem import Problem
-from lavender.problem.ordering import Order
+from lavender.problem.ordering import Order, block_order
 from lavender.solvers.setup_times import forming
 from lavender.solvers.sweeping import Sweeping, SweepState, over, plan_of, reads_whitened, swept
 from lavender_ext.accelerate import accelerated
@@ -72,15 +72,23 @@ class Accelerated(Sweeping):
             raise InputError(f"convex is {self.convex!r}; a whole number of iterations >= 0 is needed")
 
     def _state(self, problem: Problem, order: Order, before: AcceleratedState | None) -> AcceleratedState:
+        return self._over(problem, order, operator(problem))
+
+    def _over(self, problem: Problem, order: Order, data: Any) -> AcceleratedState:
         exact = self.sweep == "blocks" or (self.sweep is None and problem.law == "cone")
         convex = self.convex if problem.law == "coulomb" else 0
-        return AcceleratedState(problem, operator(problem), order, exact, self._memory, convex, self._keeps)
+        return AcceleratedState(problem, data, order, exact, self._memory, convex, self._keeps)
 
     def _told(self, state: AcceleratedState, claim: Claim, again: int) -> Claim:
         done = claim.iterations
         work = {"sweeps": 2 * done if state.order.mode == SYMMETRIC else done, "restarts": again}
         sweep = "blocks" if state.exact else "pgs"
         return replace(claim, work=work, form=f"{sweep} on {over(state.data)}")
+
+
+def as_given(solver: Accelerated, problem: Problem) -> AcceleratedState:
+    """The state of sweeps over the form that is given: A is not formed."""
+    return solver._over(problem, block_order(problem, solver.order), problem.metric)
 
 
 def operator(problem: Problem) -> Any:

@@ -6,21 +6,21 @@
                                 not solve it, as any other
     a matrix                    `direct`: linear to its end, bounded rows of a narrow band for ROUNDS times the
                                 factorisations that `newton` is counted for; as long, but after sweeps, bounded rows
-                                whose factor is dense
-    sweeps (`anderson`)         for Newton's cost, or until they predict that they will cost more than it; linear rows
-                                and, but for a matrix, bounded ones and cones only where 200 cost less than it; of a
-                                matrix each contact is solved exactly
+                                of a matrix that is not symmetric
+    sweeps (`anderson`)         SWEEPS before an analysis tells Newton's cost, then for as long as that, or until they
+                                predict that they will cost more; linear rows and, but for a matrix, bounded ones and
+                                cones only where MANY cost less than it; of a matrix each contact is solved exactly
     a loose pile                contacts of PILE rows or more under Coulomb's law, nearly each of another pair: for as
                                 much again, sweeps of a conjugate gradient (`nncg`), at first of the cone law, but not
                                 of what rolls
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost, or MOST where it costs more; over rows, of bounded ones that
-                                failed in the compiled call
+                                SURE times that cost, or MOST where it costs more
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
-                                at up to MOST times the cost or LITTLE), `admm`, `nncg`, and sweeps as long as these
-                                gain; all together LAST times Newton's cost, and no longer than LONG
+                                at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed),
+                                `admm`, `nncg`, and sweeps as long as these gain; all together LAST times Newton's cost,
+                                and no longer than LONG
     at last                     a certificate of others, by a linear program (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -40,7 +40,7 @@ from math import inf, nan
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import NEVER, Deadline
+from lavender.base.deadline import NEVER, Deadline, seconds
 from lavender.base.errors import BREAKDOWN, last_words
 from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
@@ -53,20 +53,16 @@ from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
-from lavender.solvers.steps import METHODS, PROBE, Direct, Iterations, Newton, Step, Sweeps, setup_time
+from lavender.solvers.steps import METHODS, PROBE, Iterations, Newton, Step, Sweeps, setup_time
 
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
 TURNS = 6  # that all have with doubled work
 LAST = 200.0  # times Newton's counted cost, that all have together
 LONG = 6e10  # ns of counted cost that turns have at most, and Newton's method, if SURE times its own are not more
+MANY = 200.0  # sweeps that cost less come before Newton's method where it is sure to end
+FEW, SPARSE = 32.0, 0.05  # sweeps before a factor that may fill, of a matrix of at most this share of entries
 LITTLE = 5e6  # ns of Newton's method over rows, which are worth a trial in any case
-FEW = 32.0  # sweeps before a factor that may fill
-MANY = (
-    200.0  # sweeps that cost less come before Newton's method; of a matrix, and under Coulomb's law, all do
-)
-SPARSE, DENSE = 0.05, 0.5  # shares of entries, below which A is sparse, and above which it is dense
-FILLS = 8.0  # entries of each row of a sparse A, from which a factor may fill in
 PILE = 390  # rows of contacts, below which Newton's method ends sooner than sweeps of a conjugate gradient before it
 BAND = 100  # half bandwidth up to which `direct` comes first, if it is at most a quarter of the rows
 SURE = 4.0  # times the counted cost, within which nine in ten end
@@ -75,7 +71,6 @@ EARLY = 0.25  # of the counted cost, after which an interior point has an impuls
 # which rows are free.
 STALE = 1e3
 ONE_CALL = 200  # iterations that a problem of few rows, solved in one call, takes, unless its path is long
-NOTHING_TOLD = Claim(Status.MAX_ITERATIONS, 0)
 
 
 @dataclass(frozen=True)
@@ -133,17 +128,15 @@ class Tree:
         return costs.newton_cost(costs.formed(p), self.law)
 
     def add_rows(self, most: float) -> None:
-        """Analyse A of J and M as well, if that is counted to cost less and is there in time, with what of SciPy reads
-        it; last what has failed.
-        """
+        """Analyse A of J and M as well, if that is counted to cost less and has time; last comes what has failed."""
         p, states = self.problem, self.states
         if "newton over rows" in states or self.formed >= most or self.is_late:
             return
         if self.deadline.is_set and self.deadline.passed(over_rows(p) + 3.0 * forming(p)):
             return
-        states |= self.prepared("newton over rows")
+        both = states | self.prepared("newton over rows")
         self.states = dict(
-            sorted(states.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
+            sorted(both.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
         )
 
     @property
@@ -166,35 +159,18 @@ class Tree:
         needed = 1e-9 * (before + (1.0 if name == "direct" or self.law == "coulomb" else EARLY) * cost)
         if name == "newton" and "states" in vars(self):
             return not self.deadline.passed(needed)
-        set_up, p = setup_time(name, self.problem), self.problem
-        fills = p.matrix is not None and FILLS * p.m < len(p._compressed[1]) < SPARSE * p.m**2
-        if fills and name == "direct":
-            set_up *= SURE  # a factor of what fills in takes longer than is counted
-        return not self.deadline.passed(set_up + needed)
+        return not self.deadline.passed(setup_time(name, self.problem) + needed)
 
     @property
-    def may_fill(self) -> bool:
-        """A matrix of few entries without a narrow band."""
-        p = self.problem
-        return len(p._compressed[1]) < SPARSE * p.m**2 and max(p.bandwidth) > BAND
-
-    @property
-    def is_narrow(self) -> bool:
-        """Bounded rows of a symmetric matrix, given as such, of a narrow band: a factor costs little."""
-        p = self.problem
-        if p.matrix is None or self.law != "lcp" or len(p._compressed[1]) > (2.0 * BAND + 1.0) * p.m:
-            return False
-        return max(p.bandwidth) <= min(BAND, p.m // 4) and bool(p.is_symmetric)
-
-    @property
-    def is_dense(self) -> bool:
-        """Bounded rows of a matrix of most entries, or of an unsymmetric one that is not sparse: `direct` factors only
-        rows that are free.
-        """
-        p = self.problem
+    def pivots(self) -> str:
+        """Bounded rows of a matrix of which `direct` needs little: a factor of a narrow band, or of free rows alone."""
+        p, band = self.problem, min(BAND, self.problem.m // 4)
         if p.matrix is None or self.law != "lcp":
-            return False
-        return len(p._compressed[1]) > (DENSE if p.is_symmetric else SPARSE) * p.m**2
+            return ""
+        entries = len(p._compressed[1])
+        if p.is_symmetric:
+            return "a narrow band" if entries <= (2 * band + 1) * p.m and max(p.bandwidth) <= band else ""
+        return "not symmetric" if entries > SPARSE * p.m**2 else ""
 
     @cached_property
     def is_loose(self) -> bool:
@@ -209,33 +185,30 @@ class Tree:
     def __iter__(self) -> Iterator[Stage]:
         """The lines."""
         if self.problem.matrix is not None and self.law == "linear":
-            if self.may_fill:
+            p = self.problem
+            if len(p._compressed[1]) < SPARSE * p.m**2 and max(p.bandwidth) > BAND:
                 yield Stage("anderson", FEW, FEW * self.sweep, "a sparse matrix whose factor may fill", FEW)
             yield Stage("direct", inf, self.least, "linear, a matrix")
-        if self.is_narrow:
-            yield self.rounds(self.least, "bounded rows of a narrow band")
-        # Fill is most of what J and M cost, and only an analysis tells it: they are swept as long as is usual before.
-        usual = self.problem.generalized is not None and self.law == "coulomb"
-        yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep if usual else 0.0))
+        pivots, most = self.pivots, ROUNDS * costs.factorisations(self.law)
+        if pivots == "a narrow band":
+            yield Stage("direct", most, self.least, f"bounded rows, {pivots}")
+        # Fill is most of what a factor costs, and only an analysis tells it: before it, as many as are usual.
+        yield from self.sweeps_first(max(self.least, costs.SWEEPS * self.sweep))
         yield from self.sweeps_first(min(self.newton, self.formed))
-        self.add_rows((MOST if self.tried else 1.0) * self.newton)
+        self.add_rows(max(MOST * self.newton, LITTLE) if self.tried else self.newton)
         yield from self.sweeps_first(self.newton)
-        if self.is_dense:
-            yield self.rounds(self.newton, "a dense factor, of the rows that are free")
+        if pivots == "not symmetric":
+            yield Stage("direct", most, self.newton, f"bounded rows, {pivots}")
         if self.problem.generalized is not None and not np.all(self.problem.compliance):
-            if self.tried and self.law == "lcp":
-                self.add_rows(LITTLE)
             of = self.states.get("newton")  # over velocities, as the least violation is found
             cost = self.newton if of is None else of.cost
             sooner = cost <= max(MOST * self.newton, LITTLE)
             yield from islice(self.factorisations(SURE if sooner else MOST), 1)
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.factorisations(MOST)
-        unit = self.newton if self.newton < inf else costs.SWEEPS * self.sweep
-        if "newton over rows" not in self.states:
-            self.add_rows(max(MOST * self.newton, LITTLE))
-            unit = min(max((state.cost for state in self.states.values()), default=unit), max(unit, LITTLE))
-        self.left = min((LAST - MOST) * unit, LONG) - self.begun
+        self.add_rows(max(MOST * self.newton, LITTLE))
+        most = max((state.cost for state in self.states.values()), default=costs.SWEEPS * self.sweep)
+        self.left = min((LAST - MOST) * min(most, max(self.newton, LITTLE)), LONG) - self.begun
         for k in range(TURNS):
             before = self.best
             for stage in self.in_turn(2.0**k):
@@ -251,13 +224,8 @@ class Tree:
         """Newton's method for so many times its counted cost."""
         for name, state in self.states.items():
             share = min(times, max(SURE, LONG / state.cost))
-            why = f"{share:.3g} times its counted cost of {words(state.cost)}"
+            why = f"{share:.3g} times its counted cost of {seconds(1e-9 * state.cost)}"
             yield Stage(name, share * state.steps, share * state.cost, why)
-
-    def rounds(self, cost: float, why: str) -> Stage:
-        """Of `direct`, so many times what Newton's method is counted for."""
-        why = f"{why}: {ROUNDS:g} times newton's factorisations"
-        return Stage("direct", ROUNDS * costs.factorisations(self.law), cost, why)
 
     def sweeps_first(self, newton: float) -> Iterator[Stage]:
         """For Newton's cost: first what that is at least, then what it is counted for, of J and M once A is formed."""
@@ -268,7 +236,7 @@ class Tree:
         pays = not sure or MANY * self.sweep <= newton
         if pays and 0.0 < cost < inf and not self.problem.cones.has_round:
             self.begun += cost
-            why = f"{words(cost)} of what newton costs"
+            why = f"{seconds(1e-9 * cost)} of what newton costs"
             yield self.sweeps(cost, why, newton)
             if self.is_loose:
                 rolls = self.problem.cones.has_more_parts
@@ -295,31 +263,17 @@ class Tree:
             self.swept = self.best > GAIN * before
 
 
-def words(ns: float) -> str:
-    """A time."""
-    unit, word = (1e9, "s") if ns >= 1e9 else (1e6, "ms") if ns >= 1e6 else (1e3, "us")
-    return f"{ns / unit:.3g} {word}"
-
-
-@dataclass
-class State:
-    """What `auto` has prepared: nothing."""
-
-    problem: Problem
-    log: SolveLog | None = None  # of the solve that has ended, as long as it is not told
-
-
 @dataclass(frozen=True)
 class Auto(Solver):
     """Chooses and combines other solvers; the solution's message and `turns` name them."""
 
-    def prepare(self, problem: Problem) -> State:
-        return State(problem)
+    def prepare(self, problem: Problem) -> Problem:
+        """Nothing."""
+        return problem
 
     def run(
-        self, state: State, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None = None
+        self, problem: Problem, impulse: FloatArray, max_iter: int, tol: float, time_limit: float | None
     ) -> Claim:
-        problem, state.log = state.problem, None
         deadline, failed = Deadline(time_limit), list[tuple[str, Claim]]()
         if max_iter >= ONE_CALL and call_ends_within(problem, deadline.left()):
             share = 1.0 if problem.m <= SMALL_ROWS else QUARTER
@@ -332,48 +286,34 @@ class Auto(Solver):
             failed = AUTO.failed(problem, counts)
         if problem.m == 0:
             return Claim(Status.CONVERGED, 0, {}, "nothing to solve")
-        tree, sweeps = Tree(problem, deadline), None
+        if deadline.passed(sweeping(problem)):
+            return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
+        tree = Tree(problem, deadline)
         tree.tried = bool(failed) and problem.generalized is not None
-        if deadline.is_set and not problem.cones.has_round:
-            if deadline.passed(sweeping(problem)):
-                return Claim(Status.TIME_LIMIT, 0, {}, NO_TIME)
-            if tree.is_late:
-                sweeps = Sweeps(problem, deadline)
-        log = SolveLog(problem, tol, max_iter, deadline, None if sweeps is None else sweeps.state.data)
+        log = SolveLog(problem, tol, max_iter, deadline)
         log.offer(impulse)
         if log.best > 1.0:
             log.given = impulse.copy() if log.best < STALE else None
             log.offer(problem.start())  # doing nothing is better
-        state.log = log
         try:
             if max_iter > 0 and log.best > tol and not log.done():
                 for name, claim in failed:
                     log.note(name, claim, log.best)
-                solve(log, tree, sweeps)
+                solve(log, tree)
         except KeyboardInterrupt:
             log.interrupted = True  # the best impulse goes back all the same
         except BREAKDOWN as error:
             log.failure = last_words(error)
-        return NOTHING_TOLD
-
-    def tell(self, state: State, impulse: FloatArray, claim: Claim) -> Claim:
-        """When the clock has stopped: the best impulse, judged, and what ran."""
-        log, state.log = state.log, None
-        if log is None:
-            return claim
-        if log.end is not None:
-            log.end()
         impulse[:] = log.impulse
         return log.claim()
 
 
 @np.errstate(all="ignore")  # what overflows is judged
-def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
-    """The lines of the tree, until one solves the problem or none has more to do; `sweeps` that are set up."""
+def solve(log: SolveLog, tree: Tree) -> None:
+    """The lines of the tree, until one solves the problem or none has more to do."""
     steps: dict[str, Step] = {}
-    if sweeps is not None:
-        sweeps.begin(log)
-        sweeps.finish()
+    if log.deadline.is_set and tree.is_late and not log.problem.cones.has_round:
+        Sweeps("anderson", log).finish()
         return
     lines = iter(tree)
     while not log.done():  # before the next line counts what it needs
@@ -388,14 +328,14 @@ def solve(log: SolveLog, tree: Tree, sweeps: Sweeps | None = None) -> None:
         if step is None:
             step = steps[stage.solver] = make(stage.solver, log, tree)
         if log.deadline.is_set and not step.over:
-            most = PROBE * log.deadline.nanoseconds()
-            if isinstance(step, Sweeps) and not tree_goes_on(tree, steps, min(stage.cost, most)):
-                step.finish()
-                return
-            if isinstance(step, Newton | Direct):
+            if isinstance(step, Sweeps):
+                if not tree_goes_on(tree, steps, min(stage.cost, PROBE * log.deadline.nanoseconds())):
+                    step.finish()
+                    return
+            elif step.name == "direct" or isinstance(step, Newton):
                 cost = step.state.cost if isinstance(step, Newton) else stage.cost
                 step.over = step.late = not tree.has_time(METHODS[stage.solver][0], cost)
-            elif step.state is None and isinstance(step, Iterations):
+            elif step.state is None:
                 step.over = log.deadline.passed(SURE * setup_time(stage.solver, log.problem))
         if step.over:
             tree.left += stage.cost
@@ -419,15 +359,11 @@ def tree_goes_on(tree: Tree, steps: dict[str, Step], cost: float) -> bool:
 
 def make(name: str, log: SolveLog, tree: Tree) -> Step:
     """The step of this name."""
-    if name == "anderson":
-        sweeps = Sweeps(log.problem, log.deadline)
-        sweeps.begin(log)
-        return sweeps
-    if name.startswith("newton"):
-        newton = Newton(name, log)
-        newton.state = tree.states[name]
-        return newton
-    return (Direct if name == "direct" else Iterations)(name, log)
+    kinds = {"anderson": Sweeps, "direct": Step, "newton": Newton, "newton over rows": Newton}
+    step = kinds.get(name, Iterations)(name, log)
+    if isinstance(step, Newton):
+        step.state = tree.states[name]
+    return step
 
 
 SPEC = SolverSpec(

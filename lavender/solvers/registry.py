@@ -116,10 +116,6 @@ class Solver:
         """For `auto`: n iterations or a few more, up to `left`, on from where the last turn ended."""
         return self.run(state, impulse, n, tol, time_limit)
 
-    def tell(self, state: Any, impulse: FloatArray, claim: Claim) -> Claim:
-        """The claim in the place of what `run` returned, if not `resumable`: when the clock has stopped, to judge."""
-        return claim
-
     def otherwise(self) -> Solver | None:
         """Who follows where this one stalls on friction as bounded rows (`polyhedral.py`)."""
         return None

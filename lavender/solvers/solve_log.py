@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from lavender.base.arrays import FloatArray
-from lavender.base.deadline import Deadline
+from lavender.base.deadline import NEVER, Deadline
 from lavender.judge.certificates import check_certificate
-from lavender.judge.residuals import FLOOR_MOST, at_floor, known, quick, remember, remembered
+from lavender.judge.residuals import FLOOR_MOST, at_floor, judged, known, remember, remembered
 from lavender.judge.solution import Claim, Status, Turn
 from lavender.problem import Problem
-from lavender.problem.derived import cached_property
 from lavender.solvers.small import NO_TIME, NOTHING, told
-from lavender_ext.core.problem import Data
-from lavender_ext.judge.measure import Judged
 
 __all__ = ["GAIN", "SolveLog"]
 
@@ -26,19 +22,8 @@ GAIN = 0.99  # of the residual, of which turns in vain leave more
 class SolveLog:
     """What ran on a (sub)problem, what it cost, and the best impulse."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        tol: float,
-        budget: int,
-        deadline: Deadline | None = None,
-        by: Data | None = None,
-    ) -> None:
-        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline or Deadline()
-        self.by = (
-            problem.metric if by is None else by
-        )  # what impulses are judged by: as given, or A formed of it
-        self.end: Callable[[], None] | None = None  # called when the clock has stopped
+    def __init__(self, problem: Problem, tol: float, budget: int, deadline: Deadline = NEVER) -> None:
+        self.problem, self.tol, self.budget, self.deadline = problem, tol, budget, deadline
         self.interrupted = False
         self.failure = ""  # what broke down, in words
         self.timed_out = False  # it ended a little before the deadline, as the rest of the time was too short
@@ -51,27 +36,16 @@ class SolveLog:
         self.direction: FloatArray | None = None  # (m,) one that is none, but bounds the impulses
         self.conflict: Any = None  # of `certify`: who fights in the convex relaxation, and what lifts it
 
-    def offer(self, impulse: FloatArray) -> float:
-        """Judge an impulse (m,) and keep it if it is the best."""
+    def offer(self, impulse: FloatArray) -> None:
+        """Judge an impulse (m,) and keep it if it is the best, also for the final judgement."""
         relative = known(self.problem, impulse)
         if relative is None:
-            return self.take(Judged(self.by, impulse.copy()))
+            last = judged(self.problem, impulse.copy())
+            relative, impulse = float(last.relative), last.impulse
+            if relative < self.best:
+                remember(self.problem, last)
         if relative < self.best:
             self.best, self.impulse = relative, impulse.copy()
-        return relative
-
-    def take(self, last: Judged) -> float:
-        """Keep a judged impulse if it is the best, also for the final judgement; return its relative residual.
-
-        A solution is judged by the given data, not by an A formed from them, which rounding has changed.
-        """
-        if last.relative <= self.tol and last.data is not self.problem.metric:
-            last = Judged(self.problem.metric, last.impulse)
-        relative = float(last.relative)
-        if relative < self.best:
-            self.best, self.impulse = relative, last.impulse
-            remember(self.problem, last)
-        return relative
 
     def note(self, name: str, claim: Claim, before: float) -> None:
         """Record a turn that has ended; the residual was `before`."""
@@ -79,20 +53,13 @@ class SolveLog:
         for kind, count in claim.work.items():
             self.work[kind] = self.work.get(kind, 0) + count
         self.turns.append(Turn(name, dict(claim.work), before, self.best))
-        if (
-            claim.certificate is not None
-            and check_certificate(self.problem, claim.certificate, self.tol) is None
-        ):
-            self.certificate = claim.certificate
-        elif claim.certificate is not None:
-            self.direction = claim.certificate
+        if claim.certificate is not None:
+            if check_certificate(self.problem, claim.certificate, self.tol) is None:
+                self.certificate = claim.certificate
+            else:
+                self.direction = claim.certificate
         if claim.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
-
-    @property
-    def message(self) -> str:
-        """What ran, in words."""
-        return told(self.turns)
 
     # -- the end ---------------------------------------------------------------------------------
 
@@ -121,25 +88,13 @@ class SolveLog:
 
     def done(self) -> bool:
         """Solved, proved infeasible, or out of time, iterations or progress."""
-        return (
-            self.best <= self.tol
-            or self.certificate is not None
-            or self.left <= 0
-            or self.late
-            or self.at_floor()
-        )
+        return self.status not in (Status.STALLED, Status.NUMERICAL_ERROR)
 
     def at_floor(self) -> bool:
         if self.best > FLOOR_MOST:
             return False
-        last = remembered(self.problem, self.impulse)
-        if last is not None:
-            return at_floor(last.relative, last.floor)
-        return at_floor(*quick(self.problem, self.impulse, *self._room, True))
-
-    @cached_property
-    def _room(self) -> tuple[FloatArray, FloatArray]:
-        return np.empty(self.problem.m), np.empty(self.problem.m)
+        last = remembered(self.problem, self.impulse) or judged(self.problem, self.impulse)
+        return at_floor(last.relative, last.floor)
 
     @property
     def status(self) -> Status:
@@ -159,7 +114,7 @@ class SolveLog:
         """The claim of the whole solve."""
         status = self.status
         nothing = NOTHING.get(status, NO_TIME if self.budget > 0 else "no iterations were asked for")
-        message = self.message or ("" if self.failure else nothing)
+        message = told(self.turns) or ("" if self.failure else nothing)
         return Claim(
             Status.INTERRUPTED if self.interrupted else status,
             self.iterations,

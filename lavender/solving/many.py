@@ -21,8 +21,8 @@ from lavender.judge.solution import Solution, Status, uninterrupted
 from lavender.problem import Problem
 from lavender.problem.batch import Batch
 from lavender.problem.derived import cached_property
+from lavender.solvers.loop import LEAST
 from lavender.solvers.registry import SolverSpec, get
-from lavender.solving.loop import LEAST
 from lavender.solving.solve import (
     COUNTED,
     NO_TURN,

@@ -8,10 +8,11 @@ from itertools import islice
 from typing import Any
 
 from lavender.base.arrays import number
+from lavender.base.deadline import seconds
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
-from lavender.solvers.auto import Stage, Tree, words
+from lavender.solvers.auto import Stage, Tree
 from lavender.solvers.registry import get
 from lavender.solvers.small import who
 
@@ -41,7 +42,9 @@ class Plan:
         lines = [f"{self.rows} rows, law {self.law!r}, given as {self.operator}; tol {self.tol:.0e}"]
         if self.small:
             lines.append(f"first one compiled call: {self.small}")
-        lines.append(f"newton is counted to take {words(self.newton)}, a sweep {words(self.sweep)}")
+        lines.append(
+            f"newton is counted to take {seconds(1e-9 * self.newton)}, a sweep {seconds(1e-9 * self.sweep)}"
+        )
         for stage in self.stages:
             most = "to its end"
             if stage.iterations < 1e9:

@@ -1,4 +1,4 @@
-"""`solve` and `prepare`: check the arguments, set up the solver, run it (`loop.py`), judge the result."""
+"""`solve` and `prepare`: check the arguments, set up the solver, run it (`solvers/loop.py`), judge the result."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from lavender.judge.residuals import (
 )
 from lavender.judge.solution import Claim, Solution, SolverRun, Status
 from lavender.problem import Problem, check_problem
+from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import SCIPY, loading
-from lavender.solving.loop import LEAST, Callback, Loop, Record, best_of
 from lavender.solving.outcome import (
     CONVERGED,
     INFEASIBLE,

@@ -6,15 +6,11 @@
 """
 from libc.stdint cimport int32_t
 
-import numpy as np
-
 from lavender_ext.core.csr cimport csr_t
 from lavender_ext.core.generalized cimport dot, generalized_t
 from lavender_ext.core.parts cimport blocks_t, n_directions, n_turns
-from lavender_ext.core.problem cimport Data
 from lavender_ext.core.rows cimport contact_jacobian, dot12, minv_times, rows_t
 from lavender_ext.core.view cimport view_t
-from lavender_ext.local.exact cimport boxed_rows
 from lavender_ext.local.small cimport MAX_ROWS
 from lavender_ext.local.gauss_seidel cimport (prepare_block, prepared_size, solve_csr_block, solve_general_block,
                                               solve_rows_block)
@@ -99,16 +95,6 @@ cdef void prepare_blocks(const view_t* v, const int32_t* start, double* g) noexc
         prepare_block(&v.p, i, W, one, g + start[i])
 
 
-def prepare(Data p):
-    """(start (k,) int32, numbers) of every block, for the sweeps."""
-    cdef view_t v = p.view()
-    cdef int32_t[::1] start = np.zeros(v.p.n_blocks + 1, np.int32)
-    cdef double[::1] g = np.zeros(<Py_ssize_t>prepared_sizes(&v.p, &start[0]) + 1)
-    with nogil:
-        prepare_blocks(&v, &start[0], &g[0])
-    return start.base, g.base
-
-
 cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, const generalized_t* o, const int32_t* start,
                           const double* g, const int32_t* order, double* lam, double* v) noexcept nogil:
     """One sweep over A, or over J and M (`o`), or over bodies (`r`), whose velocities v keeps; counts what fell back."""
@@ -126,14 +112,3 @@ cdef int32_t solve_blocks(const blocks_t* p, const csr_t* a, const rows_t* r, co
             i = order[q]
             fallbacks += solve_rows_block(p, r, i, g + start[i], lam, v)
     return fallbacks
-
-
-def solve_boxed(const double[:, :, ::1] W, const double[:, ::1] w, const double[:, ::1] step,
-                const double[:, ::1] lower, const double[:, ::1] upper, double[:, ::1] lam):
-    """Boxed blocks, one after the other, lam (n, rows) in place from slack w; (n,) int32: 1 exact, -1 not."""
-    cdef Py_ssize_t i, n = W.shape[0]
-    cdef int32_t[::1] found = np.empty(n, np.int32)
-    for i in range(n):
-        found[i] = boxed_rows(<int32_t>W.shape[1], &W[i, 0, 0], &w[i, 0], &step[i, 0], &lower[i, 0], &upper[i, 0],
-                              &lam[i, 0])
-    return np.asarray(found)

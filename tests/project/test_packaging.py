@@ -178,7 +178,7 @@ print(json.dumps([first, solved, list(sys.modules)]))
 LATE = """
 import os, sys
 import numpy as np, lavender as lv
-from lavender.solving.loop import Loop
+from lavender.solvers.loop import Loop
 
 class Watch:
     running = False

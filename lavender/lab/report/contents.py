@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from lavender.base.deadline import seconds
 from lavender.lab.bench.record import Record, Skip, file_name, level_name, printable
 from lavender.lab.bench.store import Records
 from lavender.lab.report import tables
@@ -18,7 +19,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.moved import idle, speed_name
 from lavender.lab.report.table import WORDS, Cell, Table
 from lavender.lab.report.tables import Advice, Line
-from lavender.lab.report.text import NONE, count, percent, residual, seconds, share, times, who, without
+from lavender.lab.report.text import NONE, count, percent, residual, share, times, who, without
 
 Rows = list[Sequence[str | Cell]]
 GOOD = ("CONVERGED", "FLOOR")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from lavender.base.deadline import seconds
 from lavender.lab.bench.record import file_name, level_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report import contents, tables
@@ -14,7 +15,7 @@ from lavender.lab.report.curves import Figures
 from lavender.lab.report.findings import Report
 from lavender.lab.report.svg import svg
 from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
-from lavender.lab.report.text import count, left_out, residual, seconds, suspicions, without
+from lavender.lab.report.text import count, left_out, residual, suspicions, without
 from lavender.lab.report.verdict import Verdict
 
 MOST = 500  # failures on a page, for its weight: 200 problems are to fit into 3 MB

@@ -18,6 +18,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from lavender.base.deadline import seconds
 from lavender.base.errors import InputError
 from lavender.io.stored import SUFFIXES, make_folder, write_figure, write_text
 from lavender.lab.bench.record import file_name, level_name
@@ -29,7 +30,7 @@ from lavender.lab.report.findings import Report
 from lavender.lab.report.style import looks
 from lavender.lab.report.table import Cell, Table, latex, tex
 from lavender.lab.report.tables.advice import NOISE
-from lavender.lab.report.text import count, seconds, without
+from lavender.lab.report.text import count, without
 
 INCH = (5.5, 3.4)  # of a figure: a page's width of text
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from shlex import quote
 
+from lavender.base.deadline import seconds
 from lavender.io.stored import SUFFIXES
 from lavender.lab.bench.record import Record, level_name
 from lavender.lab.bench.store import Records
@@ -17,7 +18,7 @@ from lavender.lab.report.tables import Choice
 from lavender.lab.report.tables.advice import QUANTILE
 from lavender.lab.report.tables.finals import STARTS, Final, Race, in_time, lines, serves_in
 from lavender.lab.report.tables.finals import to_level as race_to_level
-from lavender.lab.report.text import count, residual, seconds, without
+from lavender.lab.report.text import count, residual, without
 from lavender.lab.report.text import times as times_of
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs

@@ -498,7 +498,7 @@ def test_auto_goes_on_with_the_others_where_one_breaks_down(limit, error, monkey
 
     problem = random_contact_problem(3, contacts=60, bodies=20, friction="coulomb")
     assert problem.m > registry.SMALL_ROWS
-    kinds = {steps.Newton, steps.Direct, steps.Iterations, steps.Sweeps}
+    kinds = {steps.Newton, steps.Step, steps.Iterations, steps.Sweeps}
     for broken in [{kind} for kind in kinds] + [kinds]:
         for kind in broken:
             monkeypatch.setattr(kind, "turn", breaks)

@@ -14,13 +14,14 @@ from stacks import chain
 
 import lavender as lv
 from lavender import bench, report
+from lavender.base.deadline import seconds
 from lavender.lab.bench.record import CaseInfo, Record, Run
 from lavender.lab.report import curves, tables
 from lavender.lab.report.curves import overall_figure
 from lavender.lab.report.engine import contestants
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
-from lavender.lab.report.text import percent, residual, seconds, times
+from lavender.lab.report.text import percent, residual, times
 from lavender.lab.report.verdict import verdict
 
 LEVELS = (1e-3, 1e-6)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,6 @@ from lavender.judge.residuals import Residual, judged, known, remember, remember
 from lavender.judge.solution import Claim, History, Status
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver, State
-from lavender.solving.outcome import MAX_ITERATIONS, NUMERICAL_ERROR, STALLED, TIME_LIMIT
 from lavender_ext.judge.measure import all_finite
 
 LEAST = 1e-6  # s, what is left of a limit for a solver that is called at all
@@ -27,8 +27,14 @@ SHARE = 0.7  # of what is left, for a chunk at the pace of the last
 FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
-NOTHING_DONE = Claim(Status.MAX_ITERATIONS, 0)
-INTERRUPTED = Status.INTERRUPTED
+# Looked up once: a member reached through its class costs 600 instructions.
+INTERRUPTED, MAX_ITERATIONS, NUMERICAL_ERROR = (
+    Status.INTERRUPTED,
+    Status.MAX_ITERATIONS,
+    Status.NUMERICAL_ERROR,
+)
+STALLED, TIME_LIMIT = Status.STALLED, Status.TIME_LIMIT
+NOTHING_DONE = Claim(MAX_ITERATIONS, 0)
 
 
 @dataclass
@@ -41,13 +47,16 @@ class Loop:
     impulse: FloatArray  # (m,) N s, in place
     tol: float
     deadline: Deadline
-    callback: Callback | None
-    records: list[Record] | None
+    callback: Callback | None = None
+    records: list[Record] | None = None
     time: float = 0.0  # s, of the solver alone
     done: int = 0  # iterations
     work: dict[str, int] = field(default_factory=dict)
     broken: bool = False  # the solver did not return
     next_record: int = 0  # iterations
+    pace: float = (
+        inf  # s that an iteration takes at most, as counted; inf: the first tells, work over A is another
+    )
 
     def run_once(self, max_iter: int) -> Claim:
         """In one call, of a solver that cannot be continued."""
@@ -59,7 +68,7 @@ class Loop:
             finally:
                 self.time = watch.seconds
             if not self.broken:
-                return self.solver.tell(self.state, self.impulse, claim)
+                return claim
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
         # It was in the middle of whatever it does.
@@ -80,13 +89,19 @@ class Loop:
             return Claim(NUMERICAL_ERROR, 0, {}, last_words(error))
 
     def run(self, max_iter: int) -> Claim:
-        """In chunks."""
+        """In chunks; the result is the best of what was checked."""
+        claim = self.chunks(max_iter)
+        self._keep_best()
+        return claim
+
+    def chunks(self, max_iter: int) -> Claim:
+        """So many iterations in all, or fewer where the solver, the clock, the callback or Ctrl-C ends them."""
         # About a nanosecond per unit of work: the first guess, then measured. Capped, for solvers in Python.
         chunk = min(FIRST_CHUNK, max(1, int(CHUNK_TIME * 1e9) // max(1, self.problem.metric.work)))
         records = self.records is not None or self.callback is not None
         claim = NOTHING_DONE
         if self.deadline.is_set:
-            chunk = 1  # the counted work may be wrong: over J and M some solvers sweep over A
+            chunk = max(1, min(chunk, int(self._aim() / self.pace)))
         try:
             if self.deadline.is_set:
                 watch = Stopwatch()
@@ -122,13 +137,14 @@ class Loop:
                     chunk = self._next_chunk(n, elapsed)
         except KeyboardInterrupt:
             claim = Claim(INTERRUPTED, 0, {}, "Ctrl-C")
-        self._keep_best()
         return self._total(claim)
 
     def _next_chunk(self, n: int, elapsed: float) -> int:
+        return max(1, min(8 * n, int(n * self._aim() / max(elapsed, 1e-7))))
+
+    def _aim(self) -> float:
         left = self.deadline.left()
-        aim = CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
-        return max(1, min(8 * n, int(n * aim / max(elapsed, 1e-7))))
+        return CHUNK_TIME if left is None else min(CHUNK_TIME, SHARE * left)
 
     def not_worse(self, start: FloatArray) -> None:
         """The best of what was found, where it began, and doing nothing."""
