@@ -47,8 +47,9 @@ def check(
     A records.jsonl of a report is verified: each run is repeated on the problems named after it (default: where the
     records say). Verdicts must agree; times are shown side by side.
 
-    Exit code 1: a claim is contradicted; a verdict or problem differs from the records.jsonl; a file in a folder
-    cannot be read; or, with --precision or --threshold, a stored solution is neither at its floor nor close enough.
+    Exit code 1: a claim is contradicted; a verdict or problem differs from the records.jsonl, or nothing of one of its
+    solvers could be verified (--solvers names those that count); a file in a folder cannot be read; or, with
+    --precision or --threshold, a stored solution is neither at its floor nor close enough.
     Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
     from lavender.base.arrays import number

@@ -102,6 +102,7 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
         A case that the suite does not have.
     """
     items: list[Item] = []
+    read: set[Path] = set()  # folders, which a link in one of them may lead back to
     words = [words] if isinstance(words, Source) else list(words)
     if not words:
         from lavender.lab import suite
@@ -121,10 +122,11 @@ def resolve(words: Source | Iterable[Source], sequences: bool | None = None) -> 
             items += [*steps, *(replace(item, name=f"{name}, {item.name}", sequence=name) for item in lost)]
         elif Path(word).is_dir():
             paths = _problem_files(Path(word))
+            read.add(Path(word).resolve())
             inner = [
                 p
                 for p in sorted(Path(word).iterdir())
-                if p.is_dir() and os.access(p, os.R_OK) and _problem_files(p)
+                if p.is_dir() and p.resolve() not in read and os.access(p, os.R_OK) and _problem_files(p)
             ]
             words += inner
             if not paths and not inner:

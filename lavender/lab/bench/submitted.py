@@ -50,9 +50,15 @@ class Submission:
         return tuple(v for v in self.lines if v.agrees is False)
 
     @property
+    def unverified(self) -> tuple[str, ...]:
+        """Solvers of which no measurement was verified."""
+        verified = {v.record.solver for v in self.lines if v.agrees is not None}
+        return tuple(dict.fromkeys(v.record.solver for v in self.lines if v.record.solver not in verified))
+
+    @property
     def ok(self) -> bool:
-        """Something was verified, all of that agrees, and every problem is the one that was submitted."""
-        return not self.disagreements and not self.others and any(v.agrees for v in self.lines)
+        """Something of each solver was verified, all of that agrees, every problem is the one that was submitted."""
+        return bool(self.lines) and not (self.disagreements or self.others or self.unverified)
 
     def __str__(self) -> str:
         theirs = f"{self.run.cpu}, lavender {self.run.lavender}"
@@ -68,7 +74,7 @@ class Submission:
             out.append(" | ".join([solver, *map(str, numbers), *times]))
         for v in self.disagreements:
             out.append(f"DISAGREES: {v.record.solver} on {v.record.case}, {v.record.asked}: {v.note}")
-        out += [f"NOT VERIFIED: {text}" for text in self.others]
+        out += [f"NOT VERIFIED: {text}" for text in (*self.others, *self.unverified)]
         notes = [v.note for v in self.lines if v.agrees is None]
         out += [f"not verified, {notes.count(note)}: {note}" for note in dict.fromkeys(notes)]
         return "\n".join(out)

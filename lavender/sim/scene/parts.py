@@ -12,6 +12,7 @@ from lavender.base.errors import InputError
 from lavender.sim.scene.arithmetic import norm, sine_cosine, turned_back
 from lavender_ext.core.checks import LEAST, MOST
 
+FLAT = 1e-6  # that rounded moments of a plate may be over
 _put = object.__setattr__  # of a frozen shape, what was given as it is kept
 
 
@@ -188,4 +189,9 @@ def _tensor(label: str, given: Any) -> FloatArray:
     value = np.linalg.eigvalsh(x)
     if not value[0] > 1e-14 * value[-1] or not value[0] > 0.0:
         raise InputError(f"inertia of {label} has moments {value.tolist()} kg m^2; all must be positive")
+    if value[2] > (1.0 + FLAT) * (value[0] + value[1]):  # I_3 = sum m (x_1^2 + x_2^2) <= I_1 + I_2
+        raise InputError(
+            f"inertia of {label} has moments {value.tolist()} kg m^2; the largest is at most the sum of the others, as "
+            "of a flat plate: no body has more"
+        )
     return x

@@ -129,6 +129,7 @@ def test_contacts_of_one_scene_may_have_different_rows():
         (lambda s: s.add_body(shape=Plane((0.0, 0.0, 0.0), 0.0)), "direction"),
         (lambda s: s.add_body(inertia=(1, 1, 0)), "positive"),
         (lambda s: s.add_body(inertia=(1, 1, -1)), "positive"),
+        (lambda s: s.add_body(inertia=(1, 2.1, 1)), "at most the sum of the others"),
         (lambda s: s.add_body(inertia=(1, 1, 1e-15)), "positive"),
         (lambda s: s.add_body(inertia=[[1, 2, 0], [0, 1, 0], [0, 0, 1]]), "symmetric"),
         (lambda s: s.add_body(inertia=[[1, 2, 0], [2, 1, 0], [0, 0, 1]]), "positive"),
