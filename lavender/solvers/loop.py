@@ -17,7 +17,15 @@ from lavender.base.arrays import FloatArray
 from lavender.base.deadline import CHUNK_TIME, Deadline, Stopwatch
 from lavender.base.errors import BREAKDOWN, last_words
 from lavender.judge.residuals import Residual, judged, known, remember, remembered, residual
-from lavender.judge.solution import Claim, History, Status
+from lavender.judge.solution import (
+    INTERRUPTED,
+    MAX_ITERATIONS,
+    NUMERICAL_ERROR,
+    STALLED,
+    TIME_LIMIT,
+    Claim,
+    History,
+)
 from lavender.problem import Problem
 from lavender.solvers.registry import Solver, State
 from lavender_ext.judge.measure import all_finite
@@ -27,13 +35,6 @@ SHARE = 0.7  # of what is left, for a chunk at the pace of the last
 FIRST_CHUNK = 256  # iterations: 10 ms at 40 us each, slower than any compiled sweep of few rows
 Callback = Callable[[int, FloatArray, Residual], Any]
 Record = tuple[int, float, float, float, float]  # iterations, s, relative, energy, velocity
-# Looked up once: a member reached through its class costs 600 instructions.
-INTERRUPTED, MAX_ITERATIONS, NUMERICAL_ERROR = (
-    Status.INTERRUPTED,
-    Status.MAX_ITERATIONS,
-    Status.NUMERICAL_ERROR,
-)
-STALLED, TIME_LIMIT = Status.STALLED, Status.TIME_LIMIT
 NOTHING_DONE = Claim(MAX_ITERATIONS, 0)
 
 
@@ -54,9 +55,7 @@ class Loop:
     work: dict[str, int] = field(default_factory=dict)
     broken: bool = False  # the solver did not return
     next_record: int = 0  # iterations
-    pace: float = (
-        inf  # s that an iteration takes at most, as counted; inf: the first tells, work over A is another
-    )
+    pace: float = inf  # s that an iteration takes at most, as counted; inf: the first one tells
 
     def run_once(self, max_iter: int) -> Claim:
         """In one call, of a solver that cannot be continued."""

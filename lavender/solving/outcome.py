@@ -12,20 +12,23 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.judge.certificates import prove, rounded_down
 from lavender.judge.residuals import FLOOR_MOST, at_floor, reference, relative_of, residual
-from lavender.judge.solution import Claim, History, Solution, SolverRun, Status
+from lavender.judge.solution import (
+    CONVERGED,
+    DIVERGED,
+    FLOOR,
+    INFEASIBLE,
+    MAX_ITERATIONS,
+    NUMERICAL_ERROR,
+    STALLED,
+    TIME_LIMIT,
+    Claim,
+    History,
+    Solution,
+    SolverRun,
+)
 from lavender.problem import Problem
 from lavender.solvers.registry import SolverSpec, in_one_call
 from lavender_ext.judge.measure import Judged, all_finite
-
-# Looked up once: a member reached through its class costs 600 instructions, a dozen times a solve.
-CONVERGED = Status.CONVERGED
-DIVERGED = Status.DIVERGED
-FLOOR = Status.FLOOR
-INFEASIBLE = Status.INFEASIBLE
-MAX_ITERATIONS = Status.MAX_ITERATIONS
-NUMERICAL_ERROR = Status.NUMERICAL_ERROR
-STALLED = Status.STALLED
-TIME_LIMIT = Status.TIME_LIMIT
 
 
 def finish(

@@ -26,19 +26,21 @@ from lavender.judge.residuals import (
     told,
     unstretched,
 )
-from lavender.judge.solution import Claim, Solution, SolverRun, Status
-from lavender.problem import Problem, check_problem
-from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
-from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import SCIPY, loading
-from lavender.solving.outcome import (
+from lavender.judge.solution import (
     CONVERGED,
     INFEASIBLE,
     NUMERICAL_ERROR,
     TIME_LIMIT,
-    decide_empty_rows,
-    finish,
+    Claim,
+    Solution,
+    SolverRun,
+    Status,
 )
+from lavender.problem import Problem, check_problem
+from lavender.solvers.loop import LEAST, Callback, Loop, Record, best_of
+from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
+from lavender.solvers.setup_times import SCIPY, loading
+from lavender.solving.outcome import decide_empty_rows, finish
 from lavender_ext.judge.measure import all_finite
 
 LATER = ("iterations", "work", "solver", "message", "history", "dual", "certificate", "impulse_bound",
