@@ -146,9 +146,8 @@ def console(stderr: bool = False) -> Console:
     from rich.console import Console
 
     known = Console(stderr=stderr).is_terminal or os.environ.get("COLUMNS", "0").strip("0").isdigit()
-    width = (
-        max(shutil.get_terminal_size().columns, LEAST_WIDTH) if known else 10_000
-    )  # nothing is folded or cut
+    # nothing is folded or cut
+    width = max(shutil.get_terminal_size().columns, LEAST_WIDTH) if known else 10_000
     return Console(stderr=stderr, width=width)
 
 

@@ -128,9 +128,8 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         done = measure(context, files, path, sweeps)
     engines = [] if asked["campaign"] else contestants(files, done.records.latest())
     found = Report(done.records, old, asked["time_budgets"], sweeps, engines)
-    index = write(
-        found, out, figures=not asked["no_figures"]
-    )  # before a pipe that nobody reads ends the command
+    # before a pipe that nobody reads ends the command
+    index = write(found, out, figures=not asked["no_figures"])
     paper = None
     if asked["paper"]:
         from lavender.lab.report.paper import write_paper

@@ -51,12 +51,10 @@ class Entry:
     form: str  # rows (bodies), matrix, generalized (J and M)
     licence: str = ""  # of a model that another package installs
     made: str = ""  # versions that give these numbers, where they hang on other packages
-    sweeps: int | None = (
-        None  # of PGS to 1e-3 of doing nothing; None: not within 10,000, or it does not take the problem
-    )
-    condition: float | None = (
-        None  # of A, scaled to a diagonal of 1, over its range; None above CONDITION rows
-    )
+    # of PGS to 1e-3 of doing nothing; None: not within 10,000, or it does not take the problem
+    sweeps: int | None = None
+    # of A, scaled to a diagonal of 1, over its range; None above CONDITION rows
+    condition: float | None = None
     degenerate: float = 0.0  # share of blocks that are nearer to another state than the answer's error
     known: str = "open"  # enclosed, infeasible or open
     radius: float | None = None  # m/s, of every row of the enclosed solution

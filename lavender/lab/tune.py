@@ -119,9 +119,8 @@ class Measured:
     solver: str
     error: FloatArray = field(repr=False)  # (steps,) m/s
     motion: FloatArray = field(repr=False)  # (stretches,) m
-    times: FloatArray = field(
-        repr=False
-    )  # (steps,) s, each the least of all rounds: what interrupts one is no part of it
+    # (steps,) s, each the least of all rounds: what interrupts one is no part of it
+    times: FloatArray = field(repr=False)
 
     @property
     def time(self) -> float:

@@ -46,9 +46,8 @@ class Item:
     step: int = -1
     given: Problem | None = None  # in memory, not behind a name
     stored: Callable[[], FloatArray | None] = lambda: None  # (m,) N s, the answer beside the problem
-    named: bool = (
-        False  # asked for by name, not met in a folder: that it does not load is the request's fault
-    )
+    # asked for by name, not met in a folder: that it does not load is the request's fault
+    named: bool = False
 
     def __post_init__(self) -> None:
         self.name, self.sequence = printable(self.name), printable(self.sequence)
@@ -293,9 +292,8 @@ def _from_file(path: Path) -> Item:
         from lavender import io
 
         if path.exists() and not path.is_file():
-            raise InputError(
-                f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed"
-            )  # a pipe never ends
+            # a pipe never ends
+            raise InputError(f"{path} is no file; a problem ({', '.join(SUFFIXES)}) is needed")
         if not path.exists() and (why := _left_out(path.parent).get(path)):
             raise InputError(f"{path}: left out of its recording: {why}")
         return io.load(path)

@@ -101,9 +101,8 @@ class Run(_Texts):
     threads: int  # of BLAS and OpenMP while timing
     versions: Mapping[str, str]
     plan: Mapping[str, Any]
-    build: Mapping[str, str] = field(
-        default_factory=dict
-    )  # commit, hash of the kernels, compiler, BLAS, clock
+    # commit, hash of the kernels, compiler, BLAS, clock
+    build: Mapping[str, str] = field(default_factory=dict)
     load: float | None = None  # processes that wanted the processor, mean of the minute before
 
 
@@ -130,17 +129,14 @@ class CaseInfo(_Texts):
     step: int = -1
     nothing_to_do: bool = False  # doing nothing is a solution: the case is not ranked
     identity: str = ""  # of the sequence, from the numbers of all its steps: steps of two are never one
-    stored_verdict: str = (
-        ""  # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
-    )
+    # of a stored answer in float32: at its floor, stopped early (by how much) or wrong
+    stored_verdict: str = ""
     suspicions: tuple[str, ...] = ()  # what looks like a mistake in its data
     guess: str = ""  # to begin at: a "start"; an "answer", from which nothing is measured; or nothing
-    condition: float | None = (
-        None  # of A, scaled to a diagonal of 1, over its range; None where it was not computed
-    )
-    proof: str = (
-        ""  # how near an exact solution is enclosed, or why none is; empty where it was not asked for
-    )
+    # of A, scaled to a diagonal of 1, over its range; None where it was not computed
+    condition: float | None = None
+    # how near an exact solution is enclosed, or why none is; empty where it was not asked for
+    proof: str = ""
 
 
 @dataclass(frozen=True)
@@ -172,9 +168,8 @@ class Record(_Texts):
     sha: str  # of the case's numbers
     solver: str
     options: Mapping[str, Any]
-    start: (
-        str  # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
-    )
+    # "cold" from doing nothing, "warm" from the guess of the problem, "carried" from the step before
+    start: str
     # "tol": to that residual; "budget": exactly max_iter iterations; "time": to tol, but stopped at time_limit
     mode: str
     tol: float
@@ -206,25 +201,22 @@ class Record(_Texts):
     setup_median: float = math.nan
     solve_min: float = math.nan
     solve_median: float = math.nan
-    time_min: float = (
-        math.nan
-    )  # of one repeat: of the line where `way` says one, else set-up and solve together
+    # of one repeat: of the line where `way` says one, else set-up and solve together
+    time_min: float = math.nan
     time_median: float = math.nan
     threads: int = 1
     step: int = -1  # of a sequence
     # What was timed: "call", one `lv.solve` on a problem just made; "steps", the same in a loop that carries impulses;
     # "batch", a problem's share of one `lv.solve_many`; "" prepare and solve, without judge and front door.
     way: str = ""
-    turns: str = (
-        ""  # which lines on which cases took turns with this one; "": repeats came one after the other
-    )
+    # which lines on which cases took turns with this one; "": repeats came one after the other
+    turns: str = ""
     times: tuple[float, ...] = ()  # s, of each repeat
     reached: tuple[float, ...] = ()  # relative residual of each repeat, where they differ (mode "time")
     pace: float | None = None  # s, of a loop of fixed work beside the repeats: what the machine was worth
     load: float | None = None  # processes that wanted a processor when it was made, this one among them
-    own_min: float | None = (
-        None  # s, of a backend of others on data that it was given before, by its own interface
-    )
+    # s, of a backend of others on data that it was given before, by its own interface
+    own_min: float | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:

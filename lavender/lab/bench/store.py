@@ -37,9 +37,8 @@ class Records:
     source: str = ""
     done: dict[tuple[str, str, str], Done] = field(default_factory=dict)  # pairs of a campaign, complete
     _skips: dict[tuple[str, str, str], Skip] = field(default_factory=dict, repr=False)
-    _sequences: dict[str, str] = field(
-        default_factory=dict, repr=False
-    )  # the identity of each, as described last
+    # the identity of each, as described last
+    _sequences: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
     def skips(self) -> list[Skip]:
@@ -95,9 +94,8 @@ class Records:
         mine = [
             r for r in self.records if r.run == run and r.sha == now.get(r.case, "" if r.step >= 0 else r.sha)
         ]
-        newest = next(
-            (r.turns for r in reversed(mine) if r.turns), ""
-        )  # lines that took turns with each other
+        # lines that took turns with each other
+        newest = next((r.turns for r in reversed(mine) if r.turns), "")
         mine = [r for r in mine if r.turns in ("", newest)]
         cases = {r.case for r in mine}
         return self.having(mine, lambda e: e.run == run or (isinstance(e, CaseInfo) and e.case in cases))

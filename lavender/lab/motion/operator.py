@@ -21,9 +21,8 @@ from lavender.base.later import sparse as sp
 from lavender.problem import Problem
 
 U = 2.0**-53
-SHIFT = (
-    1e-12  # -, of the largest eigenvalue of an inverse inertia: by what rounding may have made one negative
-)
+# -, of the largest eigenvalue of an inverse inertia: by what rounding may have made one negative
+SHIFT = 1e-12
 LARGEST_TREE = 2000  # generalised velocities of one tree, whose M is inverted, dense
 
 

@@ -53,9 +53,8 @@ class Motion:
     relative: float  # -, residual
     energy: float  # J, 1/2 lambda.A lambda - b.lambda: what the constraints add to the bodies' energy at rest targets
     dissipation: float  # J, -sum w.lambda over friction rows
-    lift: (
-        float  # m/s, largest normal slack of a contact that presses: what the cone law pays for being convex
-    )
+    # m/s, largest normal slack of a contact that presses: what the cone law pays for being convex
+    lift: float
     count: int  # runs that ended here
     found_by: tuple[str, ...]  # their solvers, orders and starts
 

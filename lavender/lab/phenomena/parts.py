@@ -76,9 +76,8 @@ class Phenomenon:
     cases: tuple[Values, ...]  # that a run measures
     quantities: tuple[Quantity, ...]  # the first stands in the table
     needs: frozenset[str]  # of an engine: "box", "sphere", "spin", "rolling", "ball joint", "hinge"
-    build: Callable[
-        [Values, Mapping[str, Any]], Scene
-    ]  # of parameters, and of what an engine asks of the scene
+    # of parameters, and of what an engine asks of the scene
+    build: Callable[[Values, Mapping[str, Any]], Scene]
     seconds: Callable[[Values], float]  # simulated
     measure: Callable[[Values, Track], dict[str, float]]
     interval: float = 1.0 / 60.0  # s between two samples

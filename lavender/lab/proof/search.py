@@ -31,16 +31,14 @@ class Enclosure:
     """An exact solution of the problem's own numbers, and how far from an answer it is. `str()` is a line."""
 
     proven: bool
-    impulse_radius: (
-        float  # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
-    )
+    # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
+    impulse_radius: float
     velocity_radius: float  # m/s: largest |w_i - w_i*| of a row
     unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `motion.uniqueness`
     reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
-    borders: tuple[
-        str, ...
-    ] = ()  # degenerate blocks by name: between two cases, dependent to rounding, or singular
+    # degenerate blocks by name: between two cases, dependent to rounding, or singular
+    borders: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         if not self.proven:
@@ -372,9 +370,8 @@ class Search:
             ]
             if not block.loaded:
                 sign = sign_of(w[r])
-                if (
-                    self.cone and sign > 0
-                ):  # w_n >= sum s; one root of the sum of squares where there is one part
+                # w_n >= sum s; one root of the sum of squares where there is one part
+                if self.cone and sign > 0:
                     sign = (
                         sign_of(w[r] * w[r] - speeds[0])
                         if len(speeds) == 1

@@ -35,9 +35,8 @@ class Contestant:
     relative: float  # median
     worst: float
     above_floor: int  # answers that rounding does not explain
-    early: (
-        int  # of these, answers that stopped early or are wrong, by more than the threshold of the recording
-    )
+    # of these, answers that stopped early or are wrong, by more than the threshold of the recording
+    early: int
     velocity: float  # m/s, of the worst row of all answers; nan where the recording does not say
     where: str  # that row
     ours: str  # the fastest solver that reached the level in every step, its start, the level; empty if none did

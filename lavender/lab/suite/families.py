@@ -438,9 +438,8 @@ def random_spd(n: int = 100, condition: float = 1e6, seed: int = 0) -> Draft:
     # Twelve digits of each eigenvalue, the last of which no library's power decides.
     a = np.zeros((n, n))  # before the work: it may not fit
     np.fill_diagonal(a, [float(f"{condition**power:.12g}") for power in np.linspace(-1.0, 0.0, n)])
-    for _ in range(
-        4 * n.bit_length()
-    ):  # turned in random planes, until every vector has a part of every other
+    # turned in random planes, until every vector has a part of every other
+    for _ in range(4 * n.bit_length()):
         i, j = rng.permutation(n)[: n - n % 2].reshape(2, -1)
         t = rng.uniform(-1.0, 1.0, (len(i), 1))
         c, s = (1.0 - t * t) / (1.0 + t * t), 2.0 * t / (1.0 + t * t)

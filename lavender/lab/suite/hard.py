@@ -238,9 +238,8 @@ def diagonal(kind: str = "zero", n: int = 12) -> Draft:
         raise InputError(f"kind is {kind!r}; zero, negative, negligible are known")
     rng = np.random.default_rng(2)
     a = rng.integers(-3, 4, (n, n)).astype(float)
-    a = (
-        np.triu(a, 1) - np.triu(a, 1).T + np.diag(np.full(n, 4.0))
-    )  # skew part: monotone apart from the diagonal
+    # skew part: monotone apart from the diagonal
+    a = np.triu(a, 1) - np.triu(a, 1).T + np.diag(np.full(n, 4.0))
     a[np.arange(0, n, 3), np.arange(0, n, 3)] = value
     active = np.arange(n) % 2 == 0
     impulse = np.where(active, rng.integers(1, 5, n), 0).astype(float)

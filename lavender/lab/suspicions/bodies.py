@@ -140,9 +140,8 @@ def _same_place(r: Rows, size: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Contacts that repeat another of their pair to rounding, and those that oppose one within a hundredth."""
     pair = np.sort(r.contact_body, axis=1)
     turned = np.where(r.contact_body[:, 0] > r.contact_body[:, 1], -1.0, 1.0)[:, None]
-    arm = np.where(
-        (r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a
-    )  # of the later, a moving body
+    # of the later, a moving body
+    arm = np.where((r.contact_body[:, 1] == pair[:, 1])[:, None], r.arm_b, r.arm_a)
     n = turned * r.normal
     order = np.lexsort((arm[:, 2], arm[:, 1], arm[:, 0], pair[:, 1], pair[:, 0]))
     again, opposed = [], []

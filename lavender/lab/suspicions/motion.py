@@ -159,9 +159,8 @@ def stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicio
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= LARGE:
             push = np.array([step[j : j + 3] for j in free_bodies(g.mass.toarray())]).reshape(-1, 3)
-        fall = (
-            np.linalg.norm(push, axis=1) if len(push) else change
-        )  # light fingers are faster than what flies
+        # light fingers are faster than what flies
+        fall = np.linalg.norm(push, axis=1) if len(push) else change
         fall = fall[fall > 0.01 * fall.max()]  # of spins, and of bodies beside each other, nothing
         most = float(np.median(fall)) if len(fall) else 0.0
         if not step.any():

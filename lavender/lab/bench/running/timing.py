@@ -313,9 +313,8 @@ def _parts(problem: Problem, task: Task, impulse: Any) -> Solution:
     """Prepare and solve under the time limit."""
     fresh = replace(problem, copy=False)  # nothing derived yet: forming A is set-up
     more = {"isolate": False} if "isolate" in registry.get(task.solver).accepts else {}
-    prepared = prepare(
-        fresh, task.solver, **{**more, **task.options}
-    )  # a run has processes of its own for these
+    # a run has processes of its own for these
+    prepared = prepare(fresh, task.solver, **{**more, **task.options})
     reference(fresh)  # E0, V0: the judge's, outside the clocks
     if task.start == "cold":
         impulse = fresh.start()

@@ -51,9 +51,8 @@ class Engine(Stepping):
         if "error" in said:
             raise LavenderError(str(said["error"]))
         self.spent += float(said["cpu"])
-        self.seen = np.array(said["state"], float).reshape(
-            -1, 13
-        )  # null, for what is not finite, becomes nan
+        # null, for what is not finite, becomes nan
+        self.seen = np.array(said["state"], float).reshape(-1, 13)
 
     def step(self) -> None:
         """See `Stepping.step`."""

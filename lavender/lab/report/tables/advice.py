@@ -245,9 +245,8 @@ def within(
 
     places = _best_of_each(standing(way, limit) for way in taking)
     found = ranked(family, limit, places, RESIDUAL_NOISE)
-    found = replace(
-        found, least=QUANTILE
-    )  # who serves fewer leaves 1.0 at the 90th percentile: noise decides who
+    # who serves fewer leaves 1.0 at the 90th percentile: noise decides who
+    found = replace(found, least=QUANTILE)
     if found.best is None or math.isinf(limit):
         return found
     late = {c.solver: (key, c.score) for key, c in _best_of_each(standing(w, NOISE * limit) for w in taking)}
