@@ -62,7 +62,7 @@ def process(app, what, name, obj, options, lines):
 
 
 def add_fields(app, what, name, obj, options, lines):
-    """Sphinx event, after numpydoc: the fields of a data class with the comments on their lines."""
+    """Sphinx event, after numpydoc: the fields of a data class with their comments."""
     if what == "class" and dataclasses.is_dataclass(obj):
         lines += ["", *_fields(obj), ""]
 
@@ -75,7 +75,7 @@ def _plain(line):
 
 
 def field_comments(cls):
-    """Name -> (type, comment on the line), of the public fields of a data class, as its source declares them."""
+    """Name -> (type, comment above and on the line), of the public fields of a data class, as its source has them."""
     source = textwrap.dedent(inspect.getsource(cls))
     lines = source.split("\n")
     found = {}
@@ -88,6 +88,10 @@ def field_comments(cls):
             re.search(r"\s#\s(?!type:|noqa|fmt:)(.*)$", lines[n - 1])
             for n in range(node.lineno, node.end_lineno + 1)
         ]
+        n = node.lineno - 2
+        while comment := re.match(r"\s*#\s(.*)$", lines[n]):
+            comments.insert(0, comment)
+            n -= 1
         text = " ".join(c.group(1) for c in comments if c)
         found[node.target.id] = (ast.unparse(node.annotation), text)
     return found

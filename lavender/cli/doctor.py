@@ -7,8 +7,7 @@ from dataclasses import asdict
 
 import click
 
-from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, say
+from lavender.cli.options import Reading, say
 from lavender.lab.bench import doctor as bench_doctor
 
 
@@ -49,22 +48,15 @@ def _suspect(files: tuple[str, ...], as_json: bool) -> None:
     from lavender.lab import bench
     from lavender.lab.suspicions import diagnose
 
-    found, missing, unread = {}, False, False
+    found, reading = {}, Reading()
     for item in bench.resolve(files):
-        try:
+        with reading(item):
             found[item.name] = diagnose(item.problem)
-        except LavenderError as error:
-            say(f"{item.name}: {error}", err=True)
-            unread = True
-            missing |= isinstance(error, InputError) and item.named
-        finally:
-            item.forget()
-        for suspicion in () if as_json else found.get(item.name, ()):
-            say(f"{item.name}: {suspicion}")
+            for suspicion in () if as_json else found[item.name]:
+                say(f"{item.name}: {suspicion}")
     suspect = sum(map(bool, found.values()))
     if as_json:
         click.echo(json.dumps({name: list(map(asdict, told)) for name, told in found.items()}, indent=2))
     else:
         click.echo(f"{len(found)} looked at, {suspect or 'none'} suspicious")
-    if missing or suspect or unread:
-        raise click.exceptions.Exit(EXIT_BAD_INPUT if missing else EXIT_UNMET)
+    reading.end(suspect)

@@ -6,8 +6,7 @@ import json
 
 import click
 
-from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, say
+from lavender.cli.options import Reading, say
 
 
 @click.command()
@@ -21,24 +20,17 @@ def explain(files: tuple[str, ...], tol: float, as_data: bool) -> None:
 
     Exit code 1: a file in a folder cannot be read; the others are explained. Exit code 2: a named file cannot be read.
     """
+    from lavender.base.arrays import number
     from lavender.lab.bench.cases import resolve
     from lavender.solving.plan import explain as plan_of
 
-    unread = False
+    number("tol", tol, above=0.0)
+    reading = Reading()
     for item in resolve(list(files)):
-        try:
-            problem = item.problem
-        except InputError as error:
-            if item.named:
-                raise
-            say(f"{item.name}: {error}", err=True)
-            unread = True
-            continue
-        item.forget()
-        plan = plan_of(problem, tol)
-        if as_data:
-            click.echo(json.dumps(plan.data()))
-        else:
-            say(f"{item.name}: {plan}\n")
-    if unread:
-        raise click.exceptions.Exit(EXIT_UNMET)
+        with reading(item):
+            plan = plan_of(item.problem, tol)
+            if as_data:
+                click.echo(json.dumps(plan.data()))
+            else:
+                say(f"{item.name}: {plan}\n")
+    reading.end()

@@ -7,15 +7,18 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from lavender.base.errors import InputError
+from lavender.base.errors import InputError, LavenderError
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from lavender.lab.bench import Item
 
     _ParamType = click.ParamType[Any]  # generic for type checkers since click 8.2, never for click 8.1
 else:
@@ -321,6 +324,31 @@ def say(text: str, err: bool = False) -> None:
     from lavender.lab.bench.record import printable
 
     click.echo(printable(text, lines=True), err=err)
+
+
+class Reading:
+    """Around what is done with each problem of a command: what a file makes raise is told, and costs the exit code."""
+
+    def __init__(self, tell: Callable[[str], Any] | None = None) -> None:
+        self.tell = tell or partial(say, err=True)
+        self.code = 0
+
+    @contextlib.contextmanager
+    def __call__(self, item: Item) -> Iterator[None]:
+        """One problem, whose memory is let go of at the end."""
+        try:
+            yield
+        except LavenderError as error:
+            self.tell(f"{item.name}: {error}")
+            named = isinstance(error, InputError) and item.named
+            self.code = max(self.code, EXIT_BAD_INPUT if named else EXIT_UNMET)
+        finally:
+            item.forget()
+
+    def end(self, unmet: Any = False) -> None:
+        """The exit of the command: 2 where a named problem could not be read, 1 for another, or where `unmet`."""
+        if code := self.code or (EXIT_UNMET if unmet else 0):
+            raise click.exceptions.Exit(code)
 
 
 def parameters_of(words: tuple[str, ...]) -> dict[str, Any]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, one_thread, say
+from lavender.cli.options import Reading, one_thread, say
 
 
 @click.command()
@@ -31,19 +30,12 @@ def prove(files: tuple[str, ...], solver: str, tol: float) -> None:
     one_thread()
     get(solver)  # refused before anything is read, as is a missing package
     require()
-    unmet = missing = False
+    unmet, reading = False, Reading()
     for item in resolve(list(files)):
-        try:
+        with reading(item):
             solution = solve(item.problem, solver, tol=tol)
             found = enclose(item.problem, solution)
             short = "" if solution.success else f"; {solver}: {solution.status.name}"
             say(f"{item.name}: {found}{short}")
             unmet |= not found.proven
-        except LavenderError as error:
-            say(f"{item.name}: {error}", err=True)
-            missing |= isinstance(error, InputError) and item.named
-            unmet = True
-        finally:
-            item.forget()
-    if missing or unmet:
-        raise click.exceptions.Exit(EXIT_BAD_INPUT if missing else EXIT_UNMET)
+    reading.end(unmet)

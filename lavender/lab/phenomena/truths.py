@@ -5,20 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.special import ellipk
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.parts import GRAVITY
-
-
-def elliptic(k2: float) -> float:
-    """Complete elliptic integral K of modulus k, k^2 given: pi/2 over the arithmetic-geometric mean of 1 and k'.
-
-    K(k) = pi/(2 agm(1, sqrt(1 - k^2)))          (Gauss, 1799)
-    """
-    a, b = 1.0, math.sqrt(1.0 - k2)
-    while abs(a - b) > 4e-16 * a:
-        a, b = 0.5 * (a + b), math.sqrt(a * b)
-    return math.pi / (a + b)
 
 
 def pendulum_period(inertia: float, torque: float, angle: float) -> float:
@@ -28,7 +18,7 @@ def pendulum_period(inertia: float, torque: float, angle: float) -> float:
 
         T = 4 sqrt(I/(m g l)) K(sin(phi0/2))
     """
-    return 4.0 * math.sqrt(inertia / torque) * elliptic(math.sin(0.5 * angle) ** 2)
+    return 4.0 * math.sqrt(inertia / torque) * float(ellipk(math.sin(0.5 * angle) ** 2))
 
 
 def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
@@ -45,7 +35,7 @@ def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
         i1, i3 = i3, i1
     below = (i3 - i2) * (l2 - twice_energy * i1)
     k2 = (i2 - i1) * (twice_energy * i3 - l2) / below
-    return 4.0 * elliptic(k2) * math.sqrt(i1 * i2 * i3 / below)
+    return 4.0 * float(ellipk(k2)) * math.sqrt(i1 * i2 * i3 / below)
 
 
 def tipping_time(width: float, height: float, slope: float, angle: float) -> float:
