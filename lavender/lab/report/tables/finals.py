@@ -128,7 +128,7 @@ def to_level(records: Records, some: Sequence[Final], level: float, cases: int =
     charged = np.where(missed[:, :, None] | ~np.isfinite(times), limit, times)
 
     def score(values: FloatArray) -> FloatArray:
-        found = np.exp(np.log(_quantile(values, QUIET) + SHIFT).mean(axis=-1)) - SHIFT
+        found = np.exp(np.log(np.quantile(values, QUIET, axis=-1) + SHIFT).mean(axis=-1)) - SHIFT
         return np.asarray(np.maximum(found, TICK))
 
     def choice(i: int, value: float) -> Choice:
@@ -157,8 +157,8 @@ def in_time(records: Records, some: Sequence[Final], limit: float, cases: int = 
     served = np.quantile(got, LATE, axis=2, method="lower") <= HALF
 
     def score(values: FloatArray) -> FloatArray:
-        each = _lower_quantile(values, LATE)
-        return np.asarray(np.maximum(_inverted_cdf(each, QUANTILE), 1e-17))
+        each = np.quantile(values, LATE, axis=-1, method="lower")
+        return np.asarray(np.maximum(np.quantile(each, QUANTILE, axis=-1, method="inverted_cdf"), 1e-17))
 
     def choice(i: int, value: float) -> Choice:
         line, each = some[i].line, np.quantile(got[i], LATE, axis=1, method="lower")
@@ -182,7 +182,8 @@ def serves_in(final: Final) -> float:
         return math.inf
     times = _repeats([final], list(final.runs), lambda r: r.times or (r.time_min,))[0]
     left = np.array([r.relative for r in final.runs.values()])
-    return float(_inverted_cdf(np.where(left <= HALF, _lower_quantile(times, LATE), math.inf), QUANTILE))
+    late = np.quantile(times, LATE, axis=-1, method="lower")
+    return float(np.quantile(np.where(left <= HALF, late, math.inf), QUANTILE, method="inverted_cdf"))
 
 
 def _names(some: Sequence[Final]) -> list[str]:
@@ -198,24 +199,6 @@ def _repeats(
     return np.array(
         [[np.resize(what(f.runs[c]) if c in f.runs else np.nan, most) for c in names] for f in some], float
     )
-
-
-def _quantile(values: FloatArray, q: float) -> FloatArray:
-    """np.quantile along the last axis, at a tenth of its price for the few numbers that are drawn again and again."""
-    place = q * (values.shape[-1] - 1)
-    low = int(place)
-    some = np.sort(values, axis=-1)[..., low : low + 2]
-    return np.asarray(some[..., 0] + (place - low) * (some[..., -1] - some[..., 0]))
-
-
-def _lower_quantile(values: FloatArray, q: float) -> FloatArray:
-    """The same with method="lower"."""
-    return np.asarray(np.sort(values, axis=-1)[..., int(q * (values.shape[-1] - 1))])
-
-
-def _inverted_cdf(values: FloatArray, q: float) -> FloatArray:
-    """The same with method="inverted_cdf"."""
-    return np.asarray(np.sort(values, axis=-1)[..., max(math.ceil(q * values.shape[-1]) - 1, 0)])
 
 
 def _blocks(records: Records, names: Sequence[str]) -> list[list[int]]:
