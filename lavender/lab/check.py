@@ -271,29 +271,28 @@ def compare(problem: Problem, name: str, solution: Solution, optimum: Solution |
         "time": solution.setup_time + solution.solve_time,
         "solution": solution,
     }
+    verdict, breached = AGREES_UNCOMPARED, False
     if optimum is not None and np.isfinite(solution.impulse).all():
         apart, allowed = distance(problem, solution, optimum)
         shared |= {
             "distance": apart,
+            "allowed": allowed,
             "slack": float(np.abs(r.slack - optimum.slack).max(initial=0.0)),
             "objective": _objective(problem, solution) - _objective(problem, optimum),
         }
-        shared["allowed"] = allowed
-        if apart > allowed:
-            return CrossCheckRow(name, BREACH, note=note, **shared)
-    if solution.contradicted:
-        return CrossCheckRow(
-            name, CONTRADICTED, note=f"{solution.contradicted}; {note}".rstrip("; "), **shared
-        )
-    if solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
+        verdict, breached = AGREES, apart > allowed
+    if breached:
+        verdict = BREACH
+    elif solution.contradicted:
+        verdict, note = CONTRADICTED, f"{solution.contradicted}; {note}".rstrip("; ")
+    elif solution.status is Status.INFEASIBLE:  # its certificate holds, or the claim would be contradicted
         verdict = PROVED if solution.impulse_bound == np.inf else NEAR_NONE
-        return CrossCheckRow(name, verdict, note=note, **shared)
-    if r.nothing_to_do and r.verdict != WRONG:
+    elif r.nothing_to_do and r.verdict != WRONG:
         units = f"{r.velocity:.1e} m/s, {r.energy:.1e} sqrt(J)"
-        return CrossCheckRow(name, NOTHING, note=f"{units}; {note}".rstrip("; "), **shared)
-    if not (solution.success or r.at_floor):
-        return CrossCheckRow(name, NOT_SOLVED, note=note, **shared)
-    return CrossCheckRow(name, AGREES if "allowed" in shared else AGREES_UNCOMPARED, note=note, **shared)
+        verdict, note = NOTHING, f"{units}; {note}".rstrip("; ")
+    elif not (solution.success or r.at_floor):
+        verdict = NOT_SOLVED
+    return CrossCheckRow(name, verdict, note=note, **shared)
 
 
 def distance(problem: Problem, one: Any, two: Any) -> tuple[float, float]:

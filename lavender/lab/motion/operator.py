@@ -48,9 +48,6 @@ class Operator:
 
     def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         """Energy norm of x, every entry known up to `fuzz` (m,)."""
-        return self._size(x, fuzz)
-
-    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         raise NotImplementedError
 
     def velocity(self, x: FloatArray, fuzz: FloatArray) -> tuple[FloatArray, FloatArray] | None:
@@ -104,7 +101,7 @@ class _Factored(Operator):
             off += 1.01 * (self.size_of_jac @ (self.off @ g))
         return w, off
 
-    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
+    def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         g = self.jac_t @ x
         h = np.abs(g)
         off = self.size_of_jac_t @ (self.of_wrench * np.abs(x) + 1.01 * fuzz)  # of g
@@ -229,7 +226,7 @@ class _Matrix(Operator):
     def slack(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         return self.a @ x - self.b, self.of_slack * (self.size_of_a @ np.abs(x) + np.abs(self.b))
 
-    def _size(self, x: FloatArray, fuzz: FloatArray) -> Size:
+    def size(self, x: FloatArray, fuzz: FloatArray) -> Size:
         y = np.abs(x)
         square = max(float(x @ (self.a @ x)), 0.0)
         rounding = (self.of_slack + _gamma(len(x) + 1)) * float(y @ (self.size_of_a @ y))

@@ -9,14 +9,11 @@ import numpy as np
 
 from lavender.lab.bench.simulators import STRICT, TARGET, Step, WarmStep
 from lavender.lab.report.table import Table, markdown
+from lavender.lab.report.tables import geometric_mean
 
 S = TypeVar("S", bound=WarmStep)
 OVER = "lavender's time over MuJoCo's, geometric means, above 1 MuJoCo is faster"
 CLASSES = ((0, 10), (10, 50), (50, 300), (300, 10**9))  # rows
-
-
-def _mean(x: Sequence[float]) -> float:
-    return float(np.exp(np.mean(np.log(x)))) if len(x) else float("nan")
 
 
 def _by_class(steps: Sequence[S]) -> list[tuple[str, list[S]]]:
@@ -31,16 +28,18 @@ def _sizes(x: Sequence[float]) -> tuple[str, str]:
     return f"{np.median(x):.1e}", f"{max(x):.1e}"
 
 
+def _row(name: str, part: Sequence[WarmStep]) -> list[str]:
+    """Models, problems, the engine's time and ours over it."""
+    ratio = geometric_mean([s.ours / s.engine for s in part])
+    models, engine = len({s.model for s in part}), geometric_mean([s.engine for s in part])
+    return [name, str(models), str(len(part)), f"{1e6 * engine:.1f}", f"{ratio:.2f}"]
+
+
 def table(steps: Sequence[Step]) -> str:
     """Geometric means of ours / MuJoCo's by the number of rows, and what was solved, as Markdown."""
     heads = ["rows", "models", "problems", "MuJoCo [µs]", "one call", "`solve_many`"]
     rows = [
-        [
-            *(name, str(len({s.model for s in part})), str(len(part))),
-            f"{1e6 * _mean([s.engine for s in part]):.1f}",
-            f"{_mean([s.ours / s.engine for s in part]):.2f}",
-            f"{_mean([s.many / s.engine for s in part]):.2f}",
-        ]
+        [*_row(name, part), f"{geometric_mean([s.many / s.engine for s in part]):.2f}"]
         for name, part in _by_class(steps)
     ]
     convex = [s for s in steps if s.strict <= STRICT]
@@ -60,9 +59,7 @@ def warm_table(steps: Sequence[WarmStep]) -> str:
     """The same over consecutive steps, both sides from what they knew of the last one."""
     rows = [
         [
-            *(name, str(len({s.model for s in part})), str(len(part))),
-            f"{1e6 * _mean([s.engine for s in part]):.1f}",
-            f"{_mean([s.ours / s.engine for s in part]):.2f}",
+            *_row(name, part),
             *_sizes([s.engine_residual for s in part]),
             *_sizes([s.residual for s in part]),
         ]

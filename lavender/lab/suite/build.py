@@ -41,8 +41,11 @@ class Bodies:
         self.v_free = np.zeros((len(self.mass), 6))  # (n, 6) m/s, rad/s
         self.v_free[:, 2] = -FALL
 
-    def rows(self, **more: Any) -> Rows:
+    def rows(self, contacts: Contacts | None = None, **more: Any) -> Rows:
         """These bodies with joints or contacts; point masses (no inertia) do not turn."""
+        if contacts is not None:
+            more |= dict(zip(("arm_a", "arm_b"), contacts.arms(self.position), strict=True))
+            more |= {"normal": contacts.normal, "tangent": contacts.tangent(), "contact_body": contacts.body}
         inv_inertia = np.zeros((len(self.mass), 3, 3))
         inv_inertia[:, [0, 1, 2], [0, 1, 2]] = (
             (1.0 / self.inertia)[:, None] if np.all(self.inertia > 0.0) else 0.0
@@ -85,14 +88,7 @@ def contact_problem(
     """
     if friction not in FRICTIONS:
         raise InputError(f"friction is {friction!r}; {', '.join(FRICTIONS)} are known")
-    arm_a, arm_b = contacts.arms(bodies.position)
-    rows = bodies.rows(
-        normal=contacts.normal,
-        tangent=contacts.tangent(),
-        arm_a=arm_a,
-        arm_b=arm_b,
-        contact_body=contacts.body,
-    )
+    rows = bodies.rows(contacts)
     if friction == "none":
         return Problem.from_rows(rows, target, **more)
     return Problem.from_rows(rows, target, mu=mu, tangents=2, friction=friction, **more)

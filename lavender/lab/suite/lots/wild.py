@@ -233,16 +233,11 @@ def problem_of(
     """Contacts and joints of a world under a law; `soft`: compliance beside 1/mass, one problem of five has one."""
     contacts = Contacts(world.touch, world.point, world.normal)
     joints = len(world.joint)
-    arm_a, arm_b = contacts.arms(bodies.position)
     made = bodies.rows(
+        contacts,
         jac=ball_joints(bodies.position, world.joint, world.anchor),
         joint_ptr=np.arange(0, 3 * joints + 1, 3, dtype=np.int32),
         joint_body=np.asarray(world.joint, np.int32),
-        normal=contacts.normal,
-        tangent=contacts.tangent(),
-        arm_a=arm_a,
-        arm_b=arm_b,
-        contact_body=contacts.body,
     )
     compliance = 0.0 if soft is None else soft / float(np.median(bodies.mass))
     if soft is None and rng.random() < 0.2:
