@@ -29,6 +29,7 @@ EXIT_BAD_INPUT = 2  # or a folder that another process writes
 EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms
 EXIT_INTERRUPTED = 130
 LEAST_WIDTH = 60  # columns of a terminal
+Option = tuple[tuple[str, ...], dict[str, Any]]  # names, and what click is told of it
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -173,35 +174,27 @@ def was_given(context: click.Context, name: str) -> bool:
     return context.get_parameter_source(name) not in (None, click.core.ParameterSource.DEFAULT)
 
 
-def precision_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`--precision`, of answers that an engine made."""
-    told = "Precision in which the engine computed its solutions; default: that of the problem, or float64."
-    return click.option("--precision", type=click.Choice(["float64", "float32"]), help=told)(command)
+def adding(options: Sequence[Option], **same: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """A decorator that gives a command these options in their order, and all of them what is the `same`."""
 
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for names, more in reversed(options):
+            command = click.option(*names, **same, **more)(command)
+        return command
 
-def recording_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """How a MuJoCo model is simulated and recorded: the same options of every command that does so."""
-    for name, more in reversed(RECORDING_OPTIONS):
-        command = click.option(*name, show_default=True, **more)(command)
-    return threshold_option(command)
+    return decorate
 
 
 def worlds_options(worlds: int, steps: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Which worlds of a MuJoCo model are simulated, with these numbers as the defaults."""
-    options = {
-        "--worlds": {"default": worlds, "help": "How many; the first is that of `lavender record`."},
-        "--steps": {"default": steps, "help": "Of each world."},
-        "--spread": {"default": 0.1, "metavar": "M/S",
-                     "help": "Standard deviation of what the others' first velocities differ by."},
-    }  # fmt: skip
-    kept = [(names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed")]
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for names, more in reversed([*(((name,), more) for name, more in options.items()), *kept]):
-            command = click.option(*names, show_default=True, **more)(command)
-        return command
-
-    return decorate
+    options: list[Option] = [
+        (("--worlds",), {"default": worlds, "help": "How many; the first is that of `lavender record`."}),
+        (("--steps",), {"default": steps, "help": "Of each world."}),
+        (("--spread",), {"default": 0.1, "metavar": "M/S",
+                         "help": "Standard deviation of what the others' first velocities differ by."}),
+    ]  # fmt: skip
+    options += [(names, more) for names, more in RECORDING_OPTIONS if names[0] in ("--controls", "--seed")]
+    return adding(options, show_default=True)
 
 
 def refuse_unused_recording(context: click.Context, recorded: bool) -> None:
@@ -210,12 +203,6 @@ def refuse_unused_recording(context: click.Context, recorded: bool) -> None:
         refuse_unused(context, RECORDING, "without a MODEL.xml")
     elif context.params["control"] != "random":
         refuse_unused(context, ["seed"], "without --controls random")
-
-
-def threshold_option(command: Callable[..., Any]) -> Callable[..., Any]:
-    """`--threshold`, of answers that an engine made."""
-    told = "Velocity error [m/s] up to which an engine's solution is close enough."
-    return click.option("--threshold", type=float, default=1e-6, show_default=True, help=told)(command)
 
 
 def refuse_unused(context: click.Context, names: Sequence[str], where: str) -> None:
@@ -253,7 +240,17 @@ def refuse_idle(context: click.Context, solvers: Sequence[str] | None) -> None:
         refuse_unused(context, ["memory"], "where no solver of another package runs")
 
 
-RECORDING_OPTIONS: tuple[tuple[tuple[str, ...], dict[str, Any]], ...] = (
+#: Of answers that an engine made.
+precision_option = click.option(
+    "--precision", type=click.Choice(["float64", "float32"]),
+    help="Precision in which the engine computed its solutions; default: that of the problem, or float64.",
+)  # fmt: skip
+THRESHOLD: Option = (("--threshold",), {
+    "type": float, "default": 1e-6, "help": "Velocity error [m/s] up to which an engine's solution is close enough.",
+})  # fmt: skip
+threshold_option = adding([THRESHOLD], show_default=True)
+#: How a MuJoCo model is simulated and recorded: the same options of every command that does so.
+RECORDING_OPTIONS: tuple[Option, ...] = (
     (("--steps",), {"default": 500, "help": "MODEL.xml: number of simulation steps."}),
     (("--every",), {"default": 5, "help": "MODEL.xml: record every n-th step."}),
     (("--controls", "control"), {"default": "random", "metavar": "zero|random|FILE",
@@ -261,7 +258,9 @@ RECORDING_OPTIONS: tuple[tuple[tuple[str, ...], dict[str, Any]], ...] = (
     (("--seed",), {"default": 0, "help": "MODEL.xml: seed of random controls."}),
 )  # fmt: skip
 RECORDING = ("steps", "every", "control", "seed", "threshold")  # their names
+recording_options = adding([THRESHOLD, *RECORDING_OPTIONS], show_default=True)
 
+#: Of what is measured.
 PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("--solvers", {"type": Names(), "help": "Solvers by name; default: all that are installed."}),
     ("--levels", {"type": Numbers(), "default": "1e-3,1e-6,1e-9", "show_default": True,
@@ -286,13 +285,7 @@ PLAN_OPTIONS: tuple[tuple[str, dict[str, Any]], ...] = (
                   "help": "Memory limit of each process of another package's solver; default: half of the "
                   "machine's memory, shared by the workers of a campaign."}),
 )  # fmt: skip
-
-
-def plan_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of what is measured."""
-    for name, what in reversed(PLAN_OPTIONS):
-        command = click.option(name, **what)(command)
-    return command
+plan_options = adding([((name,), more) for name, more in PLAN_OPTIONS])
 
 
 def bytes_of(gigabytes: float | None) -> int | None:

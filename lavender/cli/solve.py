@@ -11,6 +11,8 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread, say
 from lavender.io.stored import writable, write_atomically
 
+RESIDUAL = ("error", "relative", "energy", "velocity", "floor")  # what is written of it
+
 
 @click.command()
 @click.argument("file")
@@ -77,11 +79,7 @@ def solve(
                     f,
                     impulse=solution.impulse,
                     slack=solution.slack,
-                    error=solution.residual.error,
-                    relative=solution.residual.relative,
-                    energy=solution.residual.energy,
-                    velocity=solution.residual.velocity,
-                    floor=solution.residual.floor,
+                    **{name: getattr(solution.residual, name) for name in RESIDUAL},
                     status=solution.status.name,
                     solver=solution.solver.name,
                     iterations=solution.iterations,

@@ -23,7 +23,6 @@ from lavender.lab.bench.lock import Lock
 from lavender.lab.bench.record import CaseInfo, Done, Entry, Record, Run, Skip, from_json, to_json
 
 MOST_LINE = 2**26  # bytes of a record; the longest of ours hold a few thousand
-BLOCK = 2**16  # bytes that are looked through at once for the end of a line
 SYNC = 1.0  # s, at most, of records that a power cut could take; a killed process takes none
 
 
@@ -237,16 +236,9 @@ def _cut_torn_line(path: Path) -> None:
     if not path.exists():
         return
     with path.open("rb+") as f:
-        size = end = f.seek(0, os.SEEK_END)
-        found = 0
-        while end > 0 and not found:  # from behind: a torn line is the last one
-            start = max(0, end - BLOCK)
-            f.seek(start)
-            at = f.read(end - start).rfind(b"\n")
-            found = start + at + 1 if at >= 0 else 0
-            end = start
-        if found != size:
-            f.truncate(found)
+        whole = sum(len(line) for line in f if line.endswith(b"\n"))
+        if whole != f.tell():
+            f.truncate(whole)
 
 
 def read(path: str | Path) -> Records:

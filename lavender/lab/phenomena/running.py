@@ -24,33 +24,24 @@ LIMIT = 120.0  # s of wall time for one case
 ROOM = 2**30  # bytes of one track
 
 
-class Apart:
+class Apart(Process):
     """A process that steps scenes; a new one after each that ended."""
 
     def __init__(self, limit: float = LIMIT) -> None:
+        super().__init__(MODULE)
         self.limit = limit
-        self._process = Process(MODULE)
 
     def track(self, way: Way, scene: Scene, seconds: float, interval: float) -> Track | str:
         """What the engine did, or why there is nothing."""
-        cause = self._process.start()
+        cause = self.start()
         if cause:
             return f"its process does not start: {cause}"
         try:
-            return _track(*self._process.ask([(way.name, scene, seconds, interval)], self.limit, ROOM))
+            return _track(*self.ask([(way.name, scene, seconds, interval)], self.limit, ROOM))
         except TimeoutError:
             return f"no answer within {self.limit:g} s"
         except Ended as end:
             return f"its process ended: {end}"
-
-    @property
-    def alive(self) -> bool:
-        """A process runs."""
-        return self._process.alive
-
-    def end(self) -> None:
-        """End the process."""
-        self._process.end()
 
 
 def _track(words: bytes, numbers: bytes) -> Track | str:
