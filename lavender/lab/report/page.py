@@ -35,6 +35,12 @@ def environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(seconds=seconds, residual=residual, level=level_name, anchor=file_name)
+    environment.globals.update(
+        contents=contents, tables=tables, count=count, without=without, isfinite=math.isfinite
+    )
+    environment.globals.update(
+        noise=NOISE, residual_noise=RESIDUAL_NOISE, most=MOST, most_spreads=MOST_SPREADS
+    )
     return environment
 
 
@@ -49,65 +55,12 @@ def page(report: Report, figures: Figures, saved: bool = True) -> str:
     saved : bool
         The figures are beside the page as SVG and PNG.
     """
+    records = report.records
     return environment().get_template("index.html.j2").render(
-        saved=saved, count=count, inf=math.inf, isfinite=math.isfinite, **_content(report, figures)
+        report=report, records=records, verdict=report.verdict, levels=report.levels, saved=saved,
+        level=report.levels[len(report.levels) // 2], links=_links(report.lines), left_out=left_out(records),
+        suspicions=suspicions(records), **_drawings(records, figures, report.verdict), **_cases(report),
     )  # fmt: skip
-
-
-def _content(report: Report, figures: Figures) -> dict[str, Any]:
-    """Everything that the template names."""
-    records, found, levels, campaign = report.records, report.verdict, report.levels, report.is_campaign
-    failures = tables.failures(records)
-    spreads = sorted(tables.spreads(records), key=lambda s: -s.factor)
-    return {
-        **_drawings(records, figures, found),
-        **_cases(records, levels),
-        **_changes(report.before, records),
-        "verdict": found,
-        "busy": report.busy,
-        "idle": contents.idle_table(report.every),
-        "suspicions": suspicions(records),
-        "left_out": left_out(records),
-        "engines": contents.engine_table(report.engines),
-        "moved": None if campaign else contents.moved_table(report),
-        "speed_advice": None if campaign else contents.speed_table(report),
-        "noise": NOISE,
-        "residual_noise": RESIDUAL_NOISE,
-        "level": levels[len(levels) // 2],
-        "runs": list(records.runs.values()),
-        "levels": levels,
-        "advice": contents.advice_table(report, _links(report.lines)),
-        "swept": contents.sweeps_table(report.lines),
-        "families": tables.families(records),
-        "claims": contents.claim_table(records),
-        "n_failures": len(failures),
-        "failures": contents.failure_table(failures[:MOST], campaign),
-        "most": MOST,
-        "most_spreads": MOST_SPREADS,
-        "means": {law: contents.mean_table(by) for law, by in tables.geometric_means(records).items()},
-        "backends": contents.backend_table(records),
-        "shift": tables.SHIFT,
-        "limit": tables.limit_of(records),
-        "n_spreads": len(spreads),
-        "spreads": contents.spread_table(spreads[:MOST_SPREADS]),
-        "lost": [s for s in records.skips if not s.solver],
-        "refused": contents.skip_table([s for s in records.skips if s.solver]),
-        "campaign": campaign,
-        "robustness": contents.robustness_table(tables.robustness(records) if campaign else [], levels),
-        "robustness_by_speed": contents.robustness_table(
-            tables.robustness(report.by_speed) if campaign else [], report.speeds, " m/s"
-        ),
-        "sequences": {
-            name: contents.pass_table(passes).without("sequence", "steps")
-            for name, passes in tables.by_sequence(records).items()
-        },
-        "steps": {
-            name: f"{passes[0].steps} steps{without(passes[0].left_out)}"
-            for name, passes in tables.by_sequence(records).items()
-        },
-        "n_records": len(records),
-        "n_cases": len({r.case for r in records}),
-    }
 
 
 def _drawings(records: Records, figures: Figures, found: Verdict) -> dict[str, Any]:
@@ -137,27 +90,24 @@ def _keys(figures: Figures) -> dict[str, dict[str, list[str]]]:
     }
 
 
-def _cases(records: Records, levels: Sequence[float]) -> dict[str, Any]:
+def _cases(report: Report) -> dict[str, Any]:
     """Each case with its solvers; none of a campaign: of thousands the tables over all of them say it."""
+    records, levels = report.records, report.levels
     by_case: dict[str, list[tables.Reach]] = {}
-    if not tables.is_campaign(records):
+    if not report.is_campaign:
         for reach in tables.reaches(records, levels):
             by_case.setdefault(reach.case, []).append(reach)
     level = levels[len(levels) // 2]
     fastest = {name: _fastest(rows, level) for name, rows in by_case.items()}
     stored = any(math.isfinite(x.stored) for x in records.cases.values())
     cases = [
-        {
-            "info": records.cases[name],
-            "reaches": contents.reach_table(rows, levels).without("case"),
-        }
+        {"info": records.cases[name], "reaches": contents.reach_table(rows, levels).without("case")}
         for name, rows in by_case.items()
     ]
     return {
         "cases": cases,
         "case_list": contents.case_table(records, fastest, level, stored),
         "difficulty": contents.difficulty_table(tables.difficulties(records) if cases else []),
-        "difficulty_note": contents.DIFFICULTY,
     }
 
 
@@ -165,18 +115,6 @@ def _links(lines: Sequence[tables.Line]) -> dict[str, str]:
     """Where on the page more is said of a structure or sequence."""
     parts = {line.name: "sequence" if line.sequence else "family" for line in lines}
     return {name: f"{part}-{file_name(name)}" for name, part in parts.items()}
-
-
-def _changes(old: Records | None, records: Records) -> dict[str, Any]:
-    """What differs from an earlier run beyond noise."""
-    found = tables.changes(old, records) if old is not None else []
-    return {
-        "compared": old is not None,
-        "drift": 1.0 if old is None else tables.drift(old, records),
-        "changes": None if old is None else contents.change_table(old, records),
-        "n_changes": len(found),
-        "not_compared": contents.NOT_COMPARED,
-    }
 
 
 def _fastest(rows: Sequence[tables.Reach], level: float) -> tables.Reach | None:
