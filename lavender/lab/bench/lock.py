@@ -1,8 +1,8 @@
 """One writer for a file of records: a lock that names its holder and ends with it.
 
-The lock is the operating system's, on FILE.lock (of POSIX records, or of Windows' bytes), so a process that
-died holds nothing; the text inside says who holds it. A text of another host is believed, because its lock may
-not be seen from here.
+The lock is the operating system's, on FILE.lock (`flock`, or one of Windows' bytes), so a process that died holds
+nothing; the text inside says who holds it. A text of another host is believed, because its lock may not be seen from
+here.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import contextlib
 import json
 import os
 import socket
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +19,6 @@ from lavender.lab.bench.record import printable
 
 TRIES = 100  # a holder that leaves takes its file with it; so often in a row nobody leaves
 HEAD = 64  # bytes left free for Windows, where a locked byte cannot be read
-_held: set[tuple[int, int]] = set()  # locks of POSIX are of a process: within one, this set
-_guard = threading.Lock()
 
 
 class Lock:
@@ -37,33 +34,27 @@ class Lock:
 
     def __init__(self, path: Path) -> None:
         self.path = path.with_name(path.name + ".lock")
-        with _guard:
-            for _ in range(TRIES):
-                if self._take():
-                    return
+        for _ in range(TRIES):
+            if self._take():
+                return
         raise InputError(f"{self.path} changes hands all the time; run the command again later")
 
     def _take(self) -> bool:
         """True when it is ours; False when the file went away meanwhile."""
-        with contextlib.suppress(OSError):
-            if _identity(os.stat(self.path)) in _held:  # to open and close it again would let the lock go
-                raise self._refusal(os.getpid(), socket.gethostname())
         descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             if not _lock(descriptor):
                 raise self._refusal(*_holder(descriptor))
-            key = _identity(os.fstat(descriptor))
             there = None
             with contextlib.suppress(OSError):
-                there = _identity(os.stat(self.path))
-            if there == key:
+                there = os.stat(self.path)
+            if there is not None and os.path.samestat(there, os.fstat(descriptor)):
                 pid, host = _holder(descriptor)
                 if host and host != socket.gethostname():
                     raise self._refusal(pid, host)
                 # Of a process of this host that died, or of nobody.
                 _write(descriptor, {"pid": os.getpid(), "host": socket.gethostname()})
-                self._descriptor, self._key = descriptor, key
-                _held.add(key)
+                self._descriptor = descriptor
                 return True
         except BaseException:
             os.close(descriptor)
@@ -80,21 +71,16 @@ class Lock:
 
     def release(self) -> None:
         """Let go; a second call does nothing."""
-        with _guard:
-            if self._key not in _held:
-                return
-            # The file goes first: who opened it before finds that it went, and tries again.
-            with contextlib.suppress(OSError):
-                os.unlink(self.path)
-            _held.discard(self._key)
-            os.close(self._descriptor)
+        if self._descriptor < 0:
+            return
+        # The file goes first: who opened it before finds that it went, and tries again.
+        with contextlib.suppress(OSError):
+            os.unlink(self.path)
+        os.close(self._descriptor)
+        self._descriptor = -1
         if os.name == "nt":
             with contextlib.suppress(OSError):  # an open file cannot be removed there
                 os.unlink(self.path)
-
-
-def _identity(found: os.stat_result) -> tuple[int, int]:
-    return found.st_dev, found.st_ino
 
 
 def _lock(descriptor: int) -> bool:
@@ -107,7 +93,7 @@ def _lock(descriptor: int) -> bool:
         else:
             import fcntl
 
-            fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except (BlockingIOError, PermissionError):
         return False
     except OSError:

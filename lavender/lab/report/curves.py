@@ -87,20 +87,17 @@ def work_precision(records: Records, case: str) -> Figure:
         if runs:
             points, asked = [(r.time_min, r.relative) for r in runs], tuple(r.asked for r in runs)
             curves.append(Curve.of(solver, who(solver, start), points, notes=asked, thin=start != "cold"))
+    return _of_case("work-precision", "time: set-up and solve [s]", records, case, curves)
+
+
+def _of_case(name: str, x_title: str, records: Records, case: str, curves: list[Curve]) -> Figure:
+    """With the floor of the best run: it depends on the impulses, and those are nearest to the solution's."""
+    runs = (r for (of, _, _), some in tables.pairs(records).items() if of == case for r in some)
+    best = min(((r.relative, r.floor) for r in runs if r.usable and r.floor > 0.0), default=(0.0, math.nan))
     return Figure(
-        "work-precision " + case, case, "time: set-up and solve [s]", "relative residual [-]", tuple(curves),
-        levels=tables.levels_of(records), floor=_floor(records, [case]),
+        f"{name} {case}", case, x_title, "relative residual [-]", tuple(curves),
+        levels=tables.levels_of(records), floor=best[1],
     )  # fmt: skip
-
-
-def _floor(records: Records, cases: Iterable[str]) -> float:
-    """The largest floor of the cases; each depends on the impulses: that of the best run is the one of the solution."""
-    best: dict[str, tuple[float, float]] = {}
-    for (case, _, _), runs in tables.pairs(records).items():
-        floors = [(r.relative, r.floor) for r in runs if r.usable and r.floor > 0.0]
-        best[case] = min([*floors, best.get(case, (math.inf, math.nan))])
-    found = [best[case][1] for case in cases if case in best]
-    return max((floor for floor in found if math.isfinite(floor)), default=math.nan)
 
 
 GRID = 49  # times of a figure over all cases
@@ -156,10 +153,7 @@ def budget_figure(records: Records, case: str) -> Figure:
     for (name, solver, start), points in sorted(tables.budgets(records).items()):
         if name == case:
             curves.append(Curve.of(solver, who(solver, start), points, thin=start != "cold"))
-    return Figure(
-        "budget " + case, case, "iterations (sweeps)", "relative residual [-]", tuple(curves),
-        levels=tables.levels_of(records), floor=_floor(records, [case]),
-    )  # fmt: skip
+    return _of_case("budget", "iterations (sweeps)", records, case, curves)
 
 
 def pass_figure(sequence: str, passes: list[tables.Pass]) -> Figure:
