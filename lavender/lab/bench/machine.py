@@ -26,16 +26,18 @@ LEAST = 2 * 2**30  # bytes: below that, packages of compiled code do not start
 BASE = ("numpy", "scipy", "qpsolvers", "osqp", "qdldl")
 
 
+def _cpuinfo(name: str) -> str:
+    """What Linux says of the first processor under that name; empty elsewhere."""
+    with contextlib.suppress(OSError):
+        told = Path("/proc/cpuinfo").read_text(errors="replace")
+        if found := re.search(rf"^(?:{name})\s*:\s*(.+)$", told, re.MULTILINE):
+            return found[1].strip()
+    return ""
+
+
 def cpu_name() -> str:
     """Model of the processor, as the system names it."""
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        found = re.search(
-            r"^(?:model name|Model)\s*:\s*(.+)$", info.read_text(errors="replace"), re.MULTILINE
-        )
-        if found:
-            return found[1].strip()
-    return platform.processor() or platform.machine() or "unknown"
+    return _cpuinfo("model name|Model") or platform.processor() or platform.machine() or "unknown"
 
 
 def memory() -> int:
@@ -113,12 +115,9 @@ def running() -> float | None:
 
 def clock() -> dict[str, str]:
     """Frequency of the processor now, and what governs it, as far as the system says."""
-    found: dict[str, str] = {}
+    mhz = _cpuinfo("cpu MHz")
+    found = {"clock": f"{float(mhz):.0f} MHz"} if mhz else {}
     with contextlib.suppress(OSError):
-        mhz = re.search(
-            r"^cpu MHz\s*:\s*([\d.]+)", Path("/proc/cpuinfo").read_text(errors="replace"), re.MULTILINE
-        )
-        found |= {"clock": f"{float(mhz[1]):.0f} MHz"} if mhz else {}
         found["governor"] = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor").read_text().strip()
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from lavender.lab.bench.record import Record, level_name
+from lavender.lab.bench.record import level_name
 from lavender.lab.bench.store import Records
 
 USUAL = (1e-2, 1e-3)  # m/s, where the plan names none
@@ -66,16 +66,9 @@ def working(records: Records) -> Records:
 
 def idle(records: Records) -> list[Idle]:
     """Cases where doing nothing is right, with the worst residual of any run in units."""
-    worsts: dict[str, Record] = {}
-    for r in records:
-        if r.case not in worsts or r.velocity > worsts[r.case].velocity:
-            worsts[r.case] = r
-    out = []
-    for name, info in records.cases.items():
-        if info.nothing_to_do:
-            worst = worsts.get(name)
-            if worst is None:
-                out.append(Idle(name, info.rows, "", 0.0, 0.0))
-            else:
-                out.append(Idle(name, info.rows, worst.solver, worst.velocity, worst.energy))
-    return out
+    worst: dict[str, tuple[str, float, float]] = {}
+    for r in sorted(records, key=lambda r: -r.velocity):
+        worst.setdefault(r.case, (r.solver, r.velocity, r.energy))
+    nobody = ("", 0.0, 0.0)
+    still = ((name, info.rows) for name, info in records.cases.items() if info.nothing_to_do)
+    return [Idle(name, rows, *worst.get(name, nobody)) for name, rows in still]

@@ -18,12 +18,11 @@ from lavender.lab.report.tables import Choice
 from lavender.lab.report.tables.advice import QUANTILE
 from lavender.lab.report.tables.finals import STARTS, Final, Race, in_time, lines, serves_in
 from lavender.lab.report.tables.finals import to_level as race_to_level
+from lavender.lab.report.tables.groups import SHAPES
 from lavender.lab.report.text import count, residual, without
 from lavender.lab.report.text import times as times_of
 from lavender.lab.suite import FAMILIES
 from lavender.solvers.registry import specs
-
-SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
 
 
 @dataclass(frozen=True)

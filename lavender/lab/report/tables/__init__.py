@@ -1,6 +1,7 @@
 """Records -> plain tables (lists of small frozen rows). Nothing is solved, timed or drawn here."""
 
 from lavender.lab.report.tables.advice import (
+    NOISE,
     Advice,
     Choice,
     Line,
@@ -24,7 +25,7 @@ from lavender.lab.report.tables.cases import (
     reaches,
     spreads,
 )
-from lavender.lab.report.tables.changes import NOISE, Change, changes, drift
+from lavender.lab.report.tables.changes import Change, changes, drift
 from lavender.lab.report.tables.finals import Final, Race
 from lavender.lab.report.tables.groups import families, is_campaign, levels_of, pairs
 from lavender.lab.report.tables.means import (

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 
 from lavender.lab.bench.store import Records
+from lavender.lab.report.tables.advice import NOISE
 from lavender.lab.report.tables.cases import reaches
 from lavender.lab.report.tables.groups import levels_of, pairs
 
@@ -32,9 +33,6 @@ class Change:
         if not math.isfinite(self.new) or self.old / self.noise <= self.new <= self.old * self.noise:
             return "same"
         return "faster" if self.new < self.old else "slower"
-
-
-NOISE = 1.25  # a factor of time below which nothing is said: what a busy machine does to a minimum of repeats
 
 
 def changes(old: Records, new: Records) -> list[Change]:

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
 
+SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
+
 
 def levels_of(records: Records) -> tuple[float, ...]:
     """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""
@@ -38,8 +40,7 @@ def families(records: Records) -> dict[str, list[str]]:
         if name in ran:
             for word in info.structure:
                 found[word][info.law].append(name)
-    shapes = ("separate", "chain", "mesh", "stack", "pile", "dense")
-    order = (*shapes, "redundant", "friction", "large mass ratio", "asymmetric")
+    order = (*SHAPES, "redundant", "friction", "large mass ratio", "asymmetric")
     names: dict[tuple[str, ...], list[str]] = {}
     for word in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w)):
         laws = found[word]
