@@ -78,14 +78,7 @@ def plan_of(asked: Mapping[str, Any], kind: type[P], **more: Any) -> P:
 
 
 def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Sequence[int]) -> Measured:
-    """Run with a progress bar, then time the lines that a report would print, in turns.
-
-    Parameters
-    ----------
-    context : of the command, with its options
-    files : files, folders, names of the suite
-    path : of the records
-    sweeps : budgets with which a solver is to be named
+    """Run with a progress bar, then time the lines that a report would print, in turns; `path` has the records.
 
     Raises
     ------

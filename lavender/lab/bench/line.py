@@ -22,12 +22,9 @@ def needs_more(solver: str, iterations: int) -> bool:
 
 
 def asked_of(what: Any, iterations: int) -> dict[str, Any]:
-    """What the line of a measurement passes to `lv.solve` beside problem, name and start: timed, and printed.
+    """What the line of a Task or Record passes to `lv.solve` beside problem, name and start: timed, and printed.
 
-    Parameters
-    ----------
-    what : Task or Record
-    iterations : that a solve took
+    `iterations` are those that a solve took.
     """
     asked: dict[str, Any] = {"tol": what.tol}
     given = what.turns and what.max_iter  # in turns with others: what all of the cases need

@@ -47,12 +47,8 @@ _NAMED = {"\n": "\\n", "\t": "\\t", "\r": "\\r"}
 def printable(text: str, lines: bool = False) -> str:
     """Text that any terminal, file and page can show: what cannot be shown is written as its code.
 
-    A byte of a file name that is no UTF-8 (a lone surrogate in Python's text) is written as that byte.
-
-    Parameters
-    ----------
-    text : str
-    lines : keep ends of lines and tabs, as messages have them; a name stands on one line
+    A byte of a file name that is no UTF-8 (a lone surrogate in Python's text) is written as that byte. With `lines`
+    ends of lines and tabs are kept, as messages have them; a name stands on one line.
     """
     if text.isprintable():
         return text

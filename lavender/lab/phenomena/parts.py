@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.errors import InputError, UnknownName
@@ -55,12 +56,9 @@ class Track:
 
     def axis(self, body: int, axis: int) -> FloatArray:
         """A body's own axis in the world (k, 3)."""
-        q = self.quaternions[:, body]
-        w, v = q[:, :1], q[:, 1:]
-        e = np.zeros(3)
-        e[axis] = 1.0
-        t = 2.0 * np.cross(v, e)
-        turned: FloatArray = e + w * t + np.cross(v, t)
+        turned: FloatArray = Rotation.from_quat(self.quaternions[:, body], scalar_first=True).as_matrix()[
+            ..., axis
+        ]
         return turned
 
 

@@ -47,13 +47,7 @@ def environment() -> Any:
 def page(report: Report, figures: Figures, saved: bool = True) -> str:
     """The whole page. Every text that came from a file, a problem or a backend is escaped.
 
-    Parameters
-    ----------
-    report : Report
-    figures : Figures
-        Of its records: `curves.figures`.
-    saved : bool
-        The figures are beside the page as SVG and PNG.
+    `figures` are those of the report's records; `saved`: they are beside the page as SVG and PNG.
     """
     records = report.records
     return environment().get_template("index.html.j2").render(

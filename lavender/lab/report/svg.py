@@ -36,14 +36,10 @@ class _Scale:
 def svg(
     figure: Figure, number: Mapping[str, int], leaders: Sequence[str] = (), title: str | None = None
 ) -> str:
-    """One drawing.
+    """One drawing. A solver's `number` among those of the page is its class.
 
-    Parameters
-    ----------
-    figure : Figure
-    number : place of each solver among those of the page, its class
-    leaders : solvers in colour, whose names must not cover each other
-    title : in place of the figure's own, which may repeat a heading of the page
+    `leaders` are in colour, and their names must not cover each other; `title` stands in place of the figure's own,
+    which may repeat a heading of the page.
     """
     laid = shown(figure)
     across, up = _Scale(laid.across, LEFT, WIDTH - RIGHT), _Scale(laid.up, HEIGHT - BOTTOM, TOP)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
+from lavender.base.lu import sparse_lu
 from lavender.lab.suspicions.suspicion import Suspicion, suspect
 from lavender.problem import Problem
 from lavender.problem.rows import Rows
@@ -177,7 +178,7 @@ def _loops(pair: Any, between: FloatArray, n: int) -> FloatArray:
     for _ in range(8):
         entries = np.r_[weight, weight, -weight, -weight, np.full(n, 1e-9)]
         normal = sp.csc_array((entries, stand), shape=(n, n))
-        centre = sp.linalg.splu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
+        centre = sparse_lu(normal).solve(to_centres @ (weight[:, None] * (between / scale)))
         off = np.linalg.norm(incidence @ centre - between / scale, axis=1)
         weight = 1.0 / (off + 1e-4)
     return scale * off

@@ -83,14 +83,7 @@ Place = tuple[tuple[float, ...], Choice]  # a smaller key is better whatever the
 
 
 def ranked(family: str, target: float, places: Iterable[Place], noise: float) -> Advice:
-    """Ranking by key, then by score; solvers within noise of the best are ordered by name, so that a rerun agrees.
-
-    Parameters
-    ----------
-    family, target : of the advice
-    places : (key, choice)
-    noise : factor within which scores are equal
-    """
+    """Ranking by key, then by score; solvers within a factor `noise` of the best by name, so that a rerun agrees."""
     order = sorted(places, key=lambda place: (place[0], place[1].score, place[1].solver))
     if not order:
         return Advice(family, target, ())

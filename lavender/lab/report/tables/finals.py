@@ -76,12 +76,8 @@ class Race:
 def lines(records: Records, way: str, rounds: bool = True) -> list[Final]:
     """Every line of that way ("call", "steps", "batch") that was run on as many cases as any.
 
-    Parameters
-    ----------
-    records : Records
-    way : str
-    rounds : bool
-        Those that were timed in turns; False: what was measured one after the other, which records of old have alone.
+    Of those that were timed in turns; not `rounds`: of what was measured one after the other, which records of old have
+    alone.
     """
     groups: dict[tuple[object, ...], dict[str, Record]] = {}
     for r in records:
