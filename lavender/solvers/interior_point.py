@@ -36,7 +36,8 @@ STEPS = 50
 IDLE = 8  # steps in a row that leave no smaller error, after which none follows
 PROXIMAL = 1e-8  # rho and delta, of balanced rows
 REFINED = 10  # solves with one factor of (1)
-EXACT = 1e-14  # of the right-hand side, that refinement leaves
+EXACT = 1e-14  # of the right-hand side, that refinement leaves,
+INEXACT = 1e-6  # or of this right-hand side times the error of the iterate, if that is more
 BALANCED = 5  # passes of Ruiz
 LARGE = 0.9  # share of targets that are at most the unit of x: a few may stand for no bound at all
 FULL = 0.2  # share of entries from which P and J are full matrices,
@@ -50,6 +51,7 @@ class InteriorPoint:
     """The balanced program, variables in the order of M's factor, and the iterate."""
 
     late = False  # it ended for want of time
+    error = 0.0  # of the iterate, relative
 
     @np.errstate(all="ignore")  # what overflows in these units is left to velocities
     def __init__(self, qp: QuadraticProgram) -> None:
@@ -122,6 +124,7 @@ class InteriorPoint:
             if rows <= tol and flat:
                 # All forces may vanish, and dual and gap with them: the judge knows beside what.
                 error = max(rows, self._answer(x, lam, 0.0).error)
+            self.error = error
             idle = 0 if error < 0.9 * least or left < 0.9 * nearest else idle + 1
             if error < least:
                 best = x, lam
@@ -157,7 +160,7 @@ class InteriorPoint:
         at = self.iterate
         u: FloatArray = self.system.solve(at.right)
         for _ in range(REFINED - 1):
-            if at.left_of(u) <= EXACT:
+            if at.left_of(u) <= max(EXACT, INEXACT * self.error):
                 break
             u = u + self.system.solve(at.rest)
         return u
