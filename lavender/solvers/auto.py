@@ -16,12 +16,13 @@
     Newton's method (`newton`)  for up to MOST times its cost: over bodies or rows; of J and M over velocities and over
                                 rows of A, the cheaper first; what stalls from another's impulse begins from nothing
     a certificate               of J and M with a rigid row: does the least violation prove that none solves it? After
-                                SURE times that cost, or MOST where it costs more
+                                SURE times that cost, or MOST where it costs more; of others under Coulomb's law, if
+                                more than NEAR is left: does a linear program?
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed),
                                 `admm`, `nncg`, and sweeps as long as these gain; all together LAST times Newton's cost,
                                 and no longer than LONG
-    at last                     a certificate of others, by a linear program (`certify.py`)
+    at last                     a certificate of others, by a linear program, if none was asked (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
 problem is solved in the same way on every machine. Under a time limit the tree is the same, but whoever factors begins
@@ -46,14 +47,14 @@ from lavender.judge.solution import Claim, Status
 from lavender.problem import OPERATORS, Problem
 from lavender.problem.derived import cached_property
 from lavender.solvers import costs
-from lavender.solvers.certify import certify, least_violation
+from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, linear_programs
 from lavender.solvers.islands import pairs
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
 from lavender.solvers.setup_times import forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
-from lavender.solvers.steps import METHODS, PROBE, Iterations, Newton, Step, Sweeps, setup_time
+from lavender.solvers.steps import METHODS, NEAR, PROBE, Iterations, Newton, Step, Sweeps, setup_time
 
 MOST = 10.0  # times its counted cost, that Newton's method has before both go in turn
 ROUNDS = 4.0  # times the factorisations that Newton's method is counted for, that `direct` has
@@ -207,6 +208,8 @@ class Tree:
             yield Stage("certificate", 1.0, cost, "whether the least violation proves that there is none")
         yield from self.factorisations(MOST)
         self.add_rows(max(MOST * self.newton, LITTLE))
+        if self.law == "coulomb" and self.problem.generalized is None and self.best > NEAR:
+            yield Stage("certificate", 1.0, LINEAR_PROGRAM, "whether a linear program proves it")
         most = max((state.cost for state in self.states.values()), default=costs.SWEEPS * self.sweep)
         self.left = min((LAST - MOST) * min(most, max(self.newton, LITTLE)), LONG) - self.begun
         for k in range(TURNS):
@@ -322,7 +325,7 @@ def solve(log: SolveLog, tree: Tree) -> None:
             break
         if stage.solver == "certificate":
             if not log.ends_late(stage.cost):
-                least_violation(log)
+                (linear_programs if log.problem.generalized is None else least_violation)(log)
             continue
         step = steps.get(stage.solver)
         if step is None:

@@ -40,6 +40,7 @@ from lavender_ext.core.checks import LEAST, MOST
 CERTIFICATE_ROWS = (
     3000  # rows up to which a linear program is asked for a certificate, of all islands together
 )
+LINEAR = "linear program"  # in turns
 LINEAR_PROGRAM = 5e6  # ns that scipy takes for the smallest
 CERTIFICATE_STEPS = 100  # of the simplex method for each row at most
 RELAXATION_STEPS = 150  # factorisations that the relaxation has for its proof
@@ -171,8 +172,8 @@ def least_violation(log: SolveLog) -> None:
 def certify(log: SolveLog) -> None:
     """Look for a certificate that a problem has no solution; under Coulomb's law, else of its relaxation."""
     problem = log.problem
-    if problem.generalized is None:
-        _linear_programs(log)
+    if problem.generalized is None and LINEAR not in [turn.solver for turn in log.turns]:
+        linear_programs(log)
     if (
         log.certificate is None
         and problem.law == "coulomb"
@@ -182,8 +183,8 @@ def certify(log: SolveLog) -> None:
         log.conflict = conflict_of(problem, log.tol, log.deadline)
 
 
-def _linear_programs(log: SolveLog) -> None:
-    """For rows of bodies or of any A, without upper bounds."""
+def linear_programs(log: SolveLog) -> None:
+    """A certificate for rows of bodies or of any A, without upper bounds."""
     problem = log.problem
     if log.best < 1e-6 or log.ends_late(LINEAR_PROGRAM + 1e9 * loading("scipy.optimize")):
         return
@@ -200,7 +201,7 @@ def _linear_programs(log: SolveLog) -> None:
             proof = np.zeros(problem.m)
             proof[rows] = y
         claim = Claim(Status.STALLED, 0, {"certificates": 1}, certificate=proof)
-        log.note("linear program", claim, log.best)
+        log.note(LINEAR, claim, log.best)
         if log.certificate is not None:
             return
 

@@ -321,6 +321,16 @@ def test_a_certificate_that_costs_more_than_ten_times_newton_comes_after_these()
     assert before.cost == pytest.approx(MOST * plan.newton)
 
 
+def test_squeezed_bodies_are_proved_to_have_no_solution_before_all_go_in_turn():
+    """Floor and ceiling close in on each body, under Coulomb's law, where no method of ours proves it."""
+    down = np.vstack([np.eye(3), np.diag([-1.0, 1.0, 1.0])])  # each contact: normal and two tangents
+    a = np.kron(np.eye(20), down @ down.T)
+    problem = lv.Problem(np.tile([1.0, 0.1, 0.0], 40), lv.Cones.contacts(np.full(40, 0.5)), a)
+    found = lv.solve(problem)
+    assert found.status is lv.Status.INFEASIBLE and not found.contradicted
+    assert [turn.solver for turn in found.turns][-2:] == ["newton", "linear program"]
+
+
 def test_no_certificate_is_begun_that_would_end_late(monkeypatch):
     problem = suite.case("infeasible").problem
     log = SolveLog(problem, 1e-6, 10**6, deadline=Deadline(1e-3))
