@@ -73,10 +73,6 @@ class SolveLog:
         """s until the time limit, for a solver's `time_limit`."""
         return self.deadline.left(1e-5)
 
-    @property
-    def late(self) -> bool:
-        return self.timed_out or self.deadline.passed()
-
     def ends_late(self, cost: float) -> bool:
         """Whether a step of this counted cost [ns] would end after the deadline."""
         return self.deadline.passed(1e-9 * cost)
@@ -104,7 +100,7 @@ class SolveLog:
             return Status.CONVERGED
         if self.at_floor():
             return Status.FLOOR
-        if self.late:
+        if self.timed_out or self.deadline.passed():
             return Status.TIME_LIMIT
         if self.left <= 0:
             return Status.MAX_ITERATIONS
