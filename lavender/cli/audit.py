@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.measuring import Progress, show_sheet
+from lavender.cli.measuring import progress, show_sheet
 from lavender.cli.options import (
     EXIT_UNMET,
     one_thread,
@@ -58,7 +58,7 @@ def audit(context: click.Context, /, model: Path, out: Path, accept: float | Non
                 raise InputError(f"--{name} is of --engine mujoco: leave it out")
     writable(out, folder=True)
     one_thread()
-    with Progress() as watch:
+    with progress() as watch:
         found = run(model, watch=watch, **asked)
     found.write(out)
     show_sheet(found.sheet, out, found.stopped)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,8 +15,6 @@ from lavender.base.errors import InputError
 from lavender.cli.options import EXIT_INTERRUPTED, bytes_of, console, going_on, one_thread, was_given
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as RichProgress
-
     from lavender.lab.bench import Event, Item, Plan, Records
     from lavender.lab.report.sheet import Sheet
 
@@ -109,7 +108,7 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
         check_named(items)
         before = {name: run.started for name, run in store.records.runs.items()}
         found: list[Records] = []
-        with Progress() as bar:
+        with progress() as bar:
 
             def watch(event: Event) -> None:
                 nonlocal reused
@@ -137,7 +136,7 @@ def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> 
         raise InputError("--prove is of reports; a campaign has too many problems")
     plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)
     more = {"workers": asked["workers"], "backend": asked["backend"], "memory": bytes_of(asked["memory"])}
-    with bench.Store(path) as store, Progress() as watch:
+    with bench.Store(path) as store, progress() as watch:
         try:
             made = bench.campaign(words, asked["solvers"], plan, store, watch=watch, **more)
         except KeyboardInterrupt:
@@ -156,51 +155,42 @@ def show_sheet(sheet: Sheet, folder: Path, stopped: bool) -> None:
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 
-class Progress:
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[Event], None]]:
     """What is being measured: a bar on a terminal, elsewhere a line of stderr every EVERY seconds."""
+    to = console(stderr=True)
+    if not to.is_terminal:
+        yield _lines()
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    def __enter__(self) -> Callable[[Event], None]:
-        to = console(stderr=True)
-        self.bar: RichProgress | None = None
-        if not to.is_terminal:
-            return self._lines()
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-        bar = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[what]}", markup=False),
-            console=to,
-            transient=True,
-            refresh_per_second=4,  # drawing takes time from what is being timed
-        )
-        bar.start()
+    with Progress(
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[what]}", markup=False),
+        console=to,
+        transient=True,
+        refresh_per_second=4,  # drawing takes time from what is being timed
+    ) as bar:
         task = bar.add_task("", total=None, what="")
-        self.bar = bar
+        yield lambda event: bar.update(
+            task, completed=event.done, total=event.total or None, what=_words(event)
+        )
 
-        def watch(event: Event) -> None:
-            bar.update(task, completed=event.done, total=event.total or None, what=_words(event))
 
-        return watch
+def _lines() -> Callable[[Event], None]:
+    began = told = time.monotonic()
 
-    @staticmethod
-    def _lines() -> Callable[[Event], None]:
-        began = told = time.monotonic()
+    def watch(event: Event) -> None:
+        nonlocal told
+        now = time.monotonic()
+        if now - told >= EVERY:
+            told = now
+            count = f"{event.done} of {event.total}, " if event.total else ""
+            click.echo(f"{count}{now - began:.0f} s: {_words(event)}", err=True)
 
-        def watch(event: Event) -> None:
-            nonlocal told
-            now = time.monotonic()
-            if now - told >= EVERY:
-                told = now
-                count = f"{event.done} of {event.total}, " if event.total else ""
-                click.echo(f"{count}{now - began:.0f} s: {_words(event)}", err=True)
-
-        return watch
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.stop()
+    return watch
 
 
 def _words(event: Event) -> str:

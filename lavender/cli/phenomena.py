@@ -19,7 +19,9 @@ PACKAGES = ("mujoco", "pybullet", "drake", "lavendersim", "newton", "numpy")
 
 
 def _names(text: str | None) -> list[str] | None:
-    return None if text is None or text == "all" else [w.strip() for w in text.split(",") if w.strip()]
+    if text is None or text == "all":
+        return None
+    return [] if text == "none" else [w.strip() for w in text.split(",") if w.strip()]
 
 
 @click.command("phenomena")
@@ -73,7 +75,6 @@ def phenomena(
     if out is not None:
         writable(out)
     case = parameters_of(parameters) if parameters else None
-    some = {"steppers": _names(steppers), "engines": _names(engines)}
     found: list[Record] = []
 
     def show(record: Record) -> None:
@@ -84,8 +85,8 @@ def phenomena(
 
     run(
         names,
-        steppers=[] if some["steppers"] == ["none"] else some["steppers"],
-        engines=[] if some["engines"] == ["none"] else some["engines"],
+        steppers=_names(steppers),
+        engines=_names(engines),
         parameters=case,
         limit=limit,
         show=show,

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from lavender.cli.measuring import Progress, show_sheet
+from lavender.cli.measuring import progress, show_sheet
 from lavender.cli.options import one_thread, threshold_option, worlds_options
 from lavender.io.stored import writable
 
@@ -32,6 +32,6 @@ def tune(model: Path, out: Path, **asked: Any) -> None:
 
     writable(out, folder=True)
     one_thread()
-    with Progress() as watch:
+    with progress() as watch:
         found = run(model, watch=watch, **asked)
     show_sheet(found.sheet, out, found.stopped)

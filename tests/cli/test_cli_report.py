@@ -176,14 +176,14 @@ def test_what_a_report_chose_on_the_steps_of_an_engine_is_exported(lavender, tmp
 
 def test_progress_is_told_in_lines_where_there_is_no_terminal(capsys, monkeypatch):
     monkeypatch.setattr(measuring, "EVERY", 0.0)  # s between two lines
-    with measuring.Progress() as watch:
+    with measuring.progress() as watch:
         for done in range(3):
             watch(Event(done, 3, "stack", "newton"))
     assert capsys.readouterr().err.splitlines() == [
         f"{done} of 3, 0 s: stack newton" for done in range(3)
     ]  # and no control codes or empty lines
     monkeypatch.setattr(measuring, "EVERY", 1e9)
-    with measuring.Progress() as watch:
+    with measuring.progress() as watch:
         watch(Event(0, 3, "stack", "newton"))
     assert capsys.readouterr().err == ""
 

@@ -169,9 +169,7 @@ def _measure(
     lack = way.missing()
     for phenomenon, case in plan:
         note = lack or next((way.cannot[x] for x in sorted(phenomenon.needs) if x in way.cannot), "")
-        found: Track | str = note
-        if not note:
-            found = _one(way, phenomenon, case, apart)
+        found = note or _one(way, phenomenon, case, apart)
         if isinstance(found, str):
             yield Record(phenomenon.name, way.name, case, note=found)
         else:

@@ -32,10 +32,13 @@ class Enclosure:
 
     proven: bool
     # N s: largest |lambda_i - lambda_i*| of a row, rounded up; inf where nothing is proven
-    impulse_radius: float
-    velocity_radius: float  # m/s: largest |w_i - w_i*| of a row
-    unique: bool  # no other solution has other velocities: convex laws; Coulomb's only by `motion.uniqueness`
-    reason: str  # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
+    impulse_radius: float = math.inf
+    velocity_radius: float = math.inf  # m/s: largest |w_i - w_i*| of a row
+    unique: bool = (
+        False  # no other solution has other velocities: convex laws; Coulomb's only by `motion.uniqueness`
+    )
+    # why nothing is proven, and what would be needed; where it is: rows whose impulses are one of a family
+    reason: str = ""
     impulse: FloatArray | None = field(default=None, repr=False)  # (m,) N s, the exact one rounded
     # degenerate blocks by name: between two cases, dependent to rounding, or singular
     borders: tuple[str, ...] = ()
@@ -156,14 +159,7 @@ class Search:
                     )
             raise _Undecided(f"cases still change after {ROUNDS} rounds; a more accurate answer is needed")
         except _Undecided as undecided:
-            return Enclosure(
-                proven=False,
-                impulse_radius=math.inf,
-                velocity_radius=math.inf,
-                unique=False,
-                reason=str(undecided),
-                borders=undecided.borders,
-            )
+            return Enclosure(False, reason=str(undecided), borders=undecided.borders)
 
     def _undecided(self, blocks: list[_Block], words: str) -> _Undecided:
         names = tuple(dict.fromkeys(self.problem.row_name(block.first) for block in blocks))

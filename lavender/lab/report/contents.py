@@ -247,11 +247,7 @@ def difficulty_table(found: Sequence[tables.Difficulty]) -> Table:
         for d in found
     ]
     heads = ["case", "rows", "sweeps", "condition", "on a border", "same answer", "exact solution"]
-    table = Table(heads, rows)
-    unused = [head for i, head in ((5, heads[5]), (6, heads[6])) if not any(row[i] for row in rows)]
-    for head in unused:
-        table = table.without(head)
-    return table
+    return Table(heads, rows).without(*(heads[i] for i in (5, 6) if not any(row[i] for row in rows)))
 
 
 def moved_table(report: Report) -> Table:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lavender.io.stored import write_figure
+from lavender.io.stored import make_folder, write_figure
 from lavender.lab.bench.record import file_name
 from lavender.lab.report.axes import shown
 from lavender.lab.report.curves import Figure
-from lavender.lab.report.style import Look
+from lavender.lab.report.style import Look, looks
 
 COLUMNS = 3  # of a legend over the axes
 MANY = 60  # points of a curve, above which marks would cover it
@@ -132,9 +132,12 @@ def _plain(text: str) -> str:
     return ("\u2009" + short if short.startswith("_") else short).replace("$", r"\$")
 
 
-def save(figure: Figure, look: dict[str, Look], folder: Path) -> None:
-    """NAME.svg and NAME.png in `folder`."""
-    canvas = matplotlib_figure(figure, look)
-    path = folder / file_name(figure.name)
-    write_figure(canvas, path.with_name(path.name + ".svg"), metadata={"Date": None})
-    write_figure(canvas, path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})
+def save(figures: Iterable[Figure], folder: Path, solvers: Iterable[str] = ()) -> None:
+    """Each as NAME.svg and NAME.png in `folder`; `solvers` that some of them do not show take part in the colours."""
+    drawn = list(figures)
+    look = looks({*solvers, *(c.solver for figure in drawn for c in figure.curves)})
+    for figure in drawn:
+        canvas = matplotlib_figure(figure, look)
+        path = make_folder(folder) / file_name(figure.name)
+        write_figure(canvas, path.with_name(path.name + ".svg"), metadata={"Date": None})
+        write_figure(canvas, path.with_name(path.name + ".png"), dpi=110, metadata={"Software": None})

@@ -14,7 +14,6 @@ from lavender.io.stored import make_folder, write_text
 from lavender.lab.report.curves import Figure
 from lavender.lab.report.draw import save
 from lavender.lab.report.page import environment
-from lavender.lab.report.style import looks
 from lavender.lab.report.svg import svg
 from lavender.lab.report.table import Table, print_table
 
@@ -53,13 +52,11 @@ class Sheet:
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """`index.html`, `numbers.json` and `figures/*.svg, *.png`; the path of the page."""
         folder = Path(folder)
-        make_folder(folder / "figures")
-        drawn = [f for part in self.parts for f in part.figures if f.curves]
+        make_folder(folder)
         try:
             write_text(folder / "index.html", self.html())
             write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
-            for figure in drawn:
-                save(figure, looks({c.solver for c in figure.curves}), folder / "figures")
+            save((f for part in self.parts for f in part.figures if f.curves), folder / "figures")
         except OSError as error:
             raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
         return folder / "index.html"

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import pairwise
 
 from lavender.lab.report.axes import Axis, shown
 from lavender.lab.report.curves import Curve, Figure
@@ -110,19 +111,12 @@ def _names(
             # Beside whatever of the curve is as high as its end.
             right = WIDTH - RIGHT if c.steps else max(a for a, b in places if abs(b - last) < GAP)
             ends[c.label] = (right + 12, last + 8)
-    taken: list[int] = []
-    placed: list[str] = []
-    for label in sorted(
-        (c.label for c, _, _ in curves if c.solver in leaders and c.label in ends), key=lambda k: ends[k][1]
-    ):
-        place = ends[label][1]
-        if taken:
-            place = max(place, taken[-1] + GAP)
-        taken.append(place)
-        ends[label] = (ends[label][0], place)
-        placed.append(label)
+    leading = [c.label for c, _, _ in curves if c.solver in leaders and c.label in ends]
+    leading.sort(key=lambda label: ends[label][1])
+    for above, label in pairwise(leading):
+        ends[label] = (ends[label][0], max(ends[label][1], ends[above][1] + GAP))
     lowest = HEIGHT - BOTTOM + 4  # above the numbers of the axis
-    for label in reversed(placed):
+    for label in reversed(leading):
         ends[label] = (ends[label][0], min(ends[label][1], lowest))
         lowest = ends[label][1] - GAP
     return ends

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from lavender.base.errors import InputError
 from lavender.io.stored import make_folder, write_text
 from lavender.lab.bench.store import Records, write_csv, write_json
-
-if TYPE_CHECKING:
-    from lavender.lab.report.curves import Figures
-    from lavender.lab.report.findings import Report
+from lavender.lab.report import curves
+from lavender.lab.report.draw import save
+from lavender.lab.report.findings import Report
+from lavender.lab.report.markdown import summary
+from lavender.lab.report.page import page
 
 
 def write(found: Records | Report, folder: str | Path, *, figures: bool = True) -> Path:
@@ -36,17 +36,12 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
     InputError
         Neither records nor a report; the folder cannot be written.
     """
-    from lavender.lab.report.curves import figures as figures_of
-    from lavender.lab.report.findings import Report
-    from lavender.lab.report.markdown import summary
-    from lavender.lab.report.page import page
-
     report = Report(found) if isinstance(found, Records) else found
     if not isinstance(report, Report):
         raise InputError(
             f"found is a {type(found).__name__}; Records, as lavender.lab.bench.run returns them, or a Report"
         )
-    drawn = figures_of(report.records)
+    drawn = curves.figures(report.records)
     folder = make_folder(folder)
     try:
         write_csv(report.given, folder / "records.csv")
@@ -55,22 +50,11 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
         # Whole or not at all: on a full disk the page of the last time stays.
         write_text(index, page(report, drawn, saved=figures))
         write_text(folder / "summary.md", summary(report))
-        if figures and list(drawn):
-            _save(drawn, {r.solver for r in report.every}, folder / "figures")
+        if figures:
+            save(drawn, folder / "figures", {r.solver for r in report.every})
     except OSError as error:
         raise InputError(
             f"cannot write {error.filename or folder} ({error.strerror or error}): make room, or give a folder that "
             "you may write to; the records are kept"
         ) from None
     return index
-
-
-def _save(drawn: Figures, solvers: set[str], folder: Path) -> None:
-    """Each figure as SVG and PNG."""
-    from lavender.lab.report.draw import save
-    from lavender.lab.report.style import looks
-
-    make_folder(folder)
-    look = looks(solvers | {c.solver for figure in drawn for c in figure.curves})
-    for figure in drawn:
-        save(figure, look, folder)

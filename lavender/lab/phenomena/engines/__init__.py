@@ -20,20 +20,6 @@ from lavender.lab.phenomena.parts import Track
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import STEPPERS
 
-__all__ = [
-    "PACKAGES_OF_NODE",
-    "WAYS",
-    "Stepping",
-    "Way",
-    "engine",
-    "follow",
-    "lacks",
-    "make",
-    "missing_in_node",
-    "node_folder",
-    "versions_of_node",
-]
-
 PACKAGES_OF_NODE = {"rapier": "@dimforge/rapier3d-compat", "jolt": "jolt-physics"}  # engine -> package of npm
 NO_TORSION = {"spin": "it has no friction against spinning"}
 NO_SPIN = "its friction against spinning has no radius that could be given"
