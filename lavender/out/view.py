@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -21,17 +21,6 @@ ARRAYS: dict[str, Any] = {
     for kind, name in struct_fields(_HEADER, "lav_problem")
     if "*" in kind
 }
-BODIES = (
-    "inv_mass",
-    "inv_inertia",
-    "joint_body",
-    "jac",
-    "contact_body",
-    "normal",
-    "tangent",
-    "arm_a",
-    "arm_b",
-)
 #: Solvers by their numbers in the library.
 METHODS = {
     name: constants(_HEADER)[f"LAV_{name.upper()}"]
@@ -79,8 +68,7 @@ def view(problem: Problem) -> View:
     if problem.rows is not None:
         r, form = problem.rows, 2
         bodies, joints = r.n_bodies, r.n_joints
-        for key in BODIES:
-            arrays[key] = getattr(r, key)
+        arrays |= {f.name: getattr(r, f.name) for f in fields(r) if f.name in ARRAYS}
         arrays |= {"velocity": r.v_free, "compliance": problem.compliance}
     elif problem.generalized is not None:
         g, form = problem.generalized, 3

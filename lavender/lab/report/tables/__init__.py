@@ -1,7 +1,6 @@
 """Records -> plain tables (lists of small frozen rows). Nothing is solved, timed or drawn here."""
 
 from lavender.lab.report.tables.advice import (
-    NOISE,
     Advice,
     Choice,
     Line,
@@ -26,7 +25,6 @@ from lavender.lab.report.tables.cases import (
     spreads,
 )
 from lavender.lab.report.tables.changes import Change, changes, drift
-from lavender.lab.report.tables.finals import Final, Race
 from lavender.lab.report.tables.groups import families, is_campaign, levels_of, pairs
 from lavender.lab.report.tables.means import (
     SHIFT,
@@ -37,12 +35,10 @@ from lavender.lab.report.tables.means import (
     geometric_means,
     limit_of,
     profiles,
-    times_to,
 )
 from lavender.lab.report.tables.sequences import Pass, by_sequence, passes
 
 __all__ = [
-    "NOISE",
     "SHIFT",
     "Advice",
     "Backend",
@@ -50,11 +46,9 @@ __all__ = [
     "Choice",
     "Claims",
     "Difficulty",
-    "Final",
     "Line",
     "Pass",
     "Profile",
-    "Race",
     "Reach",
     "Robustness",
     "Spread",
@@ -82,7 +76,6 @@ __all__ = [
     "spreads",
     "steps_of",
     "time_budgets",
-    "times_to",
     "to_level",
     "within",
 ]
