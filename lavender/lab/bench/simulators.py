@@ -15,6 +15,7 @@ last step, by key; MuJoCo at its own tolerance.
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -82,21 +83,18 @@ def least(run: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 def engine_time(mj: Any, model: Any, data: Any, problem: Problem) -> tuple[float, float, float]:
     """(tolerance, time, residual) of MuJoCo's Newton at the loosest tolerance that is accepted; else 0, its default."""
-    kept = model.opt.solver, model.opt.tolerance, model.opt.disableflags
-    default = kept[1]
+    model = copy.copy(model)
+    default = model.opt.tolerance
     model.opt.solver = mj.mjtSolver.mjSOL_NEWTON
     model.opt.disableflags |= int(mj.mjtDisableBit.mjDSBL_WARMSTART)
     found = 0.0, np.inf
-    try:
-        for tolerance in (*TOLERANCES, 0.0):
-            model.opt.tolerance = tolerance or default
-            mj.mj_fwdConstraint(model, data)
-            found = tolerance, residual(problem, adapter.impulse(model, data)).relative
-            if found[1] <= TARGET:
-                break
-        seconds = least(lambda: mj.mj_fwdConstraint(model, data), 4 * REPEATS)
-    finally:
-        model.opt.solver, model.opt.tolerance, model.opt.disableflags = kept
+    for tolerance in (*TOLERANCES, 0.0):
+        model.opt.tolerance = tolerance or default
+        mj.mj_fwdConstraint(model, data)
+        found = tolerance, residual(problem, adapter.impulse(model, data)).relative
+        if found[1] <= TARGET:
+            break
+    seconds = least(lambda: mj.mj_fwdConstraint(model, data), 4 * REPEATS)
     return found[0], seconds, found[1]
 
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from lavender.base.arrays import FloatArray, number, whole_number
 from lavender.base.errors import InputError, UnknownName
@@ -56,6 +55,8 @@ class Track:
 
     def axis(self, body: int, axis: int) -> FloatArray:
         """A body's own axis in the world (k, 3)."""
+        from scipy.spatial.transform import Rotation
+
         turned: FloatArray = Rotation.from_quat(self.quaternions[:, body], scalar_first=True).as_matrix()[
             ..., axis
         ]

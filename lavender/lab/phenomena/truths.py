@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.special import ellipk
 
 from lavender.base.arrays import FloatArray
 from lavender.lab.phenomena.parts import GRAVITY
@@ -18,6 +17,8 @@ def pendulum_period(inertia: float, torque: float, angle: float) -> float:
 
         T = 4 sqrt(I/(m g l)) K(sin(phi0/2))
     """
+    from scipy.special import ellipk
+
     return 4.0 * math.sqrt(inertia / torque) * float(ellipk(math.sin(0.5 * angle) ** 2))
 
 
@@ -29,6 +30,8 @@ def flip_period(inertia: FloatArray, omega: FloatArray) -> float:
 
         T = 4 K(k) sqrt(I1 I2 I3/((I3 - I2)(L^2 - 2 E I1))),   k^2 = (I2 - I1)(2 E I3 - L^2)/((I3 - I2)(L^2 - 2 E I1))
     """
+    from scipy.special import ellipk
+
     twice_energy, l2 = float(inertia @ omega**2), float(((inertia * omega) ** 2).sum())
     i1, i2, i3 = sorted(inertia.tolist())
     if l2 < twice_energy * i2:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from decimal import Decimal, localcontext
 
 import numpy as np
 
@@ -105,7 +104,7 @@ def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
     problem = Problem.contact(np.diag([1.0, 1.0, ratio]), b, [0.5])
 
     def secular() -> Reference:
-        return Reference(_secular(b, ratio), "secular equation in 60 digits")
+        return Reference(_secular(b, ratio), "secular equation")
 
     return Draft(
         problem, "tangents of unequal mass: where the usual disk projections are wrong or cycle", secular
@@ -113,20 +112,14 @@ def anisotropic(ratio: float = 10.0, speed: float = 3.0) -> Draft:
 
 
 def _secular(b: FloatArray, ratio: float) -> FloatArray:
-    with localcontext() as context:
-        context.prec = 60
-        n, b1, b2, r = (Decimal(float(x)) for x in (*b, ratio))
-        radius = n / 2
-        if b1**2 + (b2 / r) ** 2 <= radius**2:
-            return np.array([float(n), float(b1), float(b2 / r)])
-        low, high = Decimal(0), (b1**2 + b2**2).sqrt() / radius
-        for _ in range(250):  # |lambda_t| decreases in s
-            s = (low + high) / 2
-            if (b1 / (1 + s)) ** 2 + (b2 / (r + s)) ** 2 > radius**2:
-                low = s
-            else:
-                high = s
-        return np.array([float(n), float(b1 / (1 + high)), float(b2 / (r + high))])
+    from scipy.optimize import brentq
+
+    radius, mass = 0.5 * b[0], np.array([1.0, ratio])
+    if np.hypot(*(b[1:] / mass)) <= radius:
+        return np.append(b[0], b[1:] / mass)
+    most = float(np.hypot(*b[1:])) / radius
+    s = brentq(lambda s: np.hypot(*(b[1:] / (mass + s))) - radius, 0.0, most, xtol=1e-300, rtol=2.0**-50)
+    return np.append(b[0], b[1:] / (mass + s))
 
 
 @family()
