@@ -13,6 +13,13 @@ from lavender.base.errors import InputError
 from lavender.cli.options import going_on, parameters_of, refuse_unused, say
 
 FILES = ("trace", "plot", "film", "record")  # options that leave them
+OF_THE_SCENE = (
+    "solver_iterations",
+    "warm_start",
+    "order",
+    "solver",
+    "stepper",
+)  # options that `--set` has, too
 
 
 @click.command()
@@ -20,12 +27,15 @@ FILES = ("trace", "plot", "film", "record")  # options that leave them
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option(
     "--iterations",
+    "solver_iterations",
     type=int,
     default=None,
     help="Sweeps per solve, 4 to 64 (other steppers: 1 to 64).",
 )
 @click.option(
-    "--warm-start/--no-warm-start", default=True, show_default=True, help="Carry impulses from step to step."
+    "--warm-start/--no-warm-start",
+    default=None,
+    help="Carry impulses from step to step.  [default: warm-start]",
 )
 @click.option(
     "--order",
@@ -71,9 +81,6 @@ def run(
     /,
     scene: str,
     steps: int,
-    order: str | None,
-    solver: str | None,
-    stepper: str | None,
     parameters: tuple[str, ...],
     **asked: Any,
 ) -> None:
@@ -98,7 +105,7 @@ def run(
     found = run_scene(
         scene,
         steps=steps,
-        parameters=_parameters(parameters, order=order, solver=solver, stepper=stepper),
+        parameters=_parameters(parameters, {name: asked.pop(name) for name in OF_THE_SCENE}),
         every=1 if live else max(1, steps // 20),
         show=show,
         **asked,
@@ -116,15 +123,15 @@ def run(
     )
 
 
-def _parameters(words: tuple[str, ...], **options: str | None) -> dict[str, Any]:
-    """Parameters of the scene from `--set` and from the options that have their names."""
+def _parameters(words: tuple[str, ...], options: dict[str, Any]) -> dict[str, Any]:
+    """Parameters of the scene from `--set` and from the options that mean one of them."""
     found = parameters_of(words)
     for name, value in options.items():
         if value is None:
             continue
         if name in found:
             raise InputError(
-                f"--{name} {value} and --set {name}={found[name]} both say {name}: leave one out"
+                f"--set {name}={found[name]} and an option ({value}) both say {name}: leave one out"
             )
         found[name] = value
     if found.get("solver", "sequential_impulses") != "sequential_impulses" and "order" in found:

@@ -79,6 +79,10 @@ class Derivatives(_Each):
         super().__init__(len(problems), dict(alone))
         self._problems, self._linears, self._alone = problems, linears, alone
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled they are prepared anew."""
+        return derivatives, (self._problems, [one._impulse for one in self])
+
     def _make(self, i: int) -> Derivative:
         return Derivative(self._problems[i], self._linears.one(i))
 

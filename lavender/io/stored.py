@@ -11,7 +11,7 @@ import stat
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import get_native_id
 from types import MappingProxyType
@@ -48,6 +48,9 @@ class Stored:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "info", MappingProxyType(dict(self.info)))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Stored, **vars(self) | {"info": dict(self.info)}), ()
 
 
 @contextlib.contextmanager

@@ -49,10 +49,10 @@ def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Co
     follows = findex >= 0
     with np.errstate(invalid="ignore"):
         for wrong, needed in (
-            (~(low <= high), "lower <= upper is needed"),
+            (~follows & ~(low <= high), "lower <= upper is needed"),
             (
                 follows & ~(np.isfinite(high) & (high >= 0.0)),
-                "it is mu where findex >= 0, a finite number >= 0",
+                "upper is mu where findex >= 0, a finite number >= 0",
             ),
         ):
             if wrong.any():
@@ -85,7 +85,7 @@ def blocks_of(lower: Any, upper: Any, findex: Any, m: int) -> tuple[IntArray, Co
     return order, Cones(
         ptr=ptr,
         kind=kinds_of(size > 1, sides=sides),
-        lower=low[order],
+        lower=np.where(follows, -high, low)[order],
         upper=high[order],
         mu=np.where(sides, box.mu, mu[:, 0]),
         patch_radius=np.where(sides, box.patch_radius, 0.0),

@@ -295,7 +295,7 @@ class Prepared:
         else:
             lam = problem.start() if problem.guess is None else problem.guess.copy()
         left = deadline.left()
-        if left is not None and not self._late:
+        if left is not None and not self._late and not self._broken:
             watch = Stopwatch()
             self.solver.ready(self.state, left)
             deadline.keep(-watch.seconds)

@@ -14,10 +14,14 @@ from lavender.sim.engine import Film
 from lavender.sim.web import pages
 
 
-def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_path):
+@pytest.mark.parametrize(
+    "asked",
+    [("--iterations", "8", "--no-warm-start"), ("--set", "solver_iterations=8", "--set", "warm_start=false")],
+    ids=["options", "set"],
+)
+def test_lavender_run_shows_a_line_and_writes_what_was_asked_for(lavender, tmp_path, asked):
     paths = [tmp_path / name for name in ("trace.csv", "figure.svg", "problems")]
-    words = ["run", "stack", "--iterations", "8", "--no-warm-start", "--steps", "12", "--set", "n=2"]
-    words += ["--order", "top_down", "--residual"]
+    words = ["run", "stack", *asked, "--steps", "12", "--set", "n=2", "--order", "top_down", "--residual"]
     files = ["--trace", paths[0], "--plot", paths[1], "--record", paths[2]]
     code, printed, _ = lavender(*words, *files)
     assert not code

@@ -79,8 +79,8 @@ def test_every_kind_of_block_comes_back_in_every_form(tmp_path_factory, seed):
     bodies = [given_by(make(seed)) for make in CONTACTS.values() for given_by in FORMS.values()]
     for problem in (*bodies, random_lcp(seed), random_general(seed, tangents=5)):
         lavender.io.save(problem, path)
-        assert lavender.io.load(path) == problem
-        assert pickle.loads(pickle.dumps(problem)) == problem
+        stored = lavender.io.read(path)
+        assert stored.problem == pickle.loads(pickle.dumps(stored)).problem == problem
 
 
 def test_two_saves_give_the_same_bytes(tmp_path):

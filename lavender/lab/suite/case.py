@@ -49,6 +49,12 @@ class Case:
     def __str__(self) -> str:
         return f"{self.name}: {self.reason}"
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copied or pickled it is made again."""
+        from lavender.lab.suite import case
+
+        return case, (self.name,)
+
 
 @dataclass(frozen=True, eq=False)
 class Draft:

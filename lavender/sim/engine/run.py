@@ -148,8 +148,6 @@ def run_scene(
     name: str,
     *,
     steps: int = 240,
-    iterations: int | None = None,
-    warm_start: bool = True,
     parameters: Mapping[str, Any] | None = None,
     residual: bool = False,
     trace: str | PathLike[str] | None = None,
@@ -175,10 +173,7 @@ def run_scene(
     drawn = film is not None and Path(film).suffix.lower() in PICTURES
     if film is not None and drawn:
         picture_suffix(film)
-    given = dict(parameters or {})
-    if iterations is not None:
-        given["solver_iterations"] = iterations
-    simulation = Simulation(Scene(name, **{**given, "warm_start": warm_start}), report_residual=residual)
+    simulation = Simulation(Scene(name, **(parameters or {})), report_residual=residual)
 
     viewer = simulation.view() if view else None
     taken = viewer.film if viewer is not None else simulation.start_film() if film is not None else None

@@ -1,5 +1,6 @@
 """Derivatives of solutions: against differences, against their own adjoint, where they do not exist, and refusals."""
 
+import pickle
 import sys
 
 import numpy as np
@@ -248,6 +249,7 @@ def test_arrays_of_a_batch_are_those_of_its_gradients():
                 lv.derivative(p, s).vjp(velocity=y) for p, s, y in zip(given, solutions, weights, strict=True)
             ]
             assert np.array_equal(found.v_free, np.concatenate([g.v_free for g in each]))
+            assert np.array_equal(pickle.loads(pickle.dumps(found)).v_free, found.v_free)
             assert np.array_equal(found.mu, np.concatenate([g.mu for g in each]))
             assert np.array_equal(found[-1].v_free, each[-1].v_free) and len(found[:2]) == 2
         if twice in given:

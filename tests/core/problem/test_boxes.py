@@ -70,8 +70,9 @@ def test_findex_comes_back_in_any_order(seed):
     np.testing.assert_allclose(low2, low[rows], rtol=1e-15)
     named = np.where(findex < 0, -1, rows[findex]) if m else findex
     np.testing.assert_array_equal(named, given_[rows])
-    for kind in (np.int64, np.float32):
-        again = lv.Problem.from_findex(a2, b2, low2, high2, findex.astype(kind), guess=problem.guess)
+    for kind, unread in ((np.int64, np.nan), (np.float32, 2.0)):
+        low3 = np.where(findex < 0, low2, unread)
+        again = lv.Problem.from_findex(a2, b2, low3, high2, findex.astype(kind), guess=problem.guess)
         assert again == problem
 
 
@@ -81,9 +82,10 @@ def test_findex_comes_back_in_any_order(seed):
         ([0, -1, -1], [np.inf, 1, 1], [-1, 1, 0], "its own row"),
         ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 1], "no normal: it follows row 0"),
         ([0, -1, -1], [np.inf, 1, 1], [-1, 0, 3], "a row below 3"),
-        ([0, -1, -1], [np.inf, np.inf, 1], [-1, 0, 0], "it is mu"),
-        ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "lower <= upper"),
-        ([0, 2, -1], [np.inf, 1, 1], [-1, 0, 0], "lower <= upper"),
+        ([0, -1, -1], [np.inf, np.inf, 1], [-1, 0, 0], "upper is mu"),
+        ([0, -1, -1], [np.inf, np.nan, 1], [-1, 0, 0], "upper is mu"),
+        ([0, 1, -1], [np.inf, -1, 1], [-1, 0, 0], "upper is mu"),
+        ([0, 2, -1], [np.inf, 1, 1], [-1, -1, 0], "lower <= upper"),
         ([0, -1, -1], [5, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
         ([-1, -1, -1], [np.inf, 1, 1], [-1, 0, 0], r"a normal has \[0, inf\]"),
         ([0, -1], [np.inf, 1], [-1, 0, 0], "shape"),

@@ -63,7 +63,8 @@ def test_what_stalled_does_not_get_on_when_it_is_started_again(name):
 
 @pytest.mark.parametrize("error", [FloatingPointError("underflow"), MemoryError()])
 @pytest.mark.parametrize("where", ["prepare", "run"])
-def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
+@pytest.mark.parametrize("limit", [None, 10.0])
+def test_what_arithmetic_breaks_on_is_a_result(error, where, limit, register):
     class Breaks:
         def prepare(self, problem):
             if where == "prepare":
@@ -79,7 +80,7 @@ def test_what_arithmetic_breaks_on_is_a_result(error, where, register):
     register(lv.SolverSpec(name="breaks", factory=Breaks, laws={"lcp"}, summary="", resumable=False))
     solver = lv.prepare(random_lcp(4), "breaks")
     for _ in range(2):
-        solution = solver.solve()
+        solution = solver.solve(time_limit=limit)
         assert solution.status is lv.Status.NUMERICAL_ERROR
         assert type(error).__name__ in solution.message
         assert np.isfinite(solution.impulse).all()

@@ -1,6 +1,7 @@
 """Films of a run: what was stepped is what is kept, served and painted."""
 
 import json
+import pickle
 import shutil
 import threading
 import urllib.error
@@ -38,9 +39,9 @@ def test_files_lead_back_and_what_is_no_film_is_refused(tmp_path):
     film = lv.Simulation("pile").film(5)
     path = tmp_path / "pile.film"
     film.save(path)
-    back = Film.load(path)
-    assert back.header == film.header and back.ended
-    np.testing.assert_array_equal(back.frames(), film.frames())
+    for back in (Film.load(path), pickle.loads(pickle.dumps(film))):
+        assert back.header == film.header and back.ended
+        np.testing.assert_array_equal(back.frames(), film.frames())
     data = path.read_bytes()
     head = len(films.MAGIC) + 8 + int.from_bytes(data[len(films.MAGIC) : len(films.MAGIC) + 8], "little")
     for bad in (
