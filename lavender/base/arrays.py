@@ -6,7 +6,7 @@ least 1e-60. The same problem in other units has the same answer, so the message
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -277,6 +277,19 @@ def check_not_negative(what: str, array: np.ndarray) -> None:
     if checks.has_negative(array) if plain else array.size and array.min() < 0:
         i = int(np.argmin(array))
         raise InputError(f"{what} must not be negative; entry [{i}] is {array[i]}")
+
+
+def one_of(name: str, given: Any, known: Sequence[str]) -> str:
+    """A word of those that are known.
+
+    Raises
+    ------
+    InputError
+        Another word, or no word.
+    """
+    if not isinstance(given, str) or given not in known:
+        raise InputError(f"{name} is {given!r}; {' or '.join(map(repr, known))} is needed")
+    return str(given)  # NumPy's strings say in messages that they are NumPy's
 
 
 def words_for(what: str, given: Any, count: int) -> tuple[str, ...]:

@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INTERRUPTED, bytes_of, console, going_on, one_thread, was_given
+from lavender.cli.options import (
+    EXIT_INTERRUPTED,
+    bytes_of,
+    console,
+    going_on,
+    one_thread,
+    refuse_unused,
+    was_given,
+)
 
 if TYPE_CHECKING:
     from lavender.lab.bench import Event, Item, Plan, Records
@@ -126,12 +134,16 @@ def measure(context: click.Context, files: Sequence[str], path: Path, sweeps: Se
     return Measured(found[0], stopped, reused, since.replace("T", " ")[:16])
 
 
-def run_campaign(asked: Mapping[str, Any], words: Sequence[str], path: Path) -> Measured:
-    """Run a campaign with a progress bar; `asked` are the options. Raises as `measure`."""
+def run_campaign(context: click.Context, files: Sequence[str], path: Path) -> Measured:
+    """Run a campaign with a progress bar. Raises as `measure`."""
     from lavender.lab import bench
 
     one_thread()
+    asked = context.params
+    words = bench.seeds(files, len(asked["seeds"]), asked["seeds"].start)
     check_named(bench.resolve(words))
+    if words == list(files):
+        refuse_unused(context, ["seeds"], "where no case takes one")
     if asked["prove"]:
         raise InputError("--prove is of reports; a campaign has too many problems")
     plan = plan_of({**asked, "orders": asked["orders"] or ()}, bench.CampaignPlan)

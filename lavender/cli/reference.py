@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
-from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_BAD_INPUT, EXIT_UNMET, console, going_on, one_thread, plain
+from lavender.base.errors import InputError
+from lavender.cli.options import Reading, console, going_on, one_thread, plain
 
 
 @click.command()
@@ -22,7 +23,8 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     file is judged before it is used. With `--prove` (extra `proof`) motion errors are then those to an exact solution,
     which owes nothing to any solver.
 
-    Exits with 1 when nothing solves a problem or proves a solution, or a file met in a folder cannot be read.
+    Exit code 1: nothing solves a problem or proves a solution, or a file in a folder cannot be read. Exit code 2: a
+    named file cannot be read.
     """
     from lavender.lab import bench, motion
     from lavender.lab.proof import enclosed, require
@@ -31,26 +33,26 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     if proven:
         require()
     out = console()
-    unmet = missing = 0
+
+    def tell(text: str, style: str | None = None) -> None:
+        with going_on():
+            out.print(plain(text), style=style, highlight=False, soft_wrap=True)
+
+    unmet, reading = False, Reading(partial(tell, style="yellow"))
     for item in bench.resolve(files):
-        try:
+        with reading(item):
             if not Path(item.source).is_file():
                 raise InputError(f"{item.source} is no file; a reference is written beside one")
-            if proven and not (found := enclosed(item.problem)).proven:
-                raise InputError(str(found))
-            written = motion.save_reference(item.problem, item.source)
-            told = f"{item.name}: {motion.reference(item.problem.disk)}, written: {written}"
-            with going_on():
-                out.print(plain(told), highlight=False, soft_wrap=True)
-        except LavenderError as error:
-            with going_on():
-                out.print(plain(f"{item.name}: {error}"), style="yellow", highlight=False, soft_wrap=True)
-            unread = isinstance(error, InputError) and item.named and not Path(item.source).is_file()
-            missing += unread
-            unmet += not unread
-        finally:
-            item.forget()
-    if missing:
-        raise click.exceptions.Exit(EXIT_BAD_INPUT)
-    if unmet:
-        raise click.exceptions.Exit(EXIT_UNMET)
+            proof = enclosed(item.problem) if proven else None
+            found = motion.reference(item.problem.disk)
+            if proof is not None and not proof.proven:
+                reading.tell(f"{item.name}: {proof}")
+                unmet = True
+            elif not found.accepted:
+                reading.tell(
+                    f"{item.name}: nothing reached the floor ({found}); there is no reference to write"
+                )
+                unmet = True
+            else:
+                tell(f"{item.name}: {found}, written: {motion.save_reference(item.problem, item.source)}")
+    reading.end(unmet)

@@ -123,7 +123,7 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         if not (done.records.records or done.records.skips):
             raise InputError(f"{again[0]} holds no records: there is nothing to show")
     elif asked["campaign"]:
-        done = run_campaign(asked, bench.seeds(files, len(asked["seeds"]), asked["seeds"].start), path)
+        done = run_campaign(context, files, path)
     else:
         done = measure(context, files, path, sweeps)
     engines = [] if asked["campaign"] else contestants(files, done.records.latest())

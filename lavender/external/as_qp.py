@@ -36,8 +36,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lavender.base.arrays import FloatArray
-from lavender.base.errors import CapabilityError, InputError
+from lavender.base.arrays import FloatArray, one_of
+from lavender.base.errors import CapabilityError
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import reference
 from lavender.problem import Problem
@@ -180,8 +180,7 @@ def pick_form(problem: Problem, form: str, definite: bool = False) -> str:
     "auto" takes the velocity form where rows are known and m > 6 n, the mass ratio is 1e3 or more, or
     the backend needs a definite P (`definite`).
     """
-    if form not in FORMS:
-        raise InputError(f"form is {form!r}; one of {', '.join(map(repr, FORMS))} is needed")
+    form = one_of("form", form, FORMS)
     rows = problem.rows
     if form == "velocity" and rows is None:
         raise CapabilityError(

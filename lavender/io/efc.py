@@ -19,10 +19,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, precision_of, whole_number
+from lavender.base.arrays import FloatArray, as_array, number, one_of, precision_of, whole_number
 from lavender.base.errors import CapabilityError, InputError
 from lavender.io import mujoco as single
-from lavender.problem.batch import Batch, check_errors
+from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.cones import Cones, kinds_of
 from lavender_ext.judge.measure import all_finite
 
@@ -182,7 +182,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
 
         model = copy.copy(model)
         model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
-    check_errors(errors)
+    one_of("errors", errors, ERRORS)
     given = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = given.shape[1]
     kinds = {model.nq + model.nv: mj.mjtState.mjSTATE_QPOS | mj.mjtState.mjSTATE_QVEL}

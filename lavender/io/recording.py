@@ -14,7 +14,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, whole_number
+from lavender.base.arrays import FloatArray, as_array, number, one_of, whole_number
 from lavender.base.errors import InputError, LavenderError
 from lavender.io import mujoco as adapter
 from lavender.io import npz
@@ -107,8 +107,7 @@ def record(
     """
     mj = adapter._mujoco(model, data)[0].mj
     steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
+    precision = one_of("precision", precision, PRECISIONS)
     threshold = number("threshold", threshold, low=0.0)
     drive = drive_of(model, control, seed)
     kept: list[dict[str, Any]] = []

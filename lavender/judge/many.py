@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array, number, places, whole_number
+from lavender.base.arrays import FloatArray, as_array, number, one_of, places, whole_number
 from lavender.base.errors import InputError, LavenderError
 from lavender.judge.residuals import AT_REST, ENOUGH, Residual, residual, verdict_of
 from lavender.problem import PRECISIONS, Problem, check_problem
-from lavender.problem.batch import Batch, check_errors
+from lavender.problem.batch import ERRORS, Batch
 from lavender.problem.derived import cached_property
 from lavender_ext.small.many import CODE, NUMBER, PLACE, Hand, Worlds, data_of
 
@@ -284,8 +284,8 @@ def residual_many(
     (['at its floor', 'stopped early', 'wrong'], [0.0, 0.1, 1.0])
     """
     given = given_problems(problems, errors)
-    if precision not in (None, *PRECISIONS):
-        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
+    if precision is not None:
+        precision = one_of("precision", precision, PRECISIONS)
     threshold = number("threshold", threshold, low=0.0)
     threads = whole_number("threads", threads, 1, None)
     if isinstance(given, Batch):
@@ -313,7 +313,7 @@ def wait_for(held: Iterable[Any]) -> None:
 
 def given_problems(problems: Any, errors: str) -> Any:
     """A batch, or a list of problems."""
-    check_errors(errors)
+    one_of("errors", errors, ERRORS)
     if isinstance(problems, Problem):
         raise InputError("problems is one Problem; a list of them is needed, or `solve`")
     if isinstance(problems, Batch):

@@ -44,7 +44,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import ArrayLike, FloatArray, as_array, number, read_only
+from lavender.base.arrays import ArrayLike, FloatArray, as_array, number, one_of, read_only
 from lavender.base.errors import InputError
 from lavender.problem import PRECISIONS, Problem, check_problem
 from lavender_ext.judge import measure
@@ -361,9 +361,7 @@ def residual(
     ('stopped early', True)
     """
     check_problem(problem)
-    precision = problem.precision if precision is None else precision
-    if precision not in PRECISIONS:
-        raise InputError(f"precision is {precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed")
+    precision = problem.precision if precision is None else one_of("precision", precision, PRECISIONS)
     if type(impulse) is not np.ndarray or impulse.dtype != float or not impulse.flags.c_contiguous:
         impulse = as_array("impulse", impulse, (None,), finite=False, unit="N s")
     if impulse.shape != (problem.m,):

@@ -18,6 +18,7 @@ from lavender.base.arrays import (
     as_array,
     check_sizes,
     check_unmasked,
+    one_of,
     places,
     precision_of,
     shape_of,
@@ -105,7 +106,7 @@ class Batch(Sequence[Problem]):
         row_ptr: ArrayLike | None = None,
         velocity_ptr: ArrayLike | None = None,
     ) -> None:
-        _check_friction(friction)
+        friction = one_of("friction", friction, FRICTION)
         values, *pattern = M if isinstance(M, tuple) else (M,)
         jac, mass, free = (_numbers(name, x) for name, x in (("J", J), ("M", values), ("v_free", v_free)))
         if row_ptr is not None and count is None:
@@ -228,7 +229,7 @@ class Batch(Sequence[Problem]):
     @classmethod
     def _of_form(cls, n: int, m: int, friction: Any, precision: str) -> Batch:
         made: Batch = object.__new__(cls)
-        _check_friction(friction)
+        friction = one_of("friction", friction, FRICTION)
         made._n, made.friction, made.precision, made._arrays = n, friction, precision, None
         made.shape, made.velocity_shape = (n, m), (n, 0)
         made.at = np.zeros((n, len(PLACE)), np.int64)
@@ -435,17 +436,6 @@ class Batch(Sequence[Problem]):
 
 
 # -- what is given ------------------------------------------------------------------------------------
-
-
-def check_errors(errors: str) -> None:
-    """What is done about a world that is bad."""
-    if errors not in ERRORS:
-        raise InputError(f"errors is {errors!r}; {' or '.join(map(repr, ERRORS))} is needed")
-
-
-def _check_friction(friction: Any) -> None:
-    if not (isinstance(friction, str) and friction in FRICTION):
-        raise InputError(f"friction is {friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
 
 
 def _numbers(name: str, x: Any) -> np.ndarray:

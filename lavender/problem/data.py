@@ -16,6 +16,7 @@ from lavender.base.arrays import (
     check_finite,
     check_sizes,
     equal,
+    one_of,
     read_only,
     shape_of,
     table_of,
@@ -110,15 +111,10 @@ class ProblemData:
         _check_rhs(self.b)
         if (self.matrix is None) + (self.rows is None) + (self.generalized is None) != 2:
             raise InputError("give matrix=, rows= or generalized=, one of them")
-        if self.friction not in FRICTION:
-            raise InputError(f"friction is {self.friction!r}; {' or '.join(map(repr, FRICTION))} is needed")
-        put(self, "friction", str(self.friction))  # NumPy's strings say in messages that they are NumPy's
-        if not self.precision:
+        put(self, "friction", one_of("friction", self.friction, FRICTION))
+        if self.precision is None or (isinstance(self.precision, str) and not self.precision):
             put(self, "precision", getattr(self.rows, "precision", "float64"))
-        if self.precision not in PRECISIONS:
-            raise InputError(
-                f"precision is {self.precision!r}; {' or '.join(map(repr, PRECISIONS))} is needed"
-            )
+        put(self, "precision", one_of("precision", self.precision, PRECISIONS))
         if self.friction != "cone" and self.cones.has_round:
             raise InputError(
                 "a round cone of more than two tangents has no Coulomb law here: give friction='cone'"

@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray
+from lavender.base.arrays import FloatArray, one_of
 from lavender.base.deadline import Deadline, Stopwatch, TooLate
 from lavender.base.errors import CapabilityError, InputError
 from lavender.judge.certificates import check_certificate
@@ -140,8 +140,7 @@ class Newton(Solver):
 
     @np.errstate(all="ignore")  # what overflows is judged
     def _prepare(self, problem: Problem, like: System | None) -> NewtonState:
-        if self.form not in FORMS:
-            raise InputError(f"form is {self.form!r}; one of {', '.join(FORMS)} is needed")
+        one_of("form", self.form, FORMS)
         if self.form == "velocity" and problem.matrix is not None:
             raise InputError(
                 "form='velocity' needs a problem with J and M (Problem.from_rows, Problem.from_jacobian); this one "

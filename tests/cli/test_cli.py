@@ -88,6 +88,10 @@ def test_solvers_lists_all_with_reasons(lavender):
         (("report", "--campaign", "--seeds", "9:3"), "whole numbers with A < B"),
         (("report", "--time-budgets", "0"), "time budget 0.0 must be"),
         (("report", "stack(n=4)", "--seeds", "3"), "--seeds has no effect without --campaign"),
+        (
+            ("report", "stack(n=4)", "--campaign", "--seeds", "3"),
+            "--seeds has no effect where no case takes one",
+        ),
         (("report", "stack(n=4)", "--steps", "3"), "--steps has no effect without a MODEL.xml"),
         (("report", "stack(n=4)", "--pass-limit", "3"), "--pass-limit has no effect without a sequence"),
         (("report", "stack(n=4)", "--solvers", "direct", "--budgets", "3"), "--budgets has no effect"),

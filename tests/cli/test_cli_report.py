@@ -121,6 +121,8 @@ def test_what_nothing_solves_fails_and_what_has_nothing_to_do_does_not(lavender,
     lv.io.save(lv.Problem.lcp([[1.0, -1.0], [-1.0, 1.0]], [1.0, 1.0]), tmp_path / "impossible.npz")
     for place in (tmp_path / "impossible.npz", "stack(n=4)"):  # a case has no place for a reference
         assert lavender("reference", place)[0] == 1
+    (tmp_path / "cut.npz").write_bytes(b"PK")
+    assert [lavender("reference", place)[0] for place in (tmp_path / "cut.npz", tmp_path)] == [2, 1]
     lv.io.save(idle_problem(), tmp_path / "idle.npz")
     code, out, _ = lavender("solve", tmp_path / "idle.npz", "--solver", "pgs")
     assert code == 0 and "nothing to do" in out

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, flag, whole_number
+from lavender.base.arrays import FloatArray, flag, one_of, whole_number
 from lavender.base.errors import CapabilityError, InputError, LavenderError
 from lavender.base.later import sparse as sp
 from lavender.judge.residuals import residual
@@ -122,8 +122,7 @@ class Motions:
         InputError
             No such choice, a wrong impulse, or no motion to choose from.
         """
-        if choice not in CHOICES:
-            raise InputError(f"select is {choice!r}; one of {', '.join(CHOICES)} is needed")
+        choice = one_of("choice", choice, CHOICES)
         if not self.motions:
             raise InputError("no run ended at a solution; there is nothing to choose from")
         if choice == "dissipation":

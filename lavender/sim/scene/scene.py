@@ -254,7 +254,7 @@ class Scene:
     """
 
     def __init__(self, name: str | None = None, **parameters: Any) -> None:
-        if name is not None and name not in SCENES:
+        if name is not None and not (isinstance(name, str) and name in SCENES):
             raise UnknownName("scene", name, SCENES)
         own = list(inspect.signature(SCENES[name]).parameters)[1:] if name is not None else []
         for key in parameters:

@@ -72,7 +72,7 @@ def test_a_solution_rounded_to_float32_is_at_its_floor_and_one_further_off_is_no
         assert f"stopped early, {off.excess:.2g} times its floor" in str(off)
 
 
-@pytest.mark.parametrize("word", ["float16", "single", 32])
+@pytest.mark.parametrize("word", ["float16", "single", 32, np.zeros(2)], ids=repr)
 def test_another_precision_is_told(word):
     p = random_lcp(1)
     with pytest.raises(lv.InputError, match=r"precision is .*'float64' or 'float32'"):

@@ -143,6 +143,10 @@ BAD_PROBLEMS = {
         lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction="couloumb"),
         "'coulomb' or 'cone'",
     ),
+    "law of numbers": (
+        lambda: lv.Problem.contact(np.eye(3), np.ones(3), [1], friction=np.array([0.5, 0.5])),
+        "'coulomb' or 'cone'",
+    ),
     "names": (lambda: lv.Problem.lcp(I2, [1, 1], names=["a"]), "1 names for 2 blocks"),
     "key": (lambda: lv.Problem.lcp(I2, [1, 1], key=[-1, 2]), "unsigned"),
     "compliance": (lambda: lv.Problem.lcp(I2, [1, 1], compliance=[1, 1]), "already on the diagonal"),

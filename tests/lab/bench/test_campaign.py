@@ -25,11 +25,12 @@ def lines(records):
 
 
 def test_seeds_are_spread_over_cases_that_take_one():
-    assert bench.seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack"], 2) == [
+    assert bench.seeds(["granular(n=2)", "random_spd(seed=5)", "toy_stack", "@hard"], 2) == [
         "granular(n=2, seed=0)",
         "granular(n=2, seed=1)",
         "random_spd(seed=5)",
         "toy_stack",
+        "@hard",
     ]
     assert bench.seeds(["granular(n=2)"], 2, first=7) == ["granular(n=2, seed=7)", "granular(n=2, seed=8)"]
     with pytest.raises(lv.InputError):

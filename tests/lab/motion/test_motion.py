@@ -343,7 +343,7 @@ def test_choices_have_names_and_are_motions():
     for motion in found:
         assert found.select("nearest", motion.impulse) is motion
     assert found.select("compliant") in found
-    with pytest.raises(lv.InputError, match="select is"):
+    with pytest.raises(lv.InputError, match="choice is"):
         found.select("best")
     picks = found.picks(["anderson", "admm", "jacobi"], max_iter=1000)
     assert picks["jacobi"] is None  # 1000 sweeps end before it gets there

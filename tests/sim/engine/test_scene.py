@@ -195,6 +195,8 @@ def test_bad_parameters_are_refused(more, message):
 
 
 def test_unknown_scenes_and_parameters_name_the_nearest():
+    with pytest.raises(lv.UnknownName, match=r"unknown scene \['stack'\]"):
+        lv.Scene(["stack"])
     with pytest.raises(lv.UnknownName, match="did you mean 'stack'"):
         lv.Scene("stac")
     with pytest.raises(lv.UnknownName, match="did you mean 'friction'"):

@@ -75,7 +75,7 @@ class Order:
 
 
 def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
-    """Cases of the suite with seed=first .. first + n - 1, where their family takes a seed; others, and files, once.
+    """Cases with seed=first .. first + n - 1, where their family takes a seed; others, sets and files, once.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def seeds(words: Iterable[str], n: int, first: int = 0) -> list[str]:
         )
     out = []
     for word in words:
-        if is_path(word):
+        if is_path(word) or word.startswith("@"):
             out.append(word)
             continue
         name, given = parse(word)
