@@ -122,7 +122,7 @@ class Island:
 
     def balls(self, x: list[Any], speeds: Any) -> Any:
         """The slope as a matrix of balls."""
-        a, n = self.part.exact(), len(x)
+        a, n = self.part.exact, len(x)
         if not self.sliding:
             return a
         left, right = self.slope(x, speeds)

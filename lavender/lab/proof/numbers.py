@@ -78,11 +78,6 @@ def largest(x: list[Any]) -> float:
     return max((abs(float(q)) for q in x), default=0.0)
 
 
-def squared(x: Any) -> Any:
-    """Of a ball, or of anything that multiplies."""
-    return x * x
-
-
 def sign_of(x: Any) -> int:
     """+1 where certainly x >= 0, -1 where certainly x < 0, else 0."""
     return 1 if x >= 0 else -1 if x < 0 else 0

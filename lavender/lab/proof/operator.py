@@ -71,17 +71,14 @@ class Part:
         return [j.T.tocsr(), operator.inverse[used][:, used], j]
 
     @cached_property
-    def _exact(self) -> Any:
-        return self._operator.block(self._kind, self.which)
-
     def exact(self) -> Any:
         """A as a dense matrix of balls."""
-        return self._exact
+        return self._operator.block(self._kind, self.which)
 
     def times(self, x: list[Any]) -> list[Any]:
         """A x."""
         if self.dense:
-            return list((self._exact * self._kind.matrix(len(x), 1, x)).entries())
+            return list((self.exact * self._kind.matrix(len(x), 1, x)).entries())
         y = x
         for factor in self._numbers:
             y = [sum((p * y[k] for p, k in row), self._kind.number(0.0)) for row in factor]
@@ -94,7 +91,7 @@ class Part:
             a = self._operator.rows[self.which][:, self.which]
             return self._bounded(a, abs(a) * 0.0)
         if self.dense:
-            n, entries = len(self.which), self._exact.entries()
+            n, entries = len(self.which), self.exact.entries()
             near = [float(x.mid()) for x in entries]
             off = [upper_end(x - y) for x, y in zip(entries, near, strict=True)]
             both = (np.array(v).reshape(n, n) for v in (near, off))

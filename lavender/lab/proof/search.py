@@ -13,7 +13,7 @@ from lavender.base.later import sparse as sp
 from lavender.lab.motion import uniqueness
 from lavender.lab.proof.dependence import Tangled, dependencies, pivots
 from lavender.lab.proof.island import Island, NoZero, Sticks
-from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, squared, upper_end
+from lavender.lab.proof.numbers import UNIT, Balls, Rationals, sign_of, upper_end
 from lavender.lab.proof.operator import Operator, Part
 from lavender.problem import Problem
 
@@ -361,7 +361,7 @@ class Search:
                         border.append(block)
                 continue
             speeds = [
-                sum((squared(number(c) * w[k]) for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
+                sum(((number(c) * w[k]) ** 2 for k, c in zip(p.rows, p.reach, strict=True)), 0 * w[r])
                 for p in block.parts
             ]
             if not block.loaded:
@@ -388,7 +388,7 @@ class Search:
                 if part.slides:
                     continue  # |lambda / c| = lambda_n by (1), against w by its sign
                 y = sum(
-                    (squared(lam[k] / number(c)) for k, c in zip(part.rows, part.reach, strict=True)),
+                    ((lam[k] / number(c)) ** 2 for k, c in zip(part.rows, part.reach, strict=True)),
                     0 * lam[r],
                 )
                 sign = sign_of(lam[r] * lam[r] - y)

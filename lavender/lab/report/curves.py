@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from lavender.lab.bench.record import Record, level_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report import tables
@@ -124,20 +126,18 @@ def overall_figure(records: Records) -> Figure:
     times = [t for own in by.values() for some in own.values() for t, _ in some]
     if not times:
         return Figure("over all", "", "", "", ())
-    low, high = math.log10(min(times)), math.log10(max(times))
-    grid = [10.0 ** (low + (high - low) * i / (GRID - 1)) for i in range(GRID)]
+    grid = np.geomspace(min(times), max(times), GRID)
     curves = []
     for solver, own in sorted(by.items()):
-        bands = []
-        for t in grid:
-            reached = [
-                min((x for s, x in own.get(c, ()) if s <= t * (1.0 + 1e-9)), default=1.0) for c in cases
-            ]
-            bands.append([min(tables.quantile(reached, q), 1.0) for q in (0.25, 0.5, 0.75)])
+        reached = np.ones((len(cases), GRID))
+        for row, case in zip(reached, cases, strict=True):
+            for t, x in own.get(case, ()):
+                np.minimum(row, x, out=row, where=grid * (1.0 + 1e-9) >= t)
+        bands = np.quantile(reached, (0.25, 0.5, 0.75), axis=0, method="inverted_cdf")
         # from the last time at which half of the cases have nothing
-        first = max((i for i, b in enumerate(bands) if b[0] == 1.0), default=0)
-        lower, middle, upper = (tuple(column) for column in zip(*bands[first:], strict=True))
-        curves.append(Curve(solver, solver, tuple(grid[first:]), middle, low=lower, high=upper))
+        first = max(np.flatnonzero(bands[0] == 1.0), default=0)
+        across, lower, middle, upper = (tuple(x[first:].tolist()) for x in (grid, *bands))
+        curves.append(Curve(solver, solver, across, middle, low=lower, high=upper))
     over = f" over all {len(cases)} {'cases' if single else 'steps'}: median, middle half"
     if any(len(own) < len(cases) for own in by.values()):
         over += "; no result: 1"
