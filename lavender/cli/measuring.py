@@ -68,7 +68,7 @@ def check_named(items: Sequence[Item]) -> None:
             try:
                 _ = item.problem
             except Exception as error:
-                raise InputError(not_loaded(item, error)) from None
+                raise InputError(not_loaded(item.source, error)) from None
             item.forget()
 
 

@@ -68,8 +68,7 @@ def verdict(records: Records, times: Sequence[float] = (), sweeps: Sequence[int]
     """
     if tables.is_campaign(records) or not len(records):
         return Verdict((), ())
-    newest = next(reversed(list(records.runs.values())), None)
-    plan = {} if newest is None else newest.plan
+    plan = next((run.plan for run in reversed(list(records.runs.values()))), {})
     speeds = speed_levels(records)
     if speeds and plan.get("speed_levels"):
         return _by_advice(by_speed(records))

@@ -391,8 +391,7 @@ def _work(pair: Pair, order: Order) -> tuple[int, list[Any]]:
     try:
         problem, info = _look(pair, order.run.run)
     except Exception as error:  # a file may make a reader raise anything
-        item = Item(pair.case, str(pair.source), _missing, pair.reason)
-        return pair.index, [Skip(order.run.run, pair.case, "", not_loaded(item, error))]
+        return pair.index, [Skip(order.run.run, pair.case, "", not_loaded(str(pair.source), error))]
     if _worker is None:
         shared = machine.memory_share(os.cpu_count() or 1)
         _worker = Worker(shared if order.memory is None else order.memory)
@@ -418,7 +417,3 @@ def _look(pair: Pair, run: str) -> tuple[Problem, CaseInfo]:
     looked = item.problem, describe(item, run)
     _seen = (key, looked) if key is not None else None
     return looked
-
-
-def _missing() -> Problem:
-    raise InputError("the case is not known to the worker")

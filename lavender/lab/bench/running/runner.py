@@ -232,7 +232,7 @@ class Runner:
                 told = f"within {found.velocity_radius:.1e} m/s" if found.proven else f"none: {found.reason}"
                 info = replace(info, proof=told)
         except Exception as error:  # a file may make a reader raise anything; it costs its own case
-            self.keep(Skip(self.this.run, item.name, "", not_loaded(item, error), item.sequence))
+            self.keep(Skip(self.this.run, item.name, "", not_loaded(item.source, error), item.sequence))
             self.done += len(self.names)
             self.tell(item.name, "")
             return None
@@ -382,9 +382,9 @@ def _sequences(items: list[Item]) -> list[tuple[str, list[Item]]]:
     return out
 
 
-def not_loaded(item: Item, error: Exception) -> str:
+def not_loaded(source: str, error: Exception) -> str:
     """Why a case is left out; an error that the reader did not mean to raise with its kind."""
     text = str(error)
     if not isinstance(error, (LavenderError, OSError)):
         text = f"{type(error).__name__}: {text}"
-    return f"did not load: {text}" if text.startswith(item.source) else f"did not load: {item.source}: {text}"
+    return f"did not load: {text}" if text.startswith(source) else f"did not load: {source}: {text}"
