@@ -217,6 +217,19 @@ def test_a_state_that_does_not_fit_the_problem_is_refused():
         lv.diagnose(lv.Problem.contact(np.eye(3), np.ones(3), mu=0.5), gap=[0.0], dt=0.01)
 
 
+def test_a_bounce_before_the_surfaces_meet_is_no_gap_of_the_wrong_sign():
+    dt, fall, e = 0.01, np.array([-2.0, -3.0]), 0.5
+    gap = np.array([0.01, 0.02])  # m, closed within the step
+
+    def found(target):
+        cones = lv.Cones.contacts(0.0, tangents=0, count=2)
+        problem = lv.Problem.from_jacobian(np.eye(2), np.eye(2), fall - 9.81 * dt, target=target, cones=cones)
+        return [s.kind for s in lv.diagnose(problem, velocity=fall, gap=gap, dt=dt)]
+
+    assert found(-e * fall) == []
+    assert found(gap / dt) == ["targets"]
+
+
 def pressed(law, form):
     """A ball that contact 0 pushes up by 0.1 m/s and a joint of one row holds; contact 1 has no part in it.
 

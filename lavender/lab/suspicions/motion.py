@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lavender.base.arrays import FloatArray, as_array, number
 from lavender.base.errors import InputError
@@ -17,6 +18,8 @@ from lavender.problem.rows import Rows
 G = 9.81  # m/s^2
 PUSHED = 30.0  # m/s, of a target that moves bodies apart: 6 cm in a step of 2 ms
 LET = 1000.0  # m/s, of one that lets them approach: over a gap of 2 m in such a step
+LEAST = 0.05  # coefficient of restitution of what bounces; targets multiplied by dt once more have less
+SAME = 1e-6  # by which coefficients of restitution differ that are one, computed from velocities
 FAST = 30.0, 1e4  # m/s, of a contact's approach before a step; what is faster is told in another unit
 
 
@@ -151,11 +154,14 @@ def stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicio
     contact = np.flatnonzero(p.cones.is_contact)
     if motion is None or not len(contact):
         return
-    normal = p.cones.normal_rows
+    normal, g, r = p.cones.normal_rows, p.generalized, p.rows
+
+    def of_normals(v: FloatArray) -> FloatArray:
+        return np.asarray(p.jacobian @ v.ravel() if g is None else g.velocity_of(v))[normal]
+
     if velocity is not None:
-        g, r = p.generalized, p.rows
         step = (motion[2] - velocity).ravel()
-        change = np.abs(p.jacobian @ step if g is None else g.velocity_of(step))[normal]
+        change = np.abs(of_normals(step))
         push = step.reshape(-1, 6)[r.inv_mass > 0.0, :3] if r is not None else np.zeros((0, 3))
         if g is not None and g.nv <= LARGE:
             push = np.array([step[j : j + 3] for j in free_bodies(g.mass.toarray())]).reshape(-1, 3)
@@ -174,6 +180,8 @@ def stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicio
         return
     target = motion[1][normal]
     told = (target != 0.0) & (np.abs(gap) > 1e-9)
+    if velocity is not None:
+        told &= ~_bounces(target, of_normals(velocity))
     if not told.any():
         return
     if np.mean(target[told] * gap[told] > 0.0) > 0.7:
@@ -184,6 +192,15 @@ def stepped(p: Problem, velocity: Any, gap: Any, dt: float) -> Iterator[Suspicio
         reason = f"targets are {share:.2g} of gap/dt in the median, where all of it is 1: "
         reason += "are they divided by dt twice?" if share > 1.0 else "are they multiplied by dt once more?"
         yield suspect(p, "targets", reason, contact[told], share=share)
+
+
+def _bounces(target: FloatArray, before: FloatArray) -> npt.NDArray[np.bool_]:
+    """Targets (c,) that are -e times the approach before the step (c,), with one e: they say nothing of gaps."""
+    approach = before < 0.0
+    e = np.zeros(len(target))
+    np.divide(-target, before, out=e, where=approach)
+    bounces = approach & (e > LEAST) & (e <= 1.0)
+    return bounces & (np.abs(e - np.median(e[bounces])) <= SAME) if bounces.any() else bounces
 
 
 CHECKS = (targets, speeds, above)
