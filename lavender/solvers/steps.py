@@ -39,7 +39,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 FIRST = 32  # sweeps before the first prediction of how many are left
 MOST = 2**30  # iterations of one call
 LEAST = 1e-16  # relative residual that can be predicted
-NEAR = 0.02  # relative residual, up to which Newton's method under friction begins from another's impulse
+NEAR = 0.02  # relative residual, up to which Newton's method begins from another's impulse
 PROBE = 0.5  # share of the time left that sweeps have before who factors
 PACE = 4e-9  # s for each ns that an iteration is counted for, at most
 FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
@@ -102,9 +102,7 @@ class Step:
 
 
 class Newton(Step):
-    """From the state whose factor was counted; from doing nothing under friction of which sweeps left much, and once
-    more if it ends in vain.
-    """
+    """From the state whose factor was counted; from nothing if sweeps left much, and once more if it ends in vain."""
 
     anew = lost = False
 
@@ -118,7 +116,7 @@ class Newton(Step):
     def turn(self, n: int) -> Claim:
         log = self.log
         if not self.state.begun:
-            far = log.best > NEAR and log.problem.law in ("coulomb", "cone")
+            far = log.best > NEAR
             self.impulse = log.problem.start() if self.anew or far else log.impulse.copy()
             self.anew = not (self.impulse - log.problem.start()).any()
         claim = self.solver.turn(self.state, self.impulse, n, log.tol, log.time_left, log.left)
