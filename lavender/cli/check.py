@@ -47,9 +47,10 @@ def check(
     A records.jsonl of a report is verified: each run is repeated on the problems named after it (default: where the
     records say). Verdicts must agree; times are shown side by side.
 
-    Exit code 1: a claim is contradicted; a verdict or problem differs from the records.jsonl, or nothing of one of its
-    solvers could be verified (--solvers names those that count); a file in a folder cannot be read; or, with
-    --precision or --threshold, a stored solution is neither at its floor nor close enough.
+    Exit code 1: a claim is contradicted; none of the solvers takes a problem; a verdict or problem differs from the
+    records.jsonl, or nothing of one of its solvers could be verified (--solvers names those that count); a file in a
+    folder cannot be read; or, with --precision or --threshold, a stored solution is neither at its floor nor close
+    enough.
     Exit code 2: a named file cannot be read, or these options find no stored solution.
     """
     from lavender.base.arrays import number
@@ -66,7 +67,7 @@ def check(
         submission = bench.verify(bench.read(files[0]), files[1:], solvers)
         out.print(plain(str(submission)), highlight=False, soft_wrap=True)
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
-    contradicted = answers = above = unmet = 0
+    contradicted = untaken = answers = above = unmet = 0
     reading = Reading(lambda line: out.print(plain(line), style="yellow", highlight=False))
     asked = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
@@ -85,11 +86,14 @@ def check(
                 said = f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}"
                 out.print(plain(said), highlight=False)
             contradicted += len(found.contradicted)
+            untaken += len(found.refused) == len(found.rows)
     if contradicted:
         out.print(f"[bold red]{contradicted} claims are contradicted[/]")
+    if untaken:
+        out.print(f"[bold red]{untaken} problems are taken by none of these solvers[/]")
     if asked and not answers:
         raise InputError("--precision, --threshold: no file holds an answer to judge (an entry `impulse`)")
     if answers:
         shares = f"{above} of {answers} above their floor, {unmet} also more than {threshold:g} m/s off"
         out.print(f"stored answers: {shares}", highlight=False, markup=False)
-    reading.end(contradicted or (asked and unmet))
+    reading.end(contradicted or untaken or (asked and unmet))

@@ -31,6 +31,12 @@ def test_a_contradicted_claim_is_marked(lavender, path, plug_in):
     assert "claim contradicted" in out and "1 claims are contradicted" in out
 
 
+def test_a_problem_that_none_of_the_solvers_takes_is_not_checked(lavender):
+    code, out, _ = lavender("check", "granularF(n=3)", "--solvers", "sor")
+    assert code == cli.EXIT_UNMET and "1 problems are taken by none of these solvers" in out
+    assert lavender("check", "granularF(n=3)", "--solvers", "sor", "pgs")[0] == 0
+
+
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the device that is always full is Linux's")
 def test_a_full_disk_behind_stdout_is_one_line():
     with open("/dev/full", "w") as full:
