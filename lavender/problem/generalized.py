@@ -224,14 +224,7 @@ class Generalized:
     @cached_property
     def trees(self) -> IntArray:
         """Tree of each velocity (nv,): those that M couples, directly or through others; numbered in order."""
-        parent = self.operator.parents
-        label = np.empty(self.nv, np.int32)
-        count = 0
-        for i, p in enumerate(parent):
-            if p < 0:
-                label[i], count = count, count + 1
-            else:
-                label[i] = label[p]
+        label = _trees_of(self.operator.parents)
         if self.order is None:
             return read_only(label)
         given = np.empty_like(label)
@@ -267,7 +260,9 @@ class Generalized:
 
     def change(self, impulse: FloatArray) -> FloatArray:
         """M^-1 J^T impulse (nv,) [m/s, rad/s] of impulses (m,)."""
-        return self._given(self.operator.change(impulse))
+        x = self.operator.force(impulse)
+        self.operator.solve(x)
+        return self._given(x)
 
     def _given(self, x: FloatArray) -> FloatArray:
         # from the factor's order to the order given
@@ -321,9 +316,8 @@ def _lower(mass: Any, names: Sequence[str] | None) -> tuple[Compressed, int]:
     allowed = ASYMMETRY32 if precision_of(*blocks) == "float32" else ASYMMETRY
     if isinstance(mass, (list, tuple)) and all(np.ndim(block) == 2 for block in mass) and mass:
         given = [as_array(f"block {i} of M", block, (None, None)) for i, block in enumerate(mass)]
-        mass = sp.block_diag(
-            [sp.coo_array(block) for block in given], format="csr"
-        )  # dense ones warn from SciPy 1.18 on
+        # dense ones warn from SciPy 1.18 on
+        mass = sp.block_diag([sp.coo_array(block) for block in given], format="csr")
     lower = lower_of("M", mass, "give both triangles (Pinocchio's crba fills the upper one)", allowed, names)
     return lower, len(lower[0]) - 1
 
@@ -410,18 +404,21 @@ def _eliminated(graph: sp.csr_array) -> IntArray:
     return order
 
 
+def _trees_of(parent: IntArray) -> IntArray:
+    """Tree of each velocity from its parent, which stands before it, -1 at a root; numbered in order."""
+    tree = (np.cumsum(parent < 0) - 1).tolist()
+    for i, p in enumerate(parent.tolist()):
+        if p >= 0:
+            tree[i] = tree[p]
+    return np.array(tree, np.int32)
+
+
 def _apart(jac: Compressed, parent: IntArray) -> IntArray | None:
     """Velocity at each place where many trees may stand in any order, as vertices of a flex do; None: as they are.
 
     M does not fill in whatever the order of its trees, but N = M + J^T V J of Newton couples those that share a row.
     """
-    n = len(parent)
-    roots = np.flatnonzero(parent < 0)
-    tree = np.empty(n, np.int32)
-    tree[roots] = np.arange(len(roots))
-    for i, p in enumerate(parent.tolist()):
-        if p >= 0:
-            tree[i] = tree[p]
+    roots, tree = np.flatnonzero(parent < 0), _trees_of(parent)
     indptr, indices, _ = jac
     on = sp.csr_array(
         (np.ones(len(indices), np.int32), tree[indices], indptr.copy()), shape=(len(indptr) - 1, len(roots))

@@ -28,7 +28,6 @@ from lavender_ext.core.order import (
     body_colors,
     body_order_levels,
     graph_colors,
-    stable_order,
 )
 from lavender_ext.factor.graph import matrix_components
 
@@ -114,12 +113,10 @@ def block_order(
 
 def _by_key(key: IntArray, split: int) -> tuple[IntArray, IntArray]:
     # Stable order by key within joints and within contacts; first place of each key, then k.
-    parts, starts, base = [], [np.zeros(1, np.int32)], 0
+    parts, starts, base = list[Any](), list[Any]([[0]]), 0
     for part in (key[:split], key[split:]):
-        blocks, start = stable_order(np.ascontiguousarray(part, np.int32))
-        parts.append(blocks + base)
-        ends = start[1:] + base
-        starts.append(ends[np.diff(start) > 0])
+        parts.append(np.argsort(part, kind="stable") + base)
+        starts.append(np.cumsum(np.unique(part, return_counts=True)[1]) + base)
         base += len(part)
     return np.concatenate(parts).astype(np.int32), np.concatenate(starts).astype(np.int32)
 

@@ -32,10 +32,11 @@ def pairs(problem: Problem) -> int:
 
     Of a matrix, how many blocks have columns of their own: those between the same two bodies share them.
     """
-    if problem.rows is not None:
-        return graph.body_pairs(problem.rows.block_bodies, problem.rows.n_bodies)
-    if problem.generalized is not None:
-        return graph.tree_pairs(problem.derived.view)
+    if problem.matrix is None:
+        rows = problem.rows
+        ends = graph.tree_ends(problem.derived.view) if rows is None else rows.block_bodies
+        low, high = np.sort(ends, axis=1).T
+        return len(np.unique(low.astype(np.int64) << 32 | high))
     indptr, indices, _ = problem._compressed
     summed = np.concatenate([[0], np.cumsum(indices, dtype=np.int64)])
     first = problem.cones.ptr[:-1]

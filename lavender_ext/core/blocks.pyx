@@ -9,8 +9,8 @@ import numpy as np
 
 from lavender_ext.core.arrays cimport frozen, ndarray
 from lavender_ext.core.door cimport is_number, is_size
-from lavender_ext.core.parts cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, fits, lay_frictions,
-                                      spell_bounds)
+from lavender_ext.core.parts cimport (CONTACT, CONTACT_BOX, CONTACT_ROLLING, CONTACT_SPIN, ROUND, ROW, contact_kind, fits,
+                                      lay_frictions, spell_bounds)
 
 cdef enum:
     CONTACT_ELLIPSE = 7                                 # no kernel meets it: `Problem.disk` is solved and judged
@@ -245,8 +245,8 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
     cdef int32_t size = 1 + tangents + spin + 2 * rolls, kind
     cdef const double[::1] each = None, patch = None, moment = None
     cdef double one = 0.0
-    cdef Py_ssize_t i, j
-    kind = sides if sides else ROUND if tangents > 2 else CONTACT_ROLLING if rolls else CONTACT_SPIN if spin else CONTACT
+    cdef Py_ssize_t i
+    kind = sides if sides else contact_kind(False, spin, rolls, tangents)
     if not 0 <= k < 2147483647 // size:
         return None
     if type(mu) is float:
@@ -271,7 +271,5 @@ def contacts(Py_ssize_t k, int32_t tangents, mu, radius, rolling, int32_t sides=
         (<double*>made.at.mu)[i] = one if each is None else each[i]
         (<double*>made.at.patch_radius)[i] = 0.0 if patch is None else patch[i]
         (<double*>made.at.rolling)[i] = moment[i] if rolls else 0.0
-        for j in range(i * size, (i + 1) * size):
-            (<double*>made.at.lower)[j] = 0.0 if j == i * size else -INF
-            (<double*>made.at.upper)[j] = INF
+    spell_bounds(&made.at)
     return made if made.check() else None

@@ -150,13 +150,6 @@ cdef class Operator:
         if self.g.n:
             tree_solve(&self.g, doubles(x, self.g.n))
 
-    def change(self, lam):
-        """M^-1 J^T lam (n,), a new array."""
-        made = self.force(lam)
-        if self.g.n:
-            tree_solve(&self.g, doubles(made, self.g.n))
-        return made
-
     def force(self, lam):
         """J^T lam (n,), a new array."""
         cdef const double* at = doubles(lam, self.g.m)

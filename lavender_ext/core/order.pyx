@@ -3,7 +3,7 @@ from libc.stdint cimport int32_t, uint64_t
 
 import numpy as np
 
-from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies, sort_by_level
+from lavender_ext.core.order cimport block_levels, body_levels, color_by_bodies
 
 
 cdef public int32_t lav_graph_colors(int32_t n_blocks, const int32_t* block_ptr, const int32_t* block_of,
@@ -63,15 +63,3 @@ def graph_colors(const int32_t[::1] block_ptr, const int32_t[::1] block_of, cons
     elif k:
         color[:] = 0
     return np.asarray(color)[:k]
-
-
-def stable_order(const int32_t[::1] key):
-    """Block numbers sorted by key (>= 0), stable: (order (n,), start of each key (max + 2,))."""
-    cdef int32_t n = <int32_t>key.shape[0], top = -1, i
-    for i in range(n):
-        if key[i] > top:
-            top = key[i]
-    cdef int32_t[::1] start = np.zeros(top + 2, np.int32), order = np.empty(n + 1, np.int32)
-    if n:
-        sort_by_level(n, &key[0], top + 1, &start[0], &order[0])
-    return np.asarray(order)[:n], np.asarray(start)

@@ -33,11 +33,25 @@ cdef object new = np.empty, I4 = np.dtype(np.int32)
 LAWS = {"coulomb": COULOMB, "cone": CONE}
 
 
+cdef inline void fill_empty(int32_t m, double* d) noexcept nogil:
+    """The mean of the others, or 1, where d (m) is not above 0; NaN stays."""
+    cdef int32_t i, count = 0
+    cdef double total = 0.0, mean
+    for i in range(m):
+        if d[i] > 0.0:
+            count += 1
+            total += d[i] / m
+    mean = total * m / count if count > 0 and total > 0.0 else 1.0
+    for i in range(m):
+        if d[i] <= 0.0:
+            d[i] = mean
+
+
 cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* d, double* step,
                                      int32_t* empty) noexcept nogil:
     """d and step of (1), (3) from the rows of A; marks empty rows, returns how many."""
-    cdef int32_t i, j, q, g, n_empty = 0, n_positive = 0
-    cdef double diag, big, total = 0.0, mean, x
+    cdef int32_t i, j, q, g, n_empty = 0
+    cdef double diag, big, x
     cdef double most[3]
     cdef parts_t part
     for i in range(p.n_rows):
@@ -55,13 +69,7 @@ cdef public int32_t lav_csr_diagonal(const blocks_t* p, const csr_t* a, double* 
             d[i] = 0.0
         n_empty += empty[i]
         step[i] = big                                   # held for (3) below
-        if d[i] > 0.0:
-            n_positive += 1
-            total += d[i] / p.n_rows
-    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
-    for i in range(p.n_rows):
-        if not d[i] > 0.0:
-            d[i] = mean
+    fill_empty(p.n_rows, d)
     for i in range(p.n_blocks):
         j = p.ptr[i]
         pair_means(p, i, d)
@@ -90,8 +98,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
                                       int32_t* empty, double* minv_jac, double* coupling,
                                       double* swing) noexcept nogil:
     """d, nu, step, M^-1 J^T of joints, coupling and swing of contacts, from the factored form."""
-    cdef int32_t i, j, q, g, c, nt, n_empty = 0, n_positive = 0, a, b
-    cdef double total = 0.0, mean
+    cdef int32_t i, j, q, g, c, nt, n_empty = 0, a, b
     cdef double off[2]
     cdef double most[3]
     cdef parts_t part
@@ -125,13 +132,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
         if empty[j]:
             d[j] = 0.0
         n_empty += empty[j]
-        if d[j] > 0.0:
-            n_positive += 1
-            total += d[j] / p.n_rows
-    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
-    for j in range(p.n_rows):
-        if not d[j] > 0.0:
-            d[j] = mean
+    fill_empty(p.n_rows, d)
     for i in range(p.n_blocks):
         pair_means(p, i, d)
         parts_of(p, i, &part)
@@ -146,8 +147,7 @@ cdef public int32_t lav_rows_diagonal(const blocks_t* p, const rows_t* r, double
 cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t* g, double* d, double* nu, double* step,
                                          int32_t* empty, int32_t* place, double* y) noexcept nogil:
     """Y, d, nu and step of a problem in generalised coordinates; place (n) is scratch. Returns how many rows are empty."""
-    cdef int32_t i, j, b, nc, part_, n_empty = 0, n_positive = 0
-    cdef double total = 0.0, mean
+    cdef int32_t i, j, b, nc, part_, n_empty = 0
     cdef double most[3]
     cdef parts_t part
     cdef const double* row
@@ -158,17 +158,12 @@ cdef public int32_t lav_general_diagonal(const blocks_t* p, const generalized_t*
         for i in range(g.prow[b], g.prow[b + 1]):
             d[i] = dot(row, row, nc) + g.compliance[i]
             empty[i] = d[i] < least()
-            if not empty[i]:
-                n_positive += 1
-                total += d[i] / p.n_rows
-            else:
+            if empty[i]:
+                d[i] = 0.0
                 n_empty += 1
             row += nc
-    mean = total * p.n_rows / n_positive if n_positive > 0 and total > 0.0 else 1.0
     if n_empty > 0:
-        for i in range(p.n_rows):
-            if empty[i]:
-                d[i] = mean
+        fill_empty(p.n_rows, d)
     b = 0
     for i in range(p.n_blocks):
         j = p.ptr[i]
@@ -466,11 +461,6 @@ cdef class Data:
     @property
     def n_bodies(self):
         return self.rows.n_bodies
-
-    @property
-    def n_velocities(self):
-        """nv of J and M."""
-        return self.general.n
 
     @property
     def work(self):

@@ -16,6 +16,7 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
+from lavender_ext.core.arrays cimport ndarray as Array
 from lavender_ext.core.door cimport all_finite, first_outside
 from lavender_ext.core.generalized cimport generalized_t, jac_push, whitened_dot
 from lavender_ext.core.parts cimport blocks_t, is_rows
@@ -31,6 +32,7 @@ from lavender_ext.judge.measure cimport judge_view, relative_of, scratch_of
 from lavender_ext.judge.score cimport relative, score_t
 
 cdef object empty = np.empty, ndarray = np.ndarray
+cdef object F8 = np.dtype(np.float64), I4 = np.dtype(np.int32), I1 = np.dtype(np.int8)
 
 cdef double SINGULAR = 1e-12    # least pivot over the largest from which on G counts as singular
 
@@ -242,6 +244,14 @@ cdef bint adjoint_into(const linear_t* a, velocity, impulse, slack, double* out)
             PyBuffer_Release(&views[i])
 
 
+cdef object copied(const void* x, Py_ssize_t n, dtype):
+    """(n,) numbers that stand there."""
+    made = empty(n, dtype)
+    if n:
+        memcpy((<Array>made).data, x, n * (<Array>made).strides[0])
+    return made
+
+
 cdef class Linear:
     """One of `Linears`. `solve` and `adjoint` are of the factor that was found last."""
     cdef linear_t at
@@ -335,68 +345,45 @@ cdef class Linear:
             block_times(&self.at.x, &self.at.v.p, self.at.x.edge if edge else self.at.x.p, &v[0], back, &out[0])
         return out_
 
-    cdef object numbers(self, const double* x):
-        cdef int32_t m = self.at.v.p.n_rows
-        out_ = np.empty(m)
-        cdef double[::1] out = out_
-        if m:
-            memcpy(&out[0], x, m * sizeof(double))
-        return out_
-
     @property
     def impulse(self):
         """lambda (m,) [N s]."""
-        return self.numbers(self.at.lam)
+        return copied(self.at.lam, self.at.v.p.n_rows, F8)
 
     @property
     def slack(self):
         """w (m,) [m/s]."""
-        return self.numbers(self.at.w)
+        return copied(self.at.w, self.at.v.p.n_rows, F8)
 
     @property
     def root(self):
         """D^1/2 (m,)."""
-        return self.numbers(self.at.x.root)
+        return copied(self.at.x.root, self.at.v.p.n_rows, F8)
 
     @property
     def residual(self):
         """F (m,) of (1) of natural.pxd."""
-        return self.numbers(self.at.x.f)
+        return copied(self.at.x.f, self.at.v.p.n_rows, F8)
 
     @property
     def margin(self):
         """(m,) N s: of each row to the next case."""
-        return self.numbers(self.at.x.margin)
+        return copied(self.at.x.margin, self.at.v.p.n_rows, F8)
 
     @property
     def p(self):
         """Values of P, block by block: the diagonal of rows, else row by row."""
-        cdef int32_t n = self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0
-        out_ = np.empty(n)
-        cdef double[::1] out = out_
-        if n:
-            memcpy(&out[0], self.at.x.p, n * sizeof(double))
-        return out_
+        return copied(self.at.x.p, self.at.x.at[self.at.v.p.n_blocks] if self.at.v.p.n_rows else 0, F8)
 
     @property
     def case(self):
         """(m,) int8, by the numbers of CASES."""
-        cdef int32_t i
-        out_ = np.empty(self.at.v.p.n_rows, np.int8)
-        cdef int8_t[::1] out = out_
-        for i in range(self.at.v.p.n_rows):
-            out[i] = self.at.x.case_[i]
-        return out_
+        return copied(self.at.x.case_, self.at.v.p.n_rows, I1)
 
     @property
     def place(self):
         """(m,) row of G that each row is, -1 without one."""
-        cdef int32_t i
-        out_ = np.empty(self.at.v.p.n_rows, np.int32)
-        cdef int32_t[::1] out = out_
-        for i in range(self.at.v.p.n_rows):
-            out[i] = self.at.place[i]
-        return out_
+        return copied(self.at.place, self.at.v.p.n_rows, I4)
 
 
 cdef class Linears:

@@ -10,14 +10,7 @@ import numpy as np
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.problem cimport Data
-from lavender_ext.factor.graph cimport order_graph, order_room
-
-
-cdef inline int32_t root_of(int32_t* parent, int32_t i) noexcept nogil:
-    while parent[i] != i:
-        parent[i] = parent[parent[i]]
-        i = parent[i]
-    return i
+from lavender_ext.factor.graph cimport order_graph, order_room, root_of
 
 
 cdef inline void join(int32_t* parent, int32_t i, int32_t j) noexcept nogil:
@@ -147,33 +140,13 @@ def tree_components(Data p):
     return count, label_array
 
 
-def body_pairs(const int32_t[:, ::1] body, int n_bodies):
-    """Pairs of bodies with a block between them, of blocks between bodies (k, 2), static ones too."""
-    cdef int32_t k = <int32_t>body.shape[0], i, b, low, high, count = 0
-    cdef int32_t[::1] first = np.full(n_bodies + 1, -1, np.int32), mark = np.full(n_bodies + 1, -1, np.int32)
-    cdef int32_t[::1] following = np.empty(k, np.int32)
-    with nogil:
-        for i in range(k):
-            low = min(body[i, 0], body[i, 1])
-            following[i] = first[low + 1]               # a list of the blocks of each lower body
-            first[low + 1] = i
-        for b in range(n_bodies + 1):
-            i = first[b]
-            while i >= 0:
-                high = max(body[i, 0], body[i, 1])
-                if mark[high + 1] != b:
-                    mark[high + 1] = b
-                    count += 1
-                i = following[i]
-    return count
-
-
-def tree_pairs(Data p):
-    """The same of a problem in generalised coordinates: pairs of the first and the last tree that rows of a block touch."""
+def tree_ends(Data p):
+    """(k, 2) the first and the last tree that rows of each block touch, -1 without one, in generalised coordinates."""
     cdef const generalized_t* g = &p.general
     cdef int32_t i, j, q, t, k = p.blocks.n_blocks
     cdef int32_t[::1] tree = np.empty(g.n + 1, np.int32)
-    cdef int32_t[:, ::1] body = np.full((k, 2), -1, np.int32)
+    ends = np.full((k, 2), -1, np.int32)
+    cdef int32_t[:, ::1] body = ends
     with nogil:
         for i in range(g.n):
             tree[i] = i if g.parent[i] < 0 else tree[g.parent[i]]
@@ -185,7 +158,7 @@ def tree_pairs(Data p):
                         body[i, 0] = t
                     if t > body[i, 1]:
                         body[i, 1] = t
-    return body_pairs(body, g.n)
+    return ends
 
 
 cdef enum:

@@ -7,15 +7,9 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
 from lavender_ext.core.parts cimport CONE, COULOMB, blocks_t, has_friction, is_rows
+from lavender_ext.factor.graph cimport root_of
 from lavender_ext.generalized.flow cimport flow_t, row_end, row_from
 from lavender_ext.generalized.sparse cimport factor_work, find_pattern, pattern_marks
-
-
-cdef inline int32_t root_of(int32_t* up, int32_t i) noexcept nogil:
-    while up[i] != i:
-        up[i] = up[up[i]]
-        i = up[i]
-    return i
 
 
 cdef inline void join_trees(const generalized_t* g, int32_t* up) noexcept nogil:

@@ -10,7 +10,7 @@ than a dense one would.
 from libc.stdint cimport int32_t
 
 from lavender_ext.core.generalized cimport generalized_t
-from lavender_ext.core.tree cimport tree_pattern
+from lavender_ext.core.tree cimport take_two, tree_pattern
 
 
 cdef enum:
@@ -103,12 +103,6 @@ cdef inline void take_row(double* x, const double* y, double f, int32_t n) noexc
     cdef int32_t i
     for i in range(n):
         x[i] -= f * y[i]
-
-
-cdef inline void take_two(double* x, const double* y, double f, const double* z, double g, int32_t n) noexcept nogil:
-    cdef int32_t i
-    for i in range(n):
-        x[i] = (x[i] - f * y[i]) - g * z[i]
 
 
 cdef inline int32_t place_of(const int32_t* theirs, int32_t column) noexcept nogil:

@@ -36,11 +36,6 @@ cdef class Watch:
         return self.state.total
 
     @property
-    def best_relative(self):
-        """Relative residual of the best check; inf before any."""
-        return self.state.best_relative
-
-    @property
     def best(self):
         """(relative residual, impulse) of the best check; (inf, None) before any."""
         if self.state.best_at < 0:

@@ -13,7 +13,7 @@ from libc.stdint cimport int32_t
 
 from lavender_ext.core.block cimport norm2
 from lavender_ext.local.coulomb cimport slides
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, eliminate, rests
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, bracketed, eliminate, rests
 
 
 cdef inline int32_t on_ray(const double* W, const double* q, double mu, double s0, double s1,
@@ -141,15 +141,7 @@ cdef inline int32_t cone3(const double* W, const double* q, double mu, double* l
               - side * mu * (v1[0] + 2.0 * beta * v2[0]))
         step = f / df
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        step = beta - step
-        if not lo < step or (hi >= 0.0 and not step < hi):
-            if hi >= 0.0:
-                step = 0.5 * (lo + hi)
-                done = hi - lo <= 1e-15 * hi
-            else:
-                step = 4.0 * beta
-                done = 0
-        beta = step
+        beta = bracketed(beta, step, lo, hi, &done)
     if not U > 0.0 or not done:
         return FAILED
     U = side / U

@@ -17,7 +17,7 @@ hand whenever Delta > 0 between; for S = s I Newton on the quotient of both side
 from libc.math cimport fabs, sqrt
 from libc.stdint cimport int32_t
 
-from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK
+from lavender_ext.local.small cimport FAILED, OPEN, SLIP, STICK, bracketed
 
 
 cdef enum:
@@ -166,15 +166,7 @@ cdef inline int32_t coulomb3(const double* g, const double* q, double mu, double
         step = f * U2 / (mu * (a * (tr + 2.0 * beta) + hr) * U2 + P * (x0 * r0 + x1 * r1))
         # Quadratic convergence: the next point is exact to rounding.
         done = fabs(f) <= 1e-8 * U and fabs(step) <= 1e-7 * beta
-        step = beta - step
-        if not lo < step or (hi >= 0.0 and not step < hi):
-            if hi >= 0.0:
-                step = 0.5 * (lo + hi)
-                done = hi - lo <= 1e-15 * hi
-            else:
-                step = 4.0 * beta
-                done = 0
-        beta = step
+        beta = bracketed(beta, step, lo, hi, &done)
     n = U + mu * hu
     if not n > 0.0 or not a / n < 1.0 / 0.0 or not done:
         return FAILED

@@ -16,6 +16,14 @@ cdef enum:
     MAX_ROWS = 8                # of a block that is solved exactly
 
 
+cdef inline double bracketed(double x, double step, double lo, double hi, int32_t* done) noexcept nogil:
+    """x - step where that is between lo and hi; else their middle, and done where they are one number; 4 x without a hi (< 0)."""
+    if lo < x - step and (hi < 0.0 or x - step < hi):
+        return x - step
+    done[0] = hi >= 0.0 and hi - lo <= 1e-15 * hi
+    return 0.5 * (lo + hi) if hi >= 0.0 else 4.0 * x
+
+
 cdef inline int32_t eliminate(int32_t n, double* a, double* x) noexcept nogil:
     """x <- a^-1 x by elimination with row pivoting, a (n, n) destroyed; a dependent row leaves its x at 0.
 
