@@ -49,7 +49,83 @@ MASS_RATIO = 1e3  # from here on the velocity form is more accurate, whatever th
 
 
 @dataclass(frozen=True)
-class QP:
+class _Disk:
+    """|(x_t / a_t over all tangents)| <= x_n: two tangents, a the same, or a round cone of up to five."""
+
+    normal: int
+    tangents: tuple[int, ...]
+    ratios: tuple[float, ...]  # a
+
+
+@dataclass(frozen=True)
+class _FrictionRows:
+    """Rows of friction among the kept ones, with a = mu S_n / S_t (times r on spin) in scaled unknowns."""
+
+    pairs: list[tuple[int, int, float]]  # normal, the row bounded by |x| <= a x_n, a
+    disks: list[_Disk]
+
+    @property
+    def cones(self) -> tuple[int, ...]:
+        return tuple(1 + len(disk.tangents) for disk in self.disks)
+
+    @property
+    def members(self) -> list[int]:
+        return [i for p in self.pairs for i in p[:2]] + [
+            i for d in self.disks for i in (d.normal, *d.tangents)
+        ]
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What both forms share: rows that stay, impulses of those that do not, scaling."""
+
+    problem: Problem
+    kept: IntpArray  # (k,) rows of the problem that are unknown here
+    fixed: FloatArray  # (m,) N s, impulse of the rows that are not; 0 elsewhere
+    root: FloatArray  # (k,) S, kg^1/2
+    sigma: float  # J^1/2
+
+    @classmethod
+    def of(cls, problem: Problem, unit_diagonal: bool) -> _Parts:
+        c = problem.cones
+        known = (c.lower == c.upper) & np.isfinite(c.lower)
+        fixed = np.where(known, c.lower, 0.0)
+        size = np.diff(c.ptr)
+        alone = np.repeat(~c.is_contact | (size == 1), size)
+        for i in np.asarray(problem.metric.empty, int):
+            # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
+            if alone[i]:
+                bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
+                known[i] = True
+                fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
+        known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
+        kept = np.flatnonzero(~known)
+        d = problem.d[kept]
+        if not unit_diagonal and len(d):
+            d = np.full(len(d), np.exp(np.mean(np.log(d))))
+        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem))
+
+    def friction_rows(self) -> _FrictionRows:
+        c = self.problem.cones
+        reach = c.reach
+        place = np.full(self.problem.m, -1)
+        place[self.kept] = np.arange(len(self.kept))
+        pairs: list[tuple[int, int, float]] = []
+        disks: list[_Disk] = []
+        for i, part in c.parts():
+            if place[part[0]] < 0:
+                continue
+            j, at = int(place[c.ptr[i]]), [int(place[t]) for t in part]
+            ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
+            if len(part) == 1:
+                pairs.append((j, at[0], ratio[0]))
+            else:
+                disks.append(_Disk(j, tuple(at), tuple(ratio)))
+        return _FrictionRows(pairs, disks)
+
+
+@dataclass(frozen=True)
+class QP(_Parts):
     """A convex program and the way back; see the module. All arrays are free of units."""
 
     form: str  # "impulse" or "velocity"
@@ -62,11 +138,6 @@ class QP:
     soc: tuple[int, ...]  # sizes of the second-order cones, last
     lb: FloatArray | None  # (n,), or no bounds at all
     ub: FloatArray | None  # (n,)
-    problem: Problem
-    kept: IntpArray  # (k,) rows of the problem that are unknown here
-    fixed: FloatArray  # (m,) N s, impulse of the rows that are not; 0 elsewhere
-    root: FloatArray  # (k,) S, kg^1/2
-    sigma: float  # J^1/2
     back: sp.csr_matrix  # T (k, r), velocity form
     shift: FloatArray  # r (k,), velocity form
     lift: sp.csr_matrix  # K~ (k, n - number of t), velocity form
@@ -245,7 +316,8 @@ def impulse_form(problem: Problem, *, unit_diagonal: bool = True, equality: bool
                 put.row([(t, -disk.ratios[0] / ratio)])
         matrix = put.matrix(k)
         rhs = np.zeros(matrix.shape[0])
-    return parts.program(
+    return QP(
+        **vars(parts),
         form="impulse",
         P=p,
         q=q,
@@ -302,7 +374,8 @@ def velocity_form(problem: Problem) -> QP:
     diagonal = np.zeros(n)
     diagonal[:ny] = 1.0
     n_nonneg = len(lower) + len(upper) + 2 * len(rows.pairs) + n_alone
-    return parts.program(
+    return QP(
+        **vars(parts),
         form="velocity",
         P=sp.csc_matrix(sp.diags_array(diagonal)),
         q=q,
@@ -391,88 +464,6 @@ class _Entries:
         return sp.csc_matrix(
             sp.csr_matrix((np.array(self.value, float), np.array(self.column, int), self.ptr), shape)
         )
-
-
-@dataclass(frozen=True)
-class _Disk:
-    """|(x_t / a_t over all tangents)| <= x_n: two tangents, a the same, or a round cone of up to five."""
-
-    normal: int
-    tangents: tuple[int, ...]
-    ratios: tuple[float, ...]  # a
-
-
-@dataclass(frozen=True)
-class _FrictionRows:
-    """Rows of friction among the kept ones, with a = mu S_n / S_t (times r on spin) in scaled unknowns."""
-
-    pairs: list[tuple[int, int, float]]  # normal, the row bounded by |x| <= a x_n, a
-    disks: list[_Disk]
-
-    @property
-    def cones(self) -> tuple[int, ...]:
-        return tuple(1 + len(disk.tangents) for disk in self.disks)
-
-    @property
-    def members(self) -> list[int]:
-        return [i for p in self.pairs for i in p[:2]] + [
-            i for d in self.disks for i in (d.normal, *d.tangents)
-        ]
-
-
-@dataclass(frozen=True)
-class _Parts:
-    """What both forms share: rows that stay, impulses of those that do not, scaling."""
-
-    problem: Problem
-    kept: IntpArray
-    fixed: FloatArray
-    root: FloatArray
-    sigma: float
-
-    @classmethod
-    def of(cls, problem: Problem, unit_diagonal: bool) -> _Parts:
-        c = problem.cones
-        known = (c.lower == c.upper) & np.isfinite(c.lower)
-        fixed = np.where(known, c.lower, 0.0)
-        size = np.diff(c.ptr)
-        alone = np.repeat(~c.is_contact | (size == 1), size)
-        for i in np.asarray(problem.metric.empty, int):
-            # A row of zeros: b alone decides, and where no finite bound meets it the front door has said so.
-            if alone[i]:
-                bound = c.upper[i] if problem.b[i] > 0.0 else c.lower[i] if problem.b[i] < 0.0 else 0.0
-                known[i] = True
-                fixed[i] = np.clip(bound if np.isfinite(bound) else 0.0, c.lower[i], c.upper[i])
-        known[c.friction_rows] = c.reach[c.friction_rows] == 0.0
-        kept = np.flatnonzero(~known)
-        d = problem.d[kept]
-        if not unit_diagonal and len(d):
-            d = np.full(len(d), np.exp(np.mean(np.log(d))))
-        return cls(problem, kept, fixed, 1.0 / np.sqrt(d), _sigma(problem))
-
-    def program(self, **own: Any) -> QP:
-        """A program of these rows."""
-        return QP(
-            problem=self.problem, kept=self.kept, fixed=self.fixed, root=self.root, sigma=self.sigma, **own
-        )
-
-    def friction_rows(self) -> _FrictionRows:
-        c = self.problem.cones
-        reach = c.reach
-        place = np.full(self.problem.m, -1)
-        place[self.kept] = np.arange(len(self.kept))
-        pairs: list[tuple[int, int, float]] = []
-        disks: list[_Disk] = []
-        for i, part in c.parts():
-            if place[part[0]] < 0:
-                continue
-            j, at = int(place[c.ptr[i]]), [int(place[t]) for t in part]
-            ratio = [float(reach[t] * self.root[j] / self.root[s]) for t, s in zip(part, at, strict=True)]
-            if len(part) == 1:
-                pairs.append((j, at[0], ratio[0]))
-            else:
-                disks.append(_Disk(j, tuple(at), tuple(ratio)))
-        return _FrictionRows(pairs, disks)
 
 
 def bound_rows(qp: QP) -> list[tuple[float, sp.csr_matrix, FloatArray, Any]]:

@@ -23,9 +23,8 @@ TURNS = 8  # of (6): what is 1e-11 of the diagonal is off by 2^-8 then, what is 
 ENOUGH = 1e-14  # of the largest entry, below which a turn changes nothing
 PROBES = 2  # random vectors that show what is not determined
 SMALL = 64  # rows up to which the system is dense, whatever A is
-DENSE = (
-    400  # rows up to which it is dense where A is no symmetric matrix with few entries, or a contact slides
-)
+# rows up to which it is dense where A is no symmetric matrix with few entries, or a contact slides
+DENSE = 400
 
 Solve = Callable[[FloatArray, bool], FloatArray]
 

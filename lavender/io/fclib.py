@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, as_array
+from lavender.base.arrays import FloatArray, as_array, one_of
 from lavender.base.errors import CapabilityError, InputError
 from lavender.base.later import sparse as sp
 from lavender.io.condensed import ENTRY, condensed
@@ -413,8 +413,7 @@ def contents(
     if form is None:
         soft = problem.generalized is not None and np.any(problem.compliance)
         form = "local" if problem.matrix is not None or soft else "global"
-    if form not in ("local", "global"):
-        raise InputError(f"form is {form!r}; 'local' or 'global' is needed")
+    one_of("form", form, ("local", "global"))
     unknown = sorted(set(drop) - {"names", "key", "precision"})
     if unknown:
         raise InputError(

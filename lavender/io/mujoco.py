@@ -58,14 +58,12 @@ from lavender.problem import Names, Problem
 from lavender.problem.cones import Cones
 from lavender.problem.generalized import Generalized
 from lavender.problem.operators import USUAL
-from lavender_ext.core.generalized import lower_of_dense
 from lavender_ext.generalized import export
 
 ROUNDING = 2.0**-46  # 64 roundings: M a0 against the smooth force, which MuJoCo solved for by the same factor
 SAME = 1e-9  # -, R D - 1
-SUMMED = (
-    2.0**-40
-)  # of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
+# of the terms' size: sums of 1,000 of them in another order; what was changed is off by far more
+SUMMED = 2.0**-40
 ALIKE = 1e-10  # -, least share of a joint's axis that those before it in its body leave, to tell their velocities apart
 # Bytes of MuJoCo's memory that a row (12 numbers and more), a contact and an entry of efc_J with its column take.
 ROW_BYTES, CONTACT_BYTES, ENTRY_BYTES = 128, 512, 12
@@ -96,10 +94,7 @@ class _Model:
         self.mj, self.n = mj, int(model.nv)
         self.most = model.neq, self.n, model.ntendon, model.njnt, model.ntendon
         self.tree = model.body_parentid, model.dof_bodyid
-        has = hasattr(model, "M_rowadr") and hasattr(mj.MjData, "M")
-        self.mass = (
-            (model.M_rowadr, model.M_rownnz, model.M_colind) if has else None
-        )  # None: an earlier MuJoCo
+        self.mass = model.M_rowadr, model.M_rownnz, model.M_colind
         self.like: Any = None  # its operator made first, whose pattern is compared before use
 
 
@@ -221,7 +216,7 @@ def _mujoco(model: Any, data: Any) -> tuple[_Model, int, int, Any]:
     smooth = data.qacc_smooth
     if len(smooth) != seen.n:
         raise InputError(f"the data has {len(smooth)} degrees of freedom, the model {seen.n}")
-    m, contacts, entries = data.nefc, data.ncon, getattr(data, "nJ", 0)
+    m, contacts, entries = data.nefc, data.ncon, data.nJ
     needed = m * ROW_BYTES + contacts * CONTACT_BYTES + entries * ENTRY_BYTES
     if min(m, contacts, entries) < 0 or needed > data.parena:  # where its arrays end, for whoever reads them
         raise InputError(
@@ -259,8 +254,7 @@ def _mass(seen: _Model, model: Any, data: Any, smooth: Any, like: Any) -> Any:
 
     M a0 must be the smooth force: otherwise another matrix than M has made a0, and made the problem.
     """
-    parts = _whole_mass(seen.mj, model, data) if seen.mass is None else (*seen.mass, data.M)
-    made = export.lower(*parts, smooth, data.qfrc_smooth, ROUNDING, like)
+    made = export.lower(*seen.mass, data.M, smooth, data.qfrc_smooth, ROUNDING, like)
     if made is None:
         raise InputError(f"M_rowadr, M_rownnz and M_colind are no lower triangle of M. {OTHER_MODEL}")
     mass, gap = made
@@ -274,20 +268,6 @@ def _mass(seen: _Model, model: Any, data: Any, smooth: Any, like: Any) -> Any:
             f"{CHANGED if word in map(str.lower, OF_M) else why}"
         )
     return mass
-
-
-def _whole_mass(mj: Any, model: Any, data: Any) -> Any:
-    n = int(model.nv)
-    parent = np.asarray(model.dof_parentid)
-    if (
-        np.any((parent < -1) | (parent >= np.arange(n)))
-        or not 0 <= np.min(model.dof_Madr, initial=0) <= len(data.qM) - n
-    ):
-        raise InputError(f"dof_parentid and dof_Madr are no tree of velocities. {OTHER_MODEL}")
-    whole = np.zeros((n, n))
-    mj.mj_fullM(model, whole, data.qM)
-    indptr, indices, values = lower_of_dense(whole)[0]
-    return indptr[:-1], np.diff(indptr), indices, values
 
 
 def _rows(seen: _Model, model: Any, data: Any, m: int, scale: FloatArray) -> Any:

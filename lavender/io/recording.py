@@ -217,9 +217,8 @@ def control_of(control: Control) -> Control:
 def _controls(path: str) -> Any:
     try:
         first_bytes(path)  # of a regular file
-        found = np.load(
-            path, mmap_mode="r", allow_pickle=False
-        )  # as long as the file is, whatever its head says
+        # as long as the file is, whatever its head says
+        found = np.load(path, mmap_mode="r", allow_pickle=False)
     except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"controls {path}: {error}; {', '.join(CONTROLS)}, or a .npy file") from None
     if not isinstance(found, np.ndarray):

@@ -57,9 +57,8 @@ RESULT, PASS = 1e-4, 1.5e-9  # s of one result, and for each multiply-add of the
 WHITENED, READ = 4e-10, 5e-9  # s for each product that J L^-1 takes, and for each entry of it, or of a matrix
 OF_ROW = 32  # multiply-adds of that pass for each row on two bodies
 
-at_floor = (
-    measure.at_floor
-)  # (relative, floor): the test of every solver and of the judge, its reason with it
+# (relative, floor): the test of every solver and of the judge, its reason with it
+at_floor = measure.at_floor
 
 ENOUGH = 1e-6  # m/s, below which a robot's velocities are no further off than anybody measures
 AT_FLOOR, CLOSE, EARLY, WRONG = "at its floor", "close enough", "stopped early", "wrong"

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lavender.base.arrays import FloatArray, read_only, table_of
-from lavender.base.errors import InputError, SolveFailed
+from lavender.base.arrays import FloatArray, one_of, read_only, table_of
+from lavender.base.errors import SolveFailed
 from lavender.base.later import above
 from lavender.judge.residuals import Residual, residual
 from lavender.problem import Problem
@@ -91,8 +91,7 @@ class History:
         ----------
         against : {"iterations", "time"}
         """
-        if against not in ("iterations", "time"):
-            raise InputError(f"against is {against!r}; 'iterations' or 'time' is needed")
+        one_of("against", against, ("iterations", "time"))
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 

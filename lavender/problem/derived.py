@@ -87,27 +87,22 @@ class cached_property(Generic[T]):
     def __get__(self, instance: object, owner: type) -> T: ...
 
     def __get__(self, instance: Any, owner: type) -> Any:
-        if instance is None:
-            return self
-        return instance.__dict__.setdefault(self.name, self.function(instance))
+        return self if instance is None else self._worked_out(instance)
+
+    def _worked_out(self, instance: Any) -> T:
+        found: T = instance.__dict__.setdefault(self.name, self.function(instance))
+        return found
 
 
 class once(cached_property[T]):
     """The same of an object with `derived`, worked out by one thread while the others wait."""
 
-    @overload
-    def __get__(self, instance: None, owner: type) -> once[T]: ...
-
-    @overload
-    def __get__(self, instance: object, owner: type) -> T: ...
-
-    def __get__(self, instance: Any, owner: type) -> Any:
-        if instance is None:
-            return self
+    def _worked_out(self, instance: Any) -> T:
         kept, derived = instance.__dict__, instance.derived
         if derived.process is not _process:
             derived.lock, derived.process = RLock(), _process
         with derived.lock:
             if self.name not in kept:
                 kept[self.name] = self.function(instance)
-            return kept[self.name]
+            found: T = kept[self.name]
+            return found

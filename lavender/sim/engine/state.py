@@ -50,15 +50,8 @@ KEPT = (
 class Seen(NamedTuple):
     """Copies of what an observation shows, for one number of contacts and of their rows."""
 
-    positions: Copy
-    quaternions: Copy
-    velocities: Copy
-    joint_impulses: Copy
-    solver: Copy
-    pair: Copy
-    point: Copy
-    normal: Copy
-    tangent: Copy
+    whole: dict[str, Copy]  # by the names of an observation,
+    contacts: dict[str, Copy]  # and of its contacts
     gap: np.ndarray  # (c,) m
     impulses: Copy | None  # None where contacts differ in their number of rows
     per: int  # rows that a contact of this scene can have
@@ -97,16 +90,16 @@ class State:
             even = rows == contacts * per
             block = a["impulse"][first : first + rows].reshape(contacts, per).copy if even else None
             out = self.setting[SETTING["out"] : SETTING["out"] + 8]
+            whole = {
+                "positions": "x",
+                "quaternions": "q",
+                "velocities": "v",
+                "joint_impulses": "joint_impulse",
+            }
+            each = {"pair": "contact_pair", "point": "point", "normal": "normal", "tangent": "tangent"}
             seen = Seen(
-                positions=a["x"].copy,
-                quaternions=a["q"].copy,
-                velocities=a["v"].copy,
-                joint_impulses=a["joint_impulse"].copy,
-                solver=out.copy,
-                pair=a["contact_pair"][:contacts].copy,
-                point=a["point"][:contacts].copy,
-                normal=a["normal"][:contacts].copy,
-                tangent=a["tangent"][:contacts].copy,
+                whole={**{name: a[array].copy for name, array in whole.items()}, "solver": out.copy},
+                contacts={name: a[array][:contacts].copy for name, array in each.items()},
                 gap=a["gap"][:contacts],
                 impulses=block,
                 per=per,

@@ -375,24 +375,14 @@ class Stepping:
 
     def _observe(self) -> dict[str, Any]:
         s = self.state
-        c, rows = s.head.item(HEAD["contacts"]), s.head.item(HEAD["contact_rows"])
-        seen = s.seen(c, rows)
-        impulses = seen.impulses() if seen.impulses is not None else self._spread(c, seen.per)
-        return {
-            "positions": seen.positions(),
-            "quaternions": seen.quaternions(),
-            "velocities": seen.velocities(),
-            "contacts": {
-                "pair": seen.pair(),
-                "point": seen.point(),
-                "normal": seen.normal(),
-                "tangent": seen.tangent(),
-                "depth": 0.0 - seen.gap,
-                "impulses": impulses,
-            },
-            "joint_impulses": seen.joint_impulses(),
-            "solver": seen.solver(),
-        }
+        c = s.head.item(HEAD["contacts"])
+        seen = s.seen(c, s.head.item(HEAD["contact_rows"]))
+        observation: dict[str, Any] = {name: copied() for name, copied in seen.whole.items()}
+        contacts = {name: copied() for name, copied in seen.contacts.items()}
+        contacts["depth"] = 0.0 - seen.gap
+        contacts["impulses"] = seen.impulses() if seen.impulses is not None else self._spread(c, seen.per)
+        observation["contacts"] = contacts
+        return observation
 
     def _spread(self, c: int, per: int) -> FloatArray:
         # contacts that lack some of the scene's rows have zeros there

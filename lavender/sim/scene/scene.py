@@ -71,9 +71,8 @@ class Parameters:
     friction: float = 0.5  # -, of bodies that say nothing else
     restitution: float = 0.0  # -, of bodies that say nothing else
     patch_radius: float = 0.0  # m, of bodies that say nothing else; 0: no spin friction
-    rolling_radius: float = (
-        0.0  # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
-    )
+    # m, mu_r of every contact with friction: a moment of at most mu_r lambda_n; 0: none
+    rolling_radius: float = 0.0
     # "box": each tangent is bounded by itself, as in most engines; it then has no spin friction
     friction_shape: str = "disk"
     # None: 2 for "impulses", 0 for the others, which have no position projection
