@@ -234,6 +234,8 @@ def _module() -> Any:
         raise InputError(
             "mujoco cannot be imported: pip install mujoco; a model and its data come from it"
         ) from None
+    if not hasattr(mujoco.MjModel, "M_rowadr"):
+        raise InputError(f"mujoco is {mujoco.__version__}; 3.4 or later is needed: pip install -U mujoco")
     return mujoco
 
 

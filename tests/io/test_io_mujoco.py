@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import sys
 import weakref
 from itertools import product
 
@@ -235,6 +236,16 @@ def test_numbers_that_the_door_refuses_are_refused_of_an_engine_too(field, by):
         data.efc_R[:], data.efc_D[:] = by, 1.0 / by
     with pytest.raises(lv.InputError, match=f"{field}.* at least 1e-60"):
         lv.io.from_mujoco(model, data)
+
+
+def test_an_engine_that_is_too_old_is_told_by_its_version(monkeypatch):
+    class Old:
+        MjModel = MjData = object
+        __version__ = "3.1.6"
+
+    monkeypatch.setitem(sys.modules, "mujoco", Old)
+    with pytest.raises(lv.InputError, match=r"mujoco is 3\.1\.6; 3\.4 or later"):
+        lv.io.from_mujoco(object(), object())
 
 
 def test_something_else_is_an_input_error():
