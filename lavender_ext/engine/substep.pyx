@@ -340,6 +340,14 @@ cdef class Buffers:
         self.room = np.empty(room_for(joints, size[N_JOINT_ROW], contacts, contacts * size[ROWS_PER_CONTACT],
                                       size[N_DYNAMIC]) if joints <= MOST else 1)
 
+    def pairs(self):
+        """Run the broad phase, whose time the benchmark of kernels tells; returns the number of pairs needed."""
+        cdef int32_t n
+        with nogil:
+            start_bodies(&self.e)
+            n = update_pairs(&self.e)
+        return n
+
     def prepare(self):
         cdef int32_t status
         with nogil:
