@@ -20,8 +20,8 @@
                                 more than NEAR is left: does a linear program?
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
                                 at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed),
-                                `admm`, `nncg`, and sweeps as long as these gain; all together LAST times Newton's cost,
-                                and no longer than LONG
+                                `admm` (of J and M once a factor of A costs no more), `nncg`, and sweeps as long as these
+                                gain; all together LAST times Newton's cost, and no longer than LONG
     at last                     a certificate of others, by a linear program, if none was asked (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -51,7 +51,7 @@ from lavender.solvers.certify import LINEAR_PROGRAM, certify, least_violation, l
 from lavender.solvers.islands import pairs
 from lavender.solvers.newton import NewtonState
 from lavender.solvers.registry import SMALL_ROWS, Solver, SolverSpec, get
-from lavender.solvers.setup_times import forming, over_rows, sweeping
+from lavender.solvers.setup_times import factored, forming, over_rows, sweeping
 from lavender.solvers.small import AUTO, NO_TIME, QUARTER, call_ends_within
 from lavender.solvers.solve_log import GAIN, SolveLog
 from lavender.solvers.steps import METHODS, NEAR, PROBE, Iterations, Newton, Step, Sweeps, setup_time
@@ -258,7 +258,8 @@ class Tree:
         cost = times * MOST * (self.newton if self.newton < inf else costs.SWEEPS * self.sweep)
         why = f"in turn, {times * MOST:g} times newton's cost"
         yield from self.factorisations(times * MOST)
-        yield self.iterations("admm", cost, why)
+        if self.problem.generalized is None or 1e9 * factored(self.problem) <= cost:
+            yield self.iterations("admm", cost, why)
         yield self.iterations("nncg", cost, why)
         if not self.swept and not self.problem.cones.has_round:
             before = self.best
