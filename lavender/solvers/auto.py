@@ -19,9 +19,9 @@
                                 SURE times that cost, or MOST where it costs more; of others under Coulomb's law, if
                                 more than NEAR is left: does a linear program?
     all in turn                 with doubled work, until nobody gains in two turns: `newton` (of J and M over rows, too,
-                                at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed),
-                                `admm` (of J and M once a factor of A costs no more), `nncg`, and sweeps as long as these
-                                gain; all together LAST times Newton's cost, and no longer than LONG
+                                at up to MOST times the cost or LITTLE, which comes sooner if the compiled call failed,
+                                or before the end), `admm` (of J and M once a factor of A costs no more), `nncg`, and
+                                sweeps as long as these gain; all together LAST times Newton's cost, no longer than LONG
     at last                     a certificate of others, by a linear program, if none was asked (`certify.py`)
 
 Each goes on where it stopped, and the result is the best impulse of all. Costs are counted, never timed, so the same
@@ -128,17 +128,18 @@ class Tree:
             return inf
         return costs.newton_cost(costs.formed(p), self.law)
 
-    def add_rows(self, most: float) -> None:
+    def add_rows(self, most: float) -> bool:
         """Analyse A of J and M as well, if that is counted to cost less and has time; last comes what has failed."""
         p, states = self.problem, self.states
         if "newton over rows" in states or self.formed >= most or self.is_late:
-            return
+            return False
         if self.deadline.is_set and self.deadline.passed(over_rows(p) + 3.0 * forming(p)):
-            return
+            return False
         both = states | self.prepared("newton over rows")
         self.states = dict(
             sorted(both.items(), key=lambda of: (self.tried and of[1].general is not None, of[1].cost))
         )
+        return len(both) > len(states)
 
     @property
     def newton(self) -> float:
@@ -220,7 +221,7 @@ class Tree:
                 share = min(1.0, self.left / stage.cost)
                 self.left -= share * stage.cost
                 yield replace(stage, iterations=share * stage.iterations, cost=share * stage.cost)
-            if k > 0 and self.best > GAIN * before:
+            if k > 0 and self.best > GAIN * before and not self.add_rows(self.left):
                 return
 
     def factorisations(self, times: float) -> Iterator[Stage]:
