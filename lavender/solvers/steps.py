@@ -39,7 +39,8 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 FIRST = 32  # sweeps before the first prediction of how many are left
 MOST = 2**30  # iterations of one call
 LEAST = 1e-16  # relative residual that can be predicted
-NEAR = 0.02  # relative residual, up to which Newton's method begins from another's impulse
+# Relative residual up to which Newton's method begins from another's impulse, and a solution may be near.
+NEAR = 0.02
 PROBE = 0.5  # share of the time left that sweeps have before who factors
 PACE = 4e-9  # s for each ns that an iteration is counted for, at most
 FORMING = 4.0  # times what forming A takes, that has to be left for sweeps over it
