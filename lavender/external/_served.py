@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lavender.base.apart import served as apart
 from lavender.external.apart import ARRAYS, WORDS
-from lavender.external.running import Answer, quiet
+from lavender.external.running import quiet
 
 
 def serve(lifeline: int) -> None:
@@ -21,26 +19,13 @@ def _runner() -> apart.Handler:
 
     by_name = {backend.name: backend for backend in BACKENDS}
 
-    def run(message: Any) -> tuple[dict[str, Any], bytes]:
+    def run(message: Any) -> tuple[dict[str, Any], list[Any]]:
         name, qp, impulse, limit, settings = message
         with quiet(by_name[name].noisy) as said:
             found = by_name[name].run(qp, impulse, limit, settings)
-        return _as_data(found, "; ".join(said))
+        work = {str(kind): int(count) for kind, count in found.work.items()}
+        words = str(found.words or "; ".join(said))[:WORDS]
+        arrays = [getattr(found, name) for name in ARRAYS]
+        return {"status": found.status.name, "words": words, "work": work}, arrays
 
     return run
-
-
-def _as_data(found: Answer, said: str) -> tuple[dict[str, Any], bytes]:
-    sizes: list[int | None] = []
-    numbers = b""
-    for name in ARRAYS:
-        value: Any = getattr(found, name)
-        sizes.append(None if value is None else int(np.size(value)))
-        numbers += b"" if value is None else np.ascontiguousarray(value, float).tobytes()
-    words = {
-        "status": found.status.name,
-        "words": str(found.words or said)[:WORDS],
-        "work": {str(kind): int(count) for kind, count in found.work.items()},
-        "sizes": sizes,
-    }
-    return words, numbers

@@ -8,15 +8,12 @@ are data (`lavender.base.apart`): nothing that a backend sends is unpickled here
 from __future__ import annotations
 
 import atexit
-import json
 import os
 import pickle
 from threading import Lock
 from typing import Any
 
-import numpy as np
-
-from lavender.base.apart.process import Ended, Process
+from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
 from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.external.as_qp import QP
@@ -94,30 +91,24 @@ def call(
         ) from None
     except Ended as end:
         raise Failed(f"the process of the backend died ({end})") from None
+    except NoAnswer as error:
+        raise Failed(f"the process of the backend sent what is no answer ({error})") from None
+    except Raised as error:
+        _keep(process)
+        raise (
+            InputError(str(error)) if error.kind == "InputError" else Failed(f"{error.kind}: {error}")
+        ) from None
     _keep(process)
-    return _answer(found)
+    return _answer(*found)
 
 
-def _answer(found: tuple[bytes, bytes]) -> Answer:
+def _answer(said: dict[str, Any], arrays: list[Any]) -> Answer:
     # Every part is checked: a backend may have written anything.
     try:
-        said = json.loads(found[0])
-        if "error" in said:
-            if said["kind"] == InputError.__name__:
-                raise InputError(str(said["error"]))
-            raise Failed(f"{said['kind']}: {said['error']}")
-        numbers, at = np.frombuffer(found[1], float), 0
-        arrays: dict[str, FloatArray | None] = {}
-        for name, size in zip(ARRAYS, said["sizes"], strict=True):
-            if size is not None and not 0 <= size <= len(numbers) - at:
-                raise ValueError("arrays of another length")
-            arrays[name] = None if size is None else numbers[at : at + size].copy()
-            at += size or 0
         work = {str(kind): int(count) for kind, count in said["work"].items()}
-        return Answer(status=Status[said["status"]], words=str(said["words"]), work=work, **arrays)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
+        found = dict(zip(ARRAYS, arrays, strict=True))
+        return Answer(status=Status[said["status"]], words=str(said["words"]), work=work, **found)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise Failed(f"the process of the backend sent what is no answer ({error})") from None
 
 

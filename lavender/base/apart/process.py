@@ -7,6 +7,7 @@ unpickled. What it prints goes to nowhere.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import pickle
 import queue
@@ -18,6 +19,8 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from typing import IO, Any
+
+import numpy as np
 
 START_TIME = 60.0  # s, to import everything on a loaded machine
 WORDS = 2**20  # bytes of the words of one answer
@@ -40,6 +43,42 @@ def _read(stream: IO[bytes], size: int) -> bytes:
 
 class Ended(Exception):
     """The process ended before it answered; its text says how."""
+
+
+class NoAnswer(ValueError):
+    """What came is no answer; its text says why."""
+
+
+class Raised(Exception):
+    """What the process was asked for raised an error; `kind` is its type, by name."""
+
+    def __init__(self, text: str, kind: str) -> None:
+        super().__init__(text)
+        self.kind = kind
+
+
+def opened(answer: tuple[bytes, bytes]) -> tuple[dict[str, Any], list[Any]]:
+    """Words of an answer, and its arrays of float64, each copied.
+
+    Raises
+    ------
+    Raised
+    NoAnswer
+        No table of words, or arrays of other sizes than they say. It may hold anything.
+    """
+    try:
+        said = json.loads(answer[0])
+        if "error" in said:
+            raise Raised(str(said["error"]), str(said.get("kind", "")))
+        numbers, at, arrays = np.frombuffer(answer[1], float), 0, []
+        for size in said.pop("sizes"):
+            if size is not None and not 0 <= size <= len(numbers) - at:
+                raise ValueError("arrays of another length")
+            arrays.append(None if size is None else numbers[at : at + size].copy())
+            at += size or 0
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise NoAnswer(f"{type(error).__name__}: {error}") from None
+    return said, arrays
 
 
 class Process:
@@ -123,8 +162,8 @@ class Process:
         # alone, and nobody waits for it.
         threading.Thread(target=self._listen, args=(stream, self._answers), daemon=True).start()
 
-    def ask(self, messages: Sequence[Any], limit: float, room: int) -> tuple[bytes, bytes]:
-        """The answer to messages: words, and at most `room` bytes of numbers.
+    def ask(self, messages: Sequence[Any], limit: float, room: int) -> tuple[dict[str, Any], list[Any]]:
+        """The answer to messages, `opened`, of at most `room` bytes of numbers.
 
         Raises
         ------
@@ -134,6 +173,9 @@ class Process:
             It did not read them and answer within `limit` [s], and was ended, as it is after Ctrl-C.
         Ended
             It ended by itself.
+        Raised
+        NoAnswer
+            It was ended.
         """
         frames = [pickle.dumps(m, pickle.HIGHEST_PROTOCOL) for m in messages]
         self._room = room
@@ -150,7 +192,11 @@ class Process:
             raise
         if found is None:
             raise Ended(self._cause())
-        return found
+        try:
+            return opened(found)
+        except NoAnswer:
+            self.end()
+            raise
 
     def _send(self, message: bytes, limit: float) -> None:
         process = self.popen

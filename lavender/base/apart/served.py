@@ -10,11 +10,13 @@ import signal
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import IO, Any
 
+import numpy as np
+
 WORDS = 500  # characters of an error
-Handler = Callable[[Any], tuple[dict[str, Any], bytes] | None]
+Handler = Callable[[Any], tuple[dict[str, Any], Sequence[Any]] | None]
 
 
 def serve(lifeline: int, make: Callable[[], Handler], memory: int = 0) -> None:
@@ -24,8 +26,9 @@ def serve(lifeline: int, make: Callable[[], Handler], memory: int = 0) -> None:
     ----------
     lifeline : reading end of a pipe whose other end the parent alone holds; -1 for none
     make : callable
-        Imports what is needed, within the limit of memory; what it returns gives words and numbers for a message, or
-        None for one without an answer. What that raises is the answer: `error`, its text, and `kind`, its type.
+        Imports what is needed, within the limit of memory; what it returns gives words and arrays (None: no such) for a
+        message, or None for one without an answer. What that raises is the answer: `error`, its text, and `kind`, its
+        type.
     memory : bytes of address space, 0 for no limit
     """
     requests, answers = begin(lifeline)
@@ -44,9 +47,12 @@ def serve(lifeline: int, make: Callable[[], Handler], memory: int = 0) -> None:
         try:
             found = handle(message)
         except BaseException as error:  # code of others may fail in any way; a panic of Rust is no Exception
-            found = {"error": str(error)[:WORDS], "kind": type(error).__name__}, b""
+            found = {"error": str(error)[:WORDS], "kind": type(error).__name__}, ()
         if found is not None:
-            answer(answers, json.dumps(found[0]), found[1])
+            words, arrays = found
+            sizes = [None if x is None else int(np.size(x)) for x in arrays]
+            numbers = b"".join(np.ascontiguousarray(x, float).tobytes() for x in arrays if x is not None)
+            answer(answers, json.dumps({**words, "sizes": sizes}), numbers)
 
 
 def limit_cpu(more: float) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from lavender.base.apart.process import Ended, Process
+from lavender.base.apart import served
+from lavender.base.apart.process import Ended, NoAnswer, Process, Raised
 from lavender.base.errors import CapabilityError, InputError, UnknownName
 from lavender.lab.phenomena.engines import WAYS, Way, follow, make
 from lavender.lab.phenomena.friction import FRICTION
@@ -19,7 +17,7 @@ from lavender.sim.scene import Scene
 
 #: Name -> phenomenon, in the order of the table.
 PHENOMENA: dict[str, Phenomenon] = {p.name: p for p in (*FRICTION, *JOINTS, *STACKS)}
-MODULE = "lavender.lab.phenomena.engines.served"
+MODULE = __name__  # whose `serve` the other process runs
 LIMIT = 120.0  # s of wall time for one case
 ROOM = 2**30  # bytes of one track
 
@@ -37,35 +35,45 @@ class Apart(Process):
         if cause:
             return f"its process does not start: {cause}"
         try:
-            return _track(*self.ask([(way.name, scene, seconds, interval)], self.limit, ROOM))
+            said, (time, place, turn, speed) = self.ask(
+                [(way.name, scene, seconds, interval)], self.limit, ROOM
+            )
+            k, n = len(time), len(scene.bodies)
+            return Track(
+                time=time,
+                positions=place.reshape(k, n, 3),
+                quaternions=turn.reshape(k, n, 4),
+                velocities=speed.reshape(k, n, 6),
+                force=float(said["force"]),
+                cpu=float(said["cpu"]),
+                setting=str(said["setting"]),
+            )
+        except (NoAnswer, ValueError, KeyError, TypeError, AttributeError) as error:
+            return f"its answer is no track: {error}"
+        except Raised as error:
+            return (
+                str(error) if error.kind == CapabilityError.__name__ else f"it failed: {error.kind}: {error}"
+            )
         except TimeoutError:
             return f"no answer within {self.limit:g} s"
         except Ended as end:
             return f"its process ended: {end}"
 
 
-def _track(words: bytes, numbers: bytes) -> Track | str:
+def serve(lifeline: int) -> None:
+    """The other process: answer the questions of `Apart.track`, until they end."""
+    served.serve(lifeline, lambda: _answer)
+
+
+def _answer(message: Any) -> tuple[dict[str, Any], list[Any]]:
+    name, scene, seconds, interval = message
+    engine = make(WAYS[name], scene)
     try:
-        said = json.loads(words)
-        if "error" in said:
-            cannot = said["kind"] == CapabilityError.__name__
-            return str(said["error"]) if cannot else f"it failed: {said['kind']}: {said['error']}"
-        k, n = int(said["samples"]), int(said["bodies"])
-        x = np.frombuffer(numbers, float)
-        time, place, turn, speed, last = np.split(x, np.cumsum([k, 3 * k * n, 4 * k * n, 6 * k * n]))
-        shapes = ((k, n, 3), (k, n, 4), (k, n, 6))
-        place, turn, speed = (a.reshape(s) for a, s in zip((place, turn, speed), shapes, strict=True))
-        return Track(
-            time=time,
-            positions=place,
-            quaternions=turn,
-            velocities=speed,
-            force=float(last[0]),
-            cpu=float(last[1]),
-            setting=str(said["setting"]),
-        )
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        return f"its answer is no track: {error}"
+        found = follow(engine, seconds, interval)
+    finally:
+        engine.close()
+    said = {"force": found.force, "cpu": found.cpu, "setting": found.setting}
+    return said, [found.time, found.positions, found.quaternions, found.velocities]
 
 
 def chosen(names: Sequence[str] = ()) -> list[Phenomenon]:

@@ -16,6 +16,7 @@ from stacks import stack
 
 import lavender as lv
 from lavender import bench, registry
+from lavender.base.apart.process import opened
 from lavender.lab.bench import cases as bench_cases
 from lavender.lab.bench import machine
 from lavender.lab.bench.running import timing
@@ -297,18 +298,22 @@ def test_a_worker_says_what_this_process_says_and_judges_a_problem_that_no_backe
         {"times": [float("nan")]},
         {"times": None},
         {"pace": "fast"},
-        {"certificate": True},
+        {"sizes": [4, 4]},
+        {"sizes": [2, 2]},
+        {"sizes": [None, 4]},
+        {"sizes": [4]},
+        {"sizes": 4},
     ],
 )
 def test_an_answer_that_is_none_is_refused(said):
     good = {
         "status": "CONVERGED", "iterations": 3, "work": {"sweeps": 3}, "message": "", "form": "",
-        "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "certificate": False,
+        "setups": [0.01], "solves": [0.02], "times": [0.04], "pace": 1e-4, "sizes": [4, None],
     }  # fmt: skip
     numbers = np.ones(4).tobytes()
-    assert outcome_in((json.dumps(good).encode(), numbers), 4, 1.0).iterations == 3
+    assert outcome_in(*opened((json.dumps(good).encode(), numbers)), 4, 1.0).iterations == 3
     wrong = {} if not said else good | said
     with pytest.raises(ValueError, match=r".+"):
-        outcome_in((json.dumps(wrong).encode(), numbers), 4, 1.0)
+        outcome_in(*opened((json.dumps(wrong).encode(), numbers)), 4, 1.0)
     with pytest.raises(ValueError, match=r".+"):
-        outcome_in((pickle.dumps(good), numbers), 4, 1.0)
+        opened((pickle.dumps(good), numbers))

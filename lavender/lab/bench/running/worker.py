@@ -1,6 +1,6 @@
 """A process of its own for code that is not ours: it may hang, eat memory or die, and costs one record.
 
-The parent starts another Python (`served.py`), sends a problem once and tasks after it, and gets answers back. What
+The parent starts another Python (`serve`), sends a problem once and tasks after it, and gets answers back. What
 comes back is data, numbers and words of a stated form and size, never an object that is unpickled; the verdict on it
 is computed here, from a problem that the process never held. What a backend prints goes to nowhere. A worker that
 does not answer in time is killed with everything that it started, and the next task starts another; when this process
@@ -9,23 +9,23 @@ dies, the system ends its workers.
 
 from __future__ import annotations
 
-import json
 import math
 import time
+from dataclasses import fields, replace
 from typing import Any
 
-import numpy as np
-
-from lavender.base.apart.process import Ended, Process
+from lavender.base.apart import served
+from lavender.base.apart.process import Ended, Process, Raised
 from lavender.base.arrays import FloatArray
 from lavender.judge.solution import Status
 from lavender.lab.bench.machine import memory_share
-from lavender.lab.bench.record import CRASHED, KILLED, Record, values_in
-from lavender.lab.bench.running.timing import Outcome, Task, judged
+from lavender.lab.bench.record import CRASHED, KILLED, Record, plain, values_in
+from lavender.lab.bench.running.timing import Outcome, Task, attempt, judged
 from lavender.problem import Problem
 
-_SERVED = "lavender.lab.bench.running.served"
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+ORPHAN = 60.0  # s of CPU, beyond what any task may take
+ARRAYS = ("impulse", "certificate")  # of an outcome
 GRACE = 2.0  # s, beyond the repeats' own limits, for set-up and judging
 
 
@@ -43,7 +43,7 @@ class Worker:
     def __init__(self, memory: int | None = None, grace: float | None = None) -> None:
         self.memory = memory_share() if memory is None else memory
         self.grace = GRACE if grace is None else grace
-        self._process = Process(_SERVED, self.memory or 0, environment=_ONE_THREAD)
+        self._process = Process(__name__, self.memory or 0, environment=_ONE_THREAD)
         self._holds = ""
 
     def measure(self, problem: Problem, task: Task, impulse: Any = None) -> tuple[Record, FloatArray | None]:
@@ -64,18 +64,20 @@ class Worker:
             messages.insert(0, ("problem", problem))
         self._holds = task.sha
         try:
-            answer = process.ask(messages, limit, 16 * problem.m)  # impulses and a certificate
+            said, arrays = process.ask(messages, limit, 16 * problem.m)
+            found = outcome_in(said, arrays, problem.m, time.monotonic() - begun)
         except TimeoutError:
             text = f"did not stop; its process was killed after {limit:.3g} s"
             return task.record(status=KILLED, message=text), None
         except Ended as end:
             return task.record(status=f"{CRASHED} ({end})", message="the process of the backend died"), None
-        try:
-            return judged(problem, task, outcome_in(answer, problem.m, time.monotonic() - begun))
+        except Raised as error:
+            return judged(problem, task, str(error))
         except ValueError as error:
             process.end()
             text = f"the process of the backend sent what is no answer ({error}); it was killed"
             return task.record(status=f"{CRASHED} (no answer)", message=text), None
+        return judged(problem, task, found)
 
     def close(self) -> None:
         """End the process and what it started."""
@@ -88,7 +90,31 @@ class Worker:
         self.close()
 
 
-def outcome_in(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | str:
+def serve(memory: int, lifeline: int) -> None:
+    """The other process: answer tasks, until they end; `memory`: bytes of address space, 0 for no limit."""
+    served.serve(lifeline, _runner, memory)
+
+
+def _runner() -> served.Handler:
+    problem: Any = None
+
+    def run(message: Any) -> tuple[dict[str, Any], list[Any]] | None:
+        nonlocal problem
+        if message[0] == "problem":
+            problem = message[1]
+            return None
+        served.limit_cpu(3.0 * message[1].time_limit + ORPHAN)
+        found = attempt(problem, message[1], message[2])
+        if isinstance(found, str):
+            return {"error": found[:500]}, []
+        found = replace(found, message=str(found.message)[:500], form=str(found.form)[:500])
+        said = {f.name: plain(getattr(found, f.name)) for f in fields(found) if f.name not in ARRAYS}
+        return said, [getattr(found, name) for name in ARRAYS]
+
+    return run
+
+
+def outcome_in(said: dict[str, Any], arrays: list[Any], m: int, took: float) -> Outcome:
     """What an answer says, every part of it checked.
 
     Raises
@@ -96,22 +122,13 @@ def outcome_in(answer: tuple[bytes, bytes], m: int, took: float) -> Outcome | st
     ValueError
         It is none: other words, counts or sizes, times longer than the whole took.
     """
-    try:
-        said = json.loads(answer[0])
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(said, dict):
-        raise ValueError("not a table")
-    if isinstance(said.get("error"), str):
-        return str(said["error"])
     values = values_in(Outcome, said)
     if values.get("status") not in Status.__members__:
         raise ValueError("no status")
-    numbers = np.frombuffer(answer[1], float) if len(answer[1]) % 8 == 0 else np.empty(0)
-    if len(numbers) != m * (2 if said.get("certificate") is True else 1):
+    if len(arrays) != 2 or arrays[0] is None or any(x is not None and len(x) != m for x in arrays):
         raise ValueError("impulses of another length")
     try:
-        found = Outcome(numbers[:m], numbers[m:] if len(numbers) > m else None, **values)
+        found = Outcome(*arrays, **values)
     except TypeError as error:
         raise ValueError(str(error)) from None
     parts = (*found.setups, *found.solves)
