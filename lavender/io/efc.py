@@ -147,7 +147,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     Parameters
     ----------
     model : mujoco.MjModel
-        Its solver, tolerance and iterations make the answers. J is asked for as a dense matrix.
+        Its options (solver, tolerance, iterations, jacobian, ...) make the answers.
     states : (n, nq + nv), or (n, size) of mjSTATE_FULLPHYSICS or mjSTATE_INTEGRATION
         qpos and qvel, or what `mj_getState` gives.
     threads : int
@@ -177,11 +177,6 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         raise CapabilityError(
             f"integrator={word!r} puts damping into M; {', '.join(map(repr, single.OF_M))} have M itself"
         )
-    if mj.mj_isSparse(model):
-        import copy
-
-        model = copy.copy(model)
-        model.opt.jacobian = mj.mjtJacobian.mjJAC_DENSE
     one_of("errors", errors, ERRORS)
     given = np.ascontiguousarray(as_array("states", states, (None, None), finite=errors == "raise"))
     size = given.shape[1]
@@ -190,7 +185,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
         kinds.setdefault(mj.mj_stateSize(model, kind), kind)
     if size not in kinds:
         raise InputError(f"states have {size} numbers each; one of {sorted(kinds)} is needed")
-    n, nv = len(given), model.nv
+    n, nv, sparse = len(given), model.nv, bool(mj.mj_isSparse(model))
     free, smooth = np.full((n, nv), np.nan), np.zeros((n, nv))
     mass = np.zeros((n, len(model.M_colind)))
     mass[:, model.M_rowadr + model.M_rownnz - 1] = 1.0  # its diagonal, of a state that is not finite
@@ -207,10 +202,19 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             mj.mj_setState(model, data, given[i], kinds[size])
             mj.mj_forward(model, data)
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
-            rows.take(i, data, data.nefc)
+            mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)  # MuJoCo's has the speeds of surfaces, too
+            rows.take(i, data, data.nefc, efc_J=jacobian(data))
             if data.ncon:
                 contacts.take(i, data.contact, data.ncon)
         return rows, contacts
+
+    def jacobian(data: Any) -> FloatArray:
+        m = data.nefc
+        if not sparse:  # there is room behind it where rows of zeros were counted and left out
+            return np.reshape(data.efc_J[: m * nv], (m, nv))
+        jac = np.empty((m, nv))
+        mj.mju_sparse2dense(jac, data.efc_J, data.efc_J_rownnz, data.efc_J_rowadr, data.efc_J_colind)
+        return jac
 
     if threads == 1:
         parts = [work(0)]
@@ -243,8 +247,8 @@ class _Stretches:
         self.of: list[int] = []  # which state each stretch is of,
         self.counts: list[int] = []  # and its length
 
-    def take(self, i: int, source: Any, count: int) -> None:
-        """Those of state i by their names."""
+    def take(self, i: int, source: Any, count: int, **given: FloatArray) -> None:
+        """Those of state i by their names, of the source where they are not given."""
         begin, end = self.n, self.n + count
         self.of.append(i)
         self.counts.append(count)
@@ -254,8 +258,7 @@ class _Stretches:
                 self.arrays[name] = np.empty((self.room, *x.shape[1:]), x.dtype)
                 self.arrays[name][:begin] = x[:begin]
         for name, x in self.arrays.items():
-            given = getattr(source, name)
-            x[begin:end] = given if given.ndim == x.ndim else given.reshape(count, *x.shape[1:])
+            x[begin:end] = given[name] if name in given else getattr(source, name)
         self.n = end
 
 

@@ -138,7 +138,7 @@ def from_mujoco(model: Any, data: Any, *, name: str = "mujoco") -> Problem:
     jac = _rows(seen, model, data, m, scale)
     rhs, softness, v_free, sound, gap, gaps = export.numbers(
         *jac, scale, dt, _before(seen, data), smooth, data.efc_aref, data.efc_R, data.efc_D, data.efc_force,
-        data.efc_vel, data.efc_b, data.qfrc_constraint, data.qacc, USUAL,
+        _speed(model, data, m), data.efc_b, data.qfrc_constraint, data.qacc, USUAL,
     )  # fmt: skip
     _check_jacobian(*gaps)
     if not gap <= SAME:
@@ -332,6 +332,12 @@ def _before(seen: _Model, data: Any) -> FloatArray:
             "MjData was changed since its forward pass: run mj_forward"
         )
     return v
+
+
+def _speed(model: Any, data: Any, m: int) -> FloatArray:
+    """What J v is held to: efc_vel; nothing (zeros) where the speeds of geoms' surfaces are in it, too."""
+    speed: FloatArray = np.zeros(m) if getattr(model, "flg_surfacevel", False) else data.efc_vel
+    return speed
 
 
 def _check_jacobian(velocity: float, row: float, push: float, finite: float) -> None:

@@ -99,6 +99,46 @@ def test_a_model_in_which_nothing_moves_has_worlds_without_rows():
     )
 
 
+@pytest.mark.parametrize("jacobian", ["dense", "sparse"])
+def test_a_row_of_zeros_is_where_mujoco_has_it(jacobian):
+    """A tendon along the arm that it holds: dense, MuJoCo counts its row, allots room and leaves it out."""
+    model = mj.MjModel.from_xml_string(f"""<mujoco><option jacobian="{jacobian}"/><worldbody>
+      <site name="a" pos="1 0 0"/>
+      <body><joint type="hinge" axis="0 1 0" frictionloss="0.1"/><geom size="0.1" pos="0.5 0 0"/>
+        <site name="b" pos="0.5 0 0"/></body></worldbody>
+      <tendon><spatial frictionloss="0.1"><site site="a"/><site site="b"/></spatial></tendon></mujoco>""")
+    data = forwarded(model, np.zeros(2))
+    batch, impulse = lv.io.from_mujoco_many(model, np.zeros((3, 2)))
+    for i in range(3):
+        np.testing.assert_array_equal(impulse.reshape(3, -1)[i], model.opt.timestep * data.efc_force)
+        assert batch[i].row_name(0) == "friction of joint 0"
+
+
+@pytest.mark.parametrize("cone", ["elliptic", "pyramidal"])
+def test_surfaces_that_move_are_in_the_problem(cone):
+    """A conveyor: its speed is in efc_vel and in aref, not in J v."""
+    try:
+        model = mj.MjModel.from_xml_string(f"""<mujoco><option cone="{cone}" tolerance="0"/><worldbody>
+          <geom type="plane" size="9 9 1" surfacevel="1 0 0 0 0 0"/>
+          <body pos="0 0 0.1"><freejoint/><geom type="box" size="0.1 0.1 0.1"/></body></worldbody></mujoco>""")
+    except ValueError:
+        pytest.skip("this MuJoCo's surfaces do not move")
+    states = np.tile(np.r_[model.qpos0, np.zeros(model.nv)], (4, 1))
+    states[:, 2] -= 0.001
+    states[:, 7:9] = np.random.default_rng(0).standard_normal((4, 2))
+    batch, impulse = lv.io.from_mujoco_many(model, states)
+    found, dt = lv.residual_many(batch, impulse), model.opt.timestep
+    for i, state in enumerate(states):
+        data = forwarded(model, state)
+        problem = lv.io.from_mujoco(model, data)
+        assert problem.m > 0
+        np.testing.assert_allclose(batch[i].b, problem.b, rtol=1e-9, atol=1e-12)
+        # MuJoCo's Newton to its end, where its own impulses are an answer to rounding.
+        assert max(found.velocity_error[i], lv.residual(problem, single.impulse(model, data)).velocity) < 1e-9
+        after = problem.velocity(lv.solve(problem, tol=1e-12).impulse)
+        np.testing.assert_allclose(after, data.qvel + dt * data.qacc, atol=1e-9, rtol=0)
+
+
 def stacked(model, states, dtype):
     """Arrays as MJX and Warp hold them: room for the most rows of all, in float32."""
     datas = [forwarded(model, s) for s in states]
