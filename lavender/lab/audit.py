@@ -5,8 +5,9 @@
 
 An answer that rounding explains, in the precision of the engine, is at its floor and no early stop
 (`Residual.verdict`). MuJoCo's problems are those of `lavender.io.from_mujoco_many`, made anew from the state before
-each step, its warm start and controls: its own answer to the bit where it works with a dense J, else to rounding.
-`noslip_iterations` come after the problem, and what is judged is the answer before them.
+each step, its warm start and controls: its own answer to the bit. `noslip_iterations` come after the problem, and what
+is judged is the answer before them. An answer are forces: MuJoCo's Newton and CG move bodies by accelerations of their
+own, which an early stop leaves less far off (docs/mujoco.md).
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ WORST = 3  # worlds that are kept as files
 POINTS = 60  # of a curve over time
 OF_ERRORS = (
     "Of the worst row of each step. At its floor: rounding explains the error, in the engine's precision. Close "
-    "enough: no row is further off than the threshold. Stopped early, or wrong: the rest."
+    "enough: no row is further off than the threshold. Stopped early, or wrong: the rest. The errors are of the "
+    "engine's forces: the accelerations by which MuJoCo's Newton and CG move bodies are mostly less far off."
 )
 OF_FILES = (
     "Problems with the engine's impulses, in the folder worst; states.npz holds the states to go back to."
