@@ -164,7 +164,7 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
     Raises
     ------
     InputError
-        Another model, states of another size, or one that is not finite.
+        Another model, states of another size, one that is not finite, or one at which MuJoCo ends in an error.
     CapabilityError
         An integrator whose constraint problem is not of M.
     """
@@ -200,7 +200,10 @@ def from_mujoco_many(model: Any, states: Any, *, threads: int = 1, errors: str =
             if not all_finite(given[i]):
                 continue
             mj.mj_setState(model, data, given[i], kinds[size])
-            mj.mj_forward(model, data)
+            try:
+                mj.mj_forward(model, data)
+            except mj.FatalError as error:
+                raise InputError(f"state {i}: MuJoCo ends in an error, {error}") from None
             free[i], smooth[i], mass[i] = data.qvel, data.qacc_smooth, data.M
             mj.mj_mulJacVec(model, data, data.efc_vel, data.qvel)  # MuJoCo's has the speeds of surfaces, too
             rows.take(i, data, data.nefc, efc_J=jacobian(data))

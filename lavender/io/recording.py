@@ -103,7 +103,7 @@ def record(
     ------
     InputError
         Not a model and its data, `steps` or `every` below 1, another control, precision or threshold, a folder
-        that holds a recording.
+        that holds a recording; MuJoCo ends in an error (out of memory, what it does not support).
     """
     mj = adapter._mujoco(model, data)[0].mj
     steps, every = whole_number("steps", steps, 1), whole_number("every", every, 1)
@@ -119,10 +119,13 @@ def record(
             ctrl = drive(data, step)
             if ctrl is not None:
                 data.ctrl[:] = ctrl
-            mj.mj_step(model, data)
-            if (step + 1) % every:
-                continue
-            mj.mj_forward(model, data)
+            try:
+                mj.mj_step(model, data)
+                if (step + 1) % every:
+                    continue
+                mj.mj_forward(model, data)
+            except mj.FatalError as error:
+                raise InputError(f"step {step + 1}: MuJoCo ends in an error, {error}") from None
             file = folder / f"step_{step + 1:0{width}d}.npz"
             try:
                 found = _solved(mj, model, data, f"step {step + 1}", precision, threshold)

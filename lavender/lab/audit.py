@@ -121,9 +121,14 @@ class Audit:
         return int(np.count_nonzero(self.verdict >= 0))
 
     @property
+    def apart(self) -> Any:
+        """(worlds,) bool: not finite from some step on."""
+        return (self.verdict == VERDICTS.index("not finite")).any(axis=1)
+
+    @property
     def largest(self) -> float:
         """Largest velocity error that rounding does not explain [m/s]; infinite where a world is not finite."""
-        if (self.verdict == VERDICTS.index("not finite")).any():
+        if self.apart.any():
             return np.inf
         return float(np.max(self.numbers[0][self.verdict > VERDICTS.index(AT_FLOOR)], initial=0.0))
 
@@ -133,11 +138,15 @@ class Audit:
         early, of = self.early, np.count_nonzero((self.verdict >= 0).any(axis=1))
         begun = f"{Path(self.runs.model).name}, {self.engine}: "
         done = f"{self.done} steps of {count(int(of), 'world')}"
+        lost = int(self.apart.sum())
+        end = (
+            f". {count(lost, 'world')} flew apart, of which no step is judged from there on." if lost else "."
+        )
         if not early.any():
-            return f"{begun}none of {done} ended early."
+            return f"{begun}none of {done} ended early{end}"
         return (
             f"{begun}{np.count_nonzero(early)} of {done} ended early ({percent(int(early.sum()), self.done, 1)}), in "
-            f"{np.count_nonzero(early.any(axis=1))} worlds; {size(self.largest)} m/s off in the worst."
+            f"{np.count_nonzero(early.any(axis=1))} worlds; {size(self.largest)} m/s off in the worst{end}"
         )
 
     @property
@@ -218,8 +227,8 @@ class Audit:
         return {
             "head": self.head, "engine": self.engine, "model": runs.model, "worlds": runs.worlds, "steps": runs.steps,
             "seed": runs.seed, "done": self.done, "early": int(early.sum()),
-            "worlds_early": int(early.any(axis=1).sum()), "largest": largest if np.isfinite(largest) else None,
-            "stopped": self.stopped,
+            "worlds_early": int(early.any(axis=1).sum()), "worlds_apart": int(self.apart.sum()),
+            "largest": largest if np.isfinite(largest) else None, "stopped": self.stopped,
         }  # fmt: skip
 
     @property
@@ -324,7 +333,7 @@ def _worst(some: list[Worst]) -> list[Worst]:
 
 def _by_mujoco(runs: Runs, how: tuple[str, float], workers: int, backend: str) -> Iterator[Piece]:
     _, model = runs.load()
-    from_mujoco_many(model, np.zeros((0, model.nq + model.nv)))  # what it refuses is refused here
+    from_mujoco_many(model, np.concatenate([model.qpos0, np.zeros(model.nv)])[None])  # refuses here, once
     many = max(1, min(TASK // runs.steps, runs.worlds))
     parts = (
         (runs, how, range(first, min(first + many, runs.worlds))) for first in range(0, runs.worlds, many)

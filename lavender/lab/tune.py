@@ -199,7 +199,7 @@ class Stage:
             for i in range(0, len(states), AT_ONCE):
                 batch, impulse = from_mujoco_many(judge, states[i : i + AT_ONCE], errors="status")
                 errors.append(residual_many(batch, impulse, errors="status").velocity_error)
-        except mj.FatalError:
+        except (mj.FatalError, InputError):  # of a step, of its forward pass
             return apart
         off = np.linalg.norm(ends - self.ends, axis=2).max(axis=1)
         if np.isnan(off).any():

@@ -53,6 +53,17 @@ def test_what_cannot_be_exported_is_counted_not_fatal(tmp_path):
     assert "discrete" in str(found)
 
 
+@pytest.mark.parametrize("name", ["mj_step", "mj_forward"])
+def test_a_model_that_ends_mujoco_in_an_error_is_refused_by_its_words(tmp_path, monkeypatch, name):
+    def ends(*_):
+        raise mj.FatalError("not supported")
+
+    model, data = state(steps=1)
+    monkeypatch.setattr(mj, name, ends)
+    with pytest.raises(lv.InputError, match="step 1: MuJoCo ends in an error, not supported"):
+        lv.io.record(model, data, tmp_path / "steps", 4)
+
+
 def test_controls_are_played_drawn_or_called(tmp_path):
     text = """<mujoco><worldbody><body><joint name="j" range="-1 1" limited="true"/><geom size=".1"/></body></worldbody>
       <actuator><motor joint="j" ctrlrange="-2 3" ctrllimited="true"/></actuator></mujoco>"""

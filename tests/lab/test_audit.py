@@ -144,6 +144,17 @@ def test_a_world_in_which_mujoco_ends_in_an_error_is_not_finite_from_there_on(bo
     monkeypatch.setattr(mj, "mj_step", dies)
     found = audit(boxes(), worlds=1, steps=12, workers=1)
     assert [VERDICTS[i] == "not finite" for i in found.verdict[0]] == [k >= 8 for k in range(12)]
+    assert found.head.endswith("ended early. 1 world flew apart, of which no step is judged from there on.")
+    assert found.told["worlds_apart"] == 1
+
+
+def test_a_model_whose_start_ends_mujoco_in_an_error_is_refused(boxes, monkeypatch):
+    def ends(*_):
+        raise mj.FatalError("not supported")
+
+    monkeypatch.setattr(mj, "mj_forward", ends)
+    with pytest.raises(lv.InputError, match="state 0: MuJoCo ends in an error, not supported"):
+        audit(boxes(), worlds=1, steps=12, workers=1)
 
 
 @pytest.mark.filterwarnings("ignore")
