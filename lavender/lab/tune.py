@@ -293,15 +293,15 @@ class Tuning:
         enough = f"not needed, {size(self.now.worst)} m/s is within {self.threshold:g}"
         closer = enough if self.now.worst <= self.threshold else none
         said = []
-        for word, m, why, gains in (
-            ("as accurate as now, faster", self.faster, none, "time"),
-            ("as fast as now, more accurate", self.closer, closer, "worst"),
+        for word, m, why, gains, most in (
+            ("as accurate as now, faster", self.faster, none, "time", 1.0 - EQUAL),
+            ("as fast as now, more accurate", self.closer, closer, "worst", 1.0),
         ):
             if m is None:
                 said.append(f"{word}: {why}")
                 continue
             held = next((h for h in self.held[1:] if h.setting == m.setting), None)
-            if held is not None and getattr(held, gains) >= getattr(self.held[0], gains):
+            if held is not None and getattr(held, gains) >= most * getattr(self.held[0], gains):
                 word += ": not on the worlds held back"
             said += [
                 f"{m.setting.line}  <!-- {word} -->", f"    chosen on: {_beside(m, self.now)}",
