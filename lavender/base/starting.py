@@ -16,9 +16,9 @@ STATUS = 130  # what shells show of a command that Ctrl-C ended
 
 def _is_command() -> bool:
     first = sys.argv[0] if sys.argv else ""
-    if first == "-m":  # as long as the module is looked for
-        words = sys.orig_argv
-        return words[words.index("-m") + 1] in ("lavender", "lavender.cli")
+    if first == "-m":  # as long as the module is looked for; its name stands alone or as in -Imlavender
+        word = sys.orig_argv[-len(sys.argv)]
+        return (word.partition("m")[2] if word.startswith("-") else word) in ("lavender", "lavender.cli")
     folder, name = os.path.split(first)
     if name == "__main__.py":
         return folder == os.path.dirname(os.path.dirname(__file__))

@@ -256,6 +256,8 @@ sys.meta_path.insert(0, Finder())
     [
         (("-m", "lavender"), "lavender.cli.solvers"),
         (("-m", "lavender.cli"), "lavender.problem"),
+        (("-Bm", "lavender"), "lavender.problem"),
+        (("-Bmlavender",), "lavender.problem"),
     ],
 )
 def test_ctrl_c_while_the_command_is_imported_ends_with_130(way, module, tmp_path):
