@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,24 @@ from lavender.external.running import Answer, Limits
 from lavender.judge.solution import Status
 
 
+@cache
+def _algebra() -> str:
+    """The algebra that OSQP takes by itself, found once.
+
+    `osqp.OSQP()` would look for the modules of two others every time, which takes 0.2 ms and locks of the import: a
+    process that is forked meanwhile waits for them for ever.
+    """
+    import osqp
+
+    return str(osqp.default_algebra())
+
+
 def call(qp: QP, impulse: FloatArray, limit: Limits, extra: dict[str, Any]) -> Answer:
     """One run of the backend."""
     import osqp
 
     rows, low, high = two_sided(qp, True)
-    solver = osqp.OSQP()
+    solver = osqp.OSQP(algebra=_algebra())
     settings = {
         "eps_abs": limit.eps,
         "eps_rel": 0.0,

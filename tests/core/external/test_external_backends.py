@@ -123,6 +123,24 @@ def test_a_process_forked_while_a_thread_runs_a_backend_is_not_silent():
 
 
 @pytest.mark.parametrize("name", BACKENDS)
+def test_a_second_solve_looks_for_no_module(name, monkeypatch):
+    """A process that is forked while a module is looked for waits for ever where it looks for the same one."""
+
+    class Finder:
+        @staticmethod
+        def find_spec(name, path=None, target=None):
+            looked_for.append(name)
+
+    looked_for = []
+    problem = lv.Problem.lcp(*spd(4))
+    if registry.get(name).refuses(problem) is None:
+        lv.solve(problem, name)
+        monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+        lv.solve(problem, name)
+        assert looked_for == []
+
+
+@pytest.mark.parametrize("name", BACKENDS)
 def test_threads_run_a_backend_each(name):
     problem = lv.Problem.lcp(*spd(4))
     if registry.get(name).refuses(problem) is None:
