@@ -1,6 +1,7 @@
 """`lavender doctor`: everything a report of a bug needs, and a self-test that can fail."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -73,3 +74,13 @@ def test_one_sweep_less_is_seen_in_every_part(monkeypatch):
 )  # fmt: skip
 def test_the_compiler_is_read_from_the_module(library, found):
     assert machine.build_of(library) == found
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a script in place of git")
+def test_a_refusal_of_git_is_no_error_in_whatever_letters(tmp_path, monkeypatch):
+    """It names the checkout, whose folders may be in other letters than those of the locale."""
+    (tmp_path / ".git").mkdir()
+    (tmp_path / "git").write_bytes(b"#!/bin/sh\necho 'dubious ownership in \xff' >&2\nexit 128\n")
+    (tmp_path / "git").chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    assert machine._commit(tmp_path) == ""

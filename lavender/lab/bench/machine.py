@@ -150,7 +150,7 @@ def _commit(root: Path) -> str:
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         said = subprocess.run(
             ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"],
-            capture_output=True, text=True, timeout=10, check=True,
+            capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=True,
         )  # fmt: skip
         return said.stdout.strip()
     return ""

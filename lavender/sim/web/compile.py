@@ -211,7 +211,9 @@ def _run(command: list[str], folder: Path) -> None:
     if not os.access(os.path.expanduser("~"), os.W_OK | os.X_OK):  # where zig keeps libraries
         env.setdefault("ZIG_GLOBAL_CACHE_DIR", str(folder / "cache"))
     try:
-        done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, cwd=folder, env=env, capture_output=True, encoding="utf-8", errors="replace", check=False
+        )
     except OSError as error:
         raise BuildFailed(f"{command[0]} cannot be run: {error.strerror or error}") from None
     if done.returncode:

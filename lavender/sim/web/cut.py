@@ -512,7 +512,7 @@ def translate(
         out = work / f"{name}.c"
         done = subprocess.run(
             [sys.executable, "-m", "cython", *given, "--shared=lavender_ext._utility", str(source), "-o", str(out)],
-            cwd=root, capture_output=True, text=True, check=False,
+            cwd=root, capture_output=True, encoding="utf-8", errors="replace", check=False,
         )  # fmt: skip
         if done.returncode:
             raise CutFailed(f"Cython cannot translate {source}:\n{(done.stdout + done.stderr)[-4000:]}")
