@@ -99,7 +99,9 @@ def test_a_budget_is_that_of_one_solve_where_p_is_definite():
     assert done.count(0) == 1  # solves that began
 
 
-@pytest.mark.filterwarnings("ignore:Converted matrix", "ignore:The default value of raise_error")
+@pytest.mark.filterwarnings(
+    "ignore:Converted", "ignore:The default value of raise_error", "ignore:Direct access"
+)
 @pytest.mark.parametrize("backend", ["osqp", "piqp", "daqp"])
 @settings(max_examples=30)
 @given(seed=seeds)
