@@ -46,6 +46,7 @@ class Imported(NamedTuple):
     impulse: FloatArray | None  # N s, in the batch's shape: dt efc_force in the batch's rows
 
 
+@np.errstate(divide="ignore", over="ignore", invalid="ignore")  # of rows that do not count
 def from_efc(
     *,
     efc_J: Any,
@@ -127,8 +128,7 @@ def from_efc(
     step = max(1, CHUNK // max(1, m * nv))
     for i in range(0, n, step):
         goal[i : i + step] += np.einsum("nij,nj->ni", jac[i : i + step].astype(float), before[i : i + step])
-    with np.errstate(divide="ignore"):
-        soft = np.where(counted, 1.0 / stiff, 0.0)
+    soft = np.where(counted, 1.0 / stiff, 0.0)
     cones, scale = _blocks(of, loss, counted, contacts, dt)
     if scale is not None:
         jac = jac * scale[:, :, None].astype(jac.dtype)
@@ -137,7 +137,7 @@ def from_efc(
     batch.precision = precision
     if efc_force is None:
         return Imported(batch, None)
-    lam = dt * as_array("efc_force", efc_force, (n, m), finite=False) * counted
+    lam = np.where(counted, dt * as_array("efc_force", efc_force, (n, m), finite=False), 0.0)
     return Imported(batch, lam if scale is None else lam / scale)
 
 

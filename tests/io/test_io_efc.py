@@ -197,6 +197,22 @@ def test_a_triangle_of_the_mass_and_the_time_step_in_an_array_make_the_same_worl
         lv.io.from_efc(**given | {"timestep": np.array([0.1, 0.2])})
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("junk", [np.nan, np.inf])
+def test_what_stands_behind_the_rows_that_count_is_not_read(junk):
+    model = mj.MjModel.from_xml_string(scene())
+    given = stacked(model, states_of(model, 3), np.float32)
+    clean = lv.io.from_efc(**given)
+    for i, m in enumerate(given["nefc"]):
+        for name in ("efc_J", "efc_D", "efc_aref", "efc_frictionloss", "efc_force"):
+            given[name][i, m:] = junk
+    batch, impulse = lv.io.from_efc(**given)
+    for i, m in enumerate(given["nefc"]):
+        np.testing.assert_array_equal(impulse[i], np.r_[clean.impulse[i, :m], np.zeros(len(impulse[i]) - m)])
+    many, same = lv.solve_many(batch, impulse=impulse), lv.solve_many(clean.batch, impulse=clean.impulse)
+    np.testing.assert_array_equal(many.impulse, same.impulse)
+
+
 def test_arrays_that_do_not_fit_say_so():
     model = mj.MjModel.from_xml_string(scene())
     given = stacked(model, states_of(model, 3), np.float32)
