@@ -29,8 +29,7 @@ from lavender.io.stored import write_figure
 from lavender.lab.phenomena.engines import follow
 from lavender.lab.phenomena.engines.own import Engine
 from lavender.lab.report.curves import Curve, Figure
-from lavender.lab.report.draw import matplotlib_panels
-from lavender.lab.report.style import looks
+from lavender.lab.report.draw import looks, matplotlib_panels
 from lavender.sim.scene import Scene
 from lavender.sim.scene.steppers import STEPPERS, get_stepper
 

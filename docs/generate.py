@@ -40,11 +40,10 @@ from lavender.lab.bench import level_name, structure_of
 from lavender.lab.report import contents, geometric_means, reaches
 from lavender.lab.report.curves import figures as report_figures
 from lavender.lab.report.curves import work_precision
-from lavender.lab.report.draw import matplotlib_panels
+from lavender.lab.report.draw import looks, matplotlib_panels
 from lavender.lab.report.findings import Report
 from lavender.lab.report.page import page as report_page
-from lavender.lab.report.style import looks
-from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import residual
 from lavender.problem import LAWS
 from lavender.problem.ordering import ORDERS

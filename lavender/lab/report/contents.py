@@ -312,30 +312,25 @@ def change_table(old: Records, new: Records) -> Table:
 def robustness_table(rows: Sequence[tables.Robustness], levels: Sequence[float], unit: str = "") -> Table:
     """Campaigns: shares of cases brought to each level, false claims, residual (motion error) by budget."""
     budgets = sorted({n for row in rows for n in row.budgets})
-    cells: Rows = [
-        [
-            r.family,
-            r.solver,
-            str(r.cases),
-            *(percent(r.reached[x], r.cases, 1) for x in levels),
-            str(r.wrong),
-            str(r.died),
-            *(", ".join(map(residual, r.budgets[n])) if n in r.budgets else NONE for n in budgets),
-            r.hardest,
-        ]
+    told = [
+        {
+            "structure": r.family,
+            "solver": r.solver,
+            "cases": str(r.cases),
+            **{f"to {level_name(x)}{unit}": percent(r.reached[x], r.cases, 1) for x in levels},
+            "false claims": str(r.wrong),
+            "died": str(r.died),
+            **{
+                f"{n} iterations: median, 95 %": ", ".join(map(residual, r.budgets[n]))
+                if n in r.budgets
+                else NONE
+                for n in budgets
+            },
+            "hardest": r.hardest,
+        }
         for r in rows
     ]
-    marks = ["bad" if r.wrong or r.died else "" for r in rows]
-    ends = [f"{n} iterations: median, 95 %" for n in budgets]
-    heads = [
-        "structure",
-        "solver",
-        "cases",
-        *(f"to {level_name(x)}{unit}" for x in levels),
-        "false claims",
-        "died",
-    ]
-    return Table([*heads, *ends, "hardest"], cells, marks)
+    return Table.of(told, ["bad" if r.wrong or r.died else "" for r in rows])
 
 
 def claim_table(records: Records) -> Table:
@@ -406,34 +401,22 @@ def pass_table(passes: Sequence[tables.Pass]) -> Table:
 
 def engine_table(found: Sequence[Contestant]) -> Table:
     """Engines' own answers beside the solver here that is the fastest to a level as good in every step."""
-    rows: Rows = []
-    for c in found:
-        own = [
-            c.folder,
-            f"{c.steps}{without(c.left_out)}",
-            f"{c.rows:g}",
-            c.solver,
-            seconds(c.seconds),
-            residual(c.relative),
-            residual(c.worst),
-        ]
-        here = (
-            [c.ours, seconds(c.our_seconds), residual(c.our_worst)]
-            if c.ours
-            else ["none in every step", NONE, NONE]
-        )
-        short = f"{c.velocity:.2g} m/s, {c.where}" if c.early and c.where else NONE
-        rows.append([*own, str(c.above_floor), str(c.early), short, *here])
-    heads = [
-        "recorded",
-        "steps",
-        "rows",
-        "engine's own",
-        "time",
-        "residual, median",
-        "worst",
-        "above floor",
-        "stopped early",
-        "furthest off",
+    rows = [
+        {
+            "recorded": c.folder,
+            "steps": f"{c.steps}{without(c.left_out)}",
+            "rows": f"{c.rows:g}",
+            "engine's own": c.solver,
+            "time": seconds(c.seconds),
+            "residual, median": residual(c.relative),
+            "worst": residual(c.worst),
+            "above floor": str(c.above_floor),
+            "stopped early": str(c.early),
+            "furthest off": f"{c.velocity:.2g} m/s, {c.where}" if c.early and c.where else NONE,
+            "fastest here": c.ours or "none in every step",
+            "time here": seconds(c.our_seconds) if c.ours else NONE,
+            "worst here": residual(c.our_worst) if c.ours else NONE,
+        }
+        for c in found
     ]
-    return Table([*heads, "fastest here", "time here", "worst here"], rows)
+    return Table.of(rows)

@@ -14,7 +14,7 @@ from lavender.lab.report import contents, tables
 from lavender.lab.report.curves import Figures
 from lavender.lab.report.findings import Report
 from lavender.lab.report.svg import svg
-from lavender.lab.report.tables.advice import NOISE, RESIDUAL_NOISE
+from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE
 from lavender.lab.report.text import count, left_out, residual, suspicions, without
 from lavender.lab.report.verdict import Verdict
 

@@ -25,11 +25,10 @@ from lavender.lab.bench.record import file_name, level_name
 from lavender.lab.bench.store import Records
 from lavender.lab.report import contents, tables
 from lavender.lab.report.curves import LINES, Figure, Group, figures, overall_figure
-from lavender.lab.report.draw import matplotlib_figure
+from lavender.lab.report.draw import looks, matplotlib_figure
 from lavender.lab.report.findings import Report
-from lavender.lab.report.style import looks
 from lavender.lab.report.table import Cell, Table, latex, tex
-from lavender.lab.report.tables.advice import NOISE
+from lavender.lab.report.tables.cases import NOISE
 from lavender.lab.report.text import count, without
 
 INCH = (5.5, 3.4)  # of a figure: a page's width of text
@@ -58,7 +57,6 @@ def write_paper(report: Report, folder: str | Path) -> Path:
     found = report.records
     if not len(found) or report.is_campaign:
         raise InputError("a paper's figures need runs with times; these records have none")
-    folder = Path(folder)
     own = found.having(r if r.own_min is None else replace(r, time_min=r.own_min) for r in found)
     drawn = figures(own)
     groups = (drawn.over, _classes(own), drawn.profiles, drawn.sequences)
@@ -66,16 +64,13 @@ def write_paper(report: Report, folder: str | Path) -> Path:
         _leading(figure, report.verdict.leaders) for group in groups for fs in group.values() for figure in fs
     ]
     look = looks({c.solver for figure in some for c in figure.curves})
-    make_folder(folder)
-    try:
-        for figure in some:
-            canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
-            write_figure(canvas, folder / _file(figure), metadata={"CreationDate": None, "Producer": None})
-        write_text(folder / "figures.tex", "\n".join(_included(figure, own) for figure in some))
-        write_text(folder / "tables.tex", _tables(report, own))
-        write_text(folder / "method.tex", _method(report))
-    except OSError as error:
-        raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
+    folder = make_folder(folder)
+    for figure in some:
+        canvas = matplotlib_figure(replace(figure, title=""), look, INCH)
+        write_figure(canvas, folder / _file(figure), metadata={"CreationDate": None, "Producer": None})
+    write_text(folder / "figures.tex", "\n".join(_included(figure, own) for figure in some))
+    write_text(folder / "tables.tex", _tables(report, own))
+    write_text(folder / "method.tex", _method(report))
     return folder
 
 

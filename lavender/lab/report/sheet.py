@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lavender.base.errors import InputError
 from lavender.io.stored import make_folder, write_text
 from lavender.lab.report.curves import Figure
 from lavender.lab.report.draw import save
@@ -51,14 +50,10 @@ class Sheet:
 
     def write(self, folder: str | os.PathLike[str]) -> Path:
         """`index.html`, `numbers.json` and `figures/*.svg, *.png`; the path of the page."""
-        folder = Path(folder)
-        make_folder(folder)
-        try:
-            write_text(folder / "index.html", self.html())
-            write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
-            save((f for part in self.parts for f in part.figures if f.curves), folder / "figures")
-        except OSError as error:
-            raise InputError(f"cannot write {error.filename or folder} ({error.strerror or error})") from None
+        folder = make_folder(folder)
+        write_text(folder / "index.html", self.html())
+        write_text(folder / "numbers.json", json.dumps(self.numbers, indent=1) + "\n")
+        save((f for part in self.parts for f in part.figures if f.curves), folder / "figures")
         return folder / "index.html"
 
     def show(self, console: Console) -> None:

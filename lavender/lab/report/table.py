@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -45,6 +45,11 @@ class Table:
     marks: Sequence[str] = ()  # of each row, of `COLOURS`; none where it is empty
     folds: bool = False  # cells of several words, which fold where there is little room
     words: frozenset[str] = field(default=WORDS, repr=False)
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[str, str | Cell]], marks: Sequence[str] = ()) -> Table:
+        """Of rows that say their heads beside each cell, all the same ones."""
+        return cls(list(rows[0]) if rows else [], [list(row.values()) for row in rows], marks)
 
     def without(self, *heads: str) -> Table:
         """The table without some of its columns."""

@@ -43,18 +43,12 @@ def write(found: Records | Report, folder: str | Path, *, figures: bool = True) 
         )
     drawn = curves.figures(report.records)
     folder = make_folder(folder)
-    try:
-        write_csv(report.given, folder / "records.csv")
-        write_json(report.given, folder / "records.json")
-        index = folder / "index.html"
-        # Whole or not at all: on a full disk the page of the last time stays.
-        write_text(index, page(report, drawn, saved=figures))
-        write_text(folder / "summary.md", summary(report))
-        if figures:
-            save(drawn, folder / "figures", {r.solver for r in report.every})
-    except OSError as error:
-        raise InputError(
-            f"cannot write {error.filename or folder} ({error.strerror or error}): make room, or give a folder that "
-            "you may write to; the records are kept"
-        ) from None
+    write_csv(report.given, folder / "records.csv")
+    write_json(report.given, folder / "records.json")
+    index = folder / "index.html"
+    # Whole or not at all: on a full disk the page of the last time stays.
+    write_text(index, page(report, drawn, saved=figures))
+    write_text(folder / "summary.md", summary(report))
+    if figures:
+        save(drawn, folder / "figures", {r.solver for r in report.every})
     return index

@@ -13,8 +13,7 @@ from lavender import bench, report
 from lavender.lab.bench.record import file_name
 from lavender.lab.report import curves
 from lavender.lab.report.axes import Axis
-from lavender.lab.report.draw import matplotlib_figure
-from lavender.lab.report.style import looks
+from lavender.lab.report.draw import looks, matplotlib_figure
 from lavender.lab.report.svg import svg
 
 

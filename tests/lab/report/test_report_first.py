@@ -11,9 +11,9 @@ import lavender as lv
 from lavender import bench, report
 from lavender.lab.report import curves, paper, tables
 from lavender.lab.report.contents import advice_table
+from lavender.lab.report.draw import looks
 from lavender.lab.report.findings import Report
 from lavender.lab.report.paper import write_paper
-from lavender.lab.report.style import looks
 from lavender.lab.report.terminal import ADDED, LINES
 from lavender.lab.report.verdict import verdict
 from tests.lab.report.test_report import record, records_of, shown

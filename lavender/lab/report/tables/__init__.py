@@ -5,38 +5,46 @@ from lavender.lab.report.tables.advice import (
     Choice,
     Line,
     advice,
-    quantile,
     steps_of,
     time_budgets,
     to_level,
     within,
 )
-from lavender.lab.report.tables.campaigns import Robustness, robustness
 from lavender.lab.report.tables.cases import (
+    Change,
     Claims,
     Difficulty,
     Reach,
     Spread,
     budgets,
+    changes,
     claims,
     difficulties,
+    drift,
     failures,
+    families,
+    is_campaign,
+    levels_of,
+    pairs,
     reaches,
     spreads,
 )
-from lavender.lab.report.tables.changes import Change, changes, drift
-from lavender.lab.report.tables.groups import families, is_campaign, levels_of, pairs
-from lavender.lab.report.tables.means import (
+from lavender.lab.report.tables.many import (
     SHIFT,
     Backend,
+    Pass,
     Profile,
+    Robustness,
     backends,
+    by_sequence,
     geometric_mean,
     geometric_means,
     limit_of,
+    passes,
     profiles,
+    quantile,
+    robustness,
 )
-from lavender.lab.report.tables.sequences import Pass, by_sequence, passes
 
 __all__ = [
     "SHIFT",

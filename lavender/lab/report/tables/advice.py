@@ -11,13 +11,9 @@ from typing import Any
 
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
-from lavender.lab.report.tables.groups import families, levels_of
-from lavender.lab.report.tables.means import SHIFT, geometric_mean, limit_of, times_to
-from lavender.lab.report.tables.sequences import by_sequence
+from lavender.lab.report.tables.cases import NOISE, RESIDUAL_NOISE, families, levels_of
+from lavender.lab.report.tables.many import SHIFT, by_sequence, geometric_mean, limit_of, quantile, times_to
 
-#: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
-#: one run more or less within a time does to a mean residual.
-NOISE, RESIDUAL_NOISE = 1.25, 2.0
 HALF = 0.5  # of the start's residual: a case is served where at most that is left
 QUANTILE = 0.9  # of the residuals in a time or with sweeps, over the cases: misses cannot be averaged away
 FIRST = "auto"  # among equals: the only name that needs no choice
@@ -300,9 +296,3 @@ def _best_of_each(places: Iterable[Place]) -> list[Place]:
     for place in sorted(places, key=lambda pair: (pair[0], pair[1].score)):
         first.setdefault(place[1].solver, place)
     return list(first.values())
-
-
-def quantile(values: Sequence[float], q: float) -> float:
-    """The smallest value that at least a share q of them does not exceed."""
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)]

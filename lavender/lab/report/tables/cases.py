@@ -1,4 +1,4 @@
-"""Tables of single cases: how far and how fast, what failed, whether claims hold, what an order of sweeps does.
+"""Tables of single cases: how they are grouped, how far and how fast, what failed, whether claims hold, what changed.
 
 Time to a level: the smallest time of any run whose judged residual is at or below it, whatever was asked
 for: runs are matched by the accuracy they reached, never by the one they were asked for.
@@ -8,15 +8,66 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from lavender.judge.residuals import at_floor
 from lavender.lab.bench.record import Record
 from lavender.lab.bench.store import Records
-from lavender.lab.report.tables.groups import DIED, levels_of, pairs
 
+SHAPES = ("separate", "chain", "mesh", "stack", "pile", "dense")
+DIED = ("ERROR", "KILLED", "CRASHED")
 EASY = 1e-3  # relative residual to which sweeps are counted
+#: Factors within which two scores are the same: what a busy machine does to the minimum of a few repeats, and what
+#: one run more or less within a time does to a mean residual.
+NOISE, RESIDUAL_NOISE = 1.25, 2.0
+
+
+def levels_of(records: Records) -> tuple[float, ...]:
+    """Levels of the newest run's plan, loosest first; else the tolerances that were asked for."""
+    for run in reversed(list(records.runs.values())):
+        if run.plan.get("levels"):
+            return tuple(sorted(map(float, run.plan["levels"]), reverse=True))
+    return tuple(sorted({r.tol for r in records if r.mode == "tol"}, reverse=True)) or (1e-3, 1e-6, 1e-9)
+
+
+def pairs(records: Iterable[Record]) -> dict[tuple[str, str, str], list[Record]]:
+    """Runs in the given order of blocks, by (case, solver, start)."""
+    groups: dict[tuple[str, str, str], list[Record]] = defaultdict(list)
+    for r in records:
+        if r.order == "given" and r.step < 0 and not r.turns:
+            groups[r.case, r.solver, r.start].append(r)
+    return dict(groups)
+
+
+def families(records: Records) -> dict[str, list[str]]:
+    """Structure -> cases, biggest first. A case is in every family whose word describes it.
+
+    A structure whose cases have several laws is a family for each law: "pile, coulomb". Words that describe the same
+    cases are one family: "stack / friction".
+    """
+    found: dict[str, dict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    ran = {r.case for r in records if r.step < 0}
+    for name, info in records.cases.items():
+        if name in ran:
+            for word in info.structure:
+                found[word][info.law].append(name)
+    order = (*SHAPES, "redundant", "friction", "large mass ratio", "asymmetric")
+    names: dict[tuple[str, ...], list[str]] = {}
+    for word in sorted(found, key=lambda w: (order.index(w) if w in order else len(order), w)):
+        laws = found[word]
+        for law in sorted(laws, key=lambda x: (-len(laws[x]), x)):
+            names.setdefault(tuple(laws[law]), []).append(word if len(laws) == 1 else f"{word}, {law}")
+    return {" / ".join(words): list(cases) for cases, words in names.items()}
+
+
+def is_campaign(records: Records) -> bool:
+    """Times were left out on purpose."""
+    return any(run.plan.get("campaign") for run in records.runs.values())
+
+
+# -- single cases ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -213,3 +264,63 @@ def budgets(records: Records) -> dict[tuple[str, str, str], list[tuple[int, floa
         if r.order == "given" and r.step < 0 and r.status == "MAX_ITERATIONS":
             groups[r.case, r.solver, r.start].append((r.iterations, r.relative))
     return {key: sorted(points) for key, points in groups.items()}
+
+
+# -- two runs ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Change:
+    """One case and solver in an old and a new run."""
+
+    case: str
+    solver: str
+    start: str
+    level: float
+    old: float  # s, inf where the level was missed
+    new: float
+    noise: float  # what counts as noise: a factor above 1
+
+    @property
+    def kind(self) -> str:
+        """reached | lost | faster | slower | same."""
+        if math.isfinite(self.new) != math.isfinite(self.old):
+            return "reached" if math.isfinite(self.new) else "lost"
+        if not math.isfinite(self.new) or self.old / self.noise <= self.new <= self.old * self.noise:
+            return "same"
+        return "faster" if self.new < self.old else "slower"
+
+
+def changes(old: Records, new: Records) -> list[Change]:
+    """Time to each level in two runs, on the cases whose numbers are the same in both.
+
+    Noise is at least `NOISE`, and at least twice the ratio between minimum and median of either run. Earlier times are
+    in what the machine is worth now: multiplied by the drift of the case, where both runs know it.
+    """
+    levels = levels_of(new)
+    same = {name for name, info in new.cases.items() if name in old.cases and old.cases[name].sha == info.sha}
+    before = {(r.case, r.solver, r.start): r for r in reaches(old, levels)}
+    jitter: dict[tuple[str, str, str], float] = defaultdict(lambda: 1.0)
+    for records in (old, new):
+        for key, group in pairs(records).items():
+            for r in group:
+                if r.usable and r.time_min > 0.0:
+                    jitter[key] = max(jitter[key], r.time_median / r.time_min)
+    out = []
+    for row in reaches(new, levels):
+        key = (row.case, row.solver, row.start)
+        if row.case not in same or key not in before:
+            continue
+        worth = drift(old, new, row.case)
+        noise = max(NOISE, 1.0 + 2.0 * (jitter[key] - 1.0))
+        out += [Change(*key, x, worth * before[key].times[x], row.times[x], noise) for x in levels]
+    return out
+
+
+def drift(old: Records, new: Records, case: str = "") -> float:
+    """Time of the loop of fixed work now over then, medians beside the runs of a case, or of all; 1 where not known."""
+    found = []
+    for records in (old, new):
+        some = [r.pace for r in records if r.pace and (not case or r.case == case)]
+        found.append(median(some) if some else math.nan)
+    return found[1] / found[0] if all(map(math.isfinite, found)) else 1.0
