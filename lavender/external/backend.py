@@ -16,7 +16,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows
-from lavender.external.running import Answer, Call, Limits, proof, quiet
+from lavender.external.running import Answer, Call, Limits, at_least, proof, quiet
 from lavender.judge.solution import Status
 
 
@@ -30,7 +30,9 @@ class Backend:
     summary: str
     reference: str
     call: Call | None = None  # its own interface; None goes through qpsolvers
-    settings: Any = None  # Limits -> settings, through qpsolvers; None: runs at its own tolerances
+    # through qpsolvers: by its own names fields of Limits, or what is fixed; None: runs at its own tolerances
+    settings: Mapping[str, Any] | None = None
+    least: float = 0.0  # tolerance that it takes
     max_iter: int = 10_000
     dense: bool = False  # takes dense matrices only
     definite: bool = False  # needs a positive definite P, which the velocity form has
@@ -53,7 +55,9 @@ def _through_qpsolvers(
 ) -> Answer:
     import qpsolvers
 
-    settings = {} if backend.settings is None else backend.settings(limit)
+    known = {**vars(limit), "eps": at_least(limit.eps, backend.least) if backend.least else limit.eps}
+    given = {name: known[x] if isinstance(x, str) else x for name, x in (backend.settings or {}).items()}
+    settings = {name: x for name, x in given.items() if x is not None}  # no time limit, if none is asked for
     if backend.warm:
         settings.update(_warm_settings(backend.name, qp, impulse))
     settings.update(extra)

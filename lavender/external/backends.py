@@ -13,68 +13,39 @@ certificates, warm start) are called by their own interface (`native/`), the oth
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 from lavender.external.backend import Backend
 from lavender.external.native import clarabel, daqp, highs, osqp, qpalm
 from lavender.external.qp_solver import OPTIONS, QPSolver, refusal
-from lavender.external.running import Limits, at_least
 from lavender.solvers.registry import SolverSpec
 
-# -- settings of those that go through qpsolvers -----------------------------------------------------
-
-
-def _proximal(limit: Limits) -> dict[str, Any]:
-    # Without the gap proxqp accepts multipliers on bounds that are not active (met on a redundant stack).
-    return {
-        "eps_abs": limit.eps, "eps_rel": 0.0, "max_iter": limit.max_iter,
-        "check_duality_gap": True, "eps_duality_gap_abs": limit.gap, "eps_duality_gap_rel": limit.gap_relative,
-    }  # fmt: skip
-
-
-def _scs(limit: Limits) -> dict[str, Any]:
-    more = {} if limit.time_limit is None else {"time_limit_secs": limit.time_limit}
-    return {"eps_abs": limit.eps, "eps_rel": 0.0, "eps_infeas": 1e-11, "max_iters": limit.max_iter, **more}
-
-
-def _cvxopt(limit: Limits, count: str = "maxiters") -> dict[str, Any]:
-    return {
-        "feastol": limit.eps,
-        "abstol": limit.gap,
-        "reltol": limit.gap_relative,
-        count: limit.max_iter,
-    }
-
-
-def _gurobi(limit: Limits) -> dict[str, Any]:
-    more = {} if limit.time_limit is None else {"TimeLimit": limit.time_limit}
-    eps = at_least(limit.eps, 1e-9)
-    return {
-        "FeasibilityTol": eps, "OptimalityTol": eps, "BarConvTol": limit.gap,
-        "BarIterLimit": limit.max_iter, "IterationLimit": limit.max_iter, "Threads": 1, **more,
-    }  # fmt: skip
-
-
-def _copt(limit: Limits) -> dict[str, Any]:
-    more = {} if limit.time_limit is None else {"TimeLimit": limit.time_limit}
-    eps = at_least(limit.eps, 1e-9)
-    return {"FeasTol": eps, "DualTol": eps, "BarIterLimit": limit.max_iter, "Threads": 1, **more}
-
-
-def _qtqp(limit: Limits) -> dict[str, Any]:
-    return {
-        "tol_feas": limit.eps, "tol_gap_abs": limit.gap, "tol_gap_rel": limit.gap_relative,
-        "max_iter": limit.max_iter, "collect_stats": True,
-    }  # fmt: skip
-
-
-def _pyqpmad(limit: Limits) -> dict[str, Any]:
-    return {"tolerance": at_least(limit.eps, 1e-12), "max_iter": limit.max_iter}
-
-
-def _qpax(limit: Limits) -> dict[str, Any]:
-    return {"solver_tol": at_least(limit.eps, 1e-12)}
-
+#: Settings of those that go through qpsolvers, by their names there: a word is a field of `Limits`, all else is fixed.
+PROXIMAL = {  # without the gap proxqp accepts multipliers on bounds that are not active (met on a redundant stack)
+    "eps_abs": "eps", "eps_rel": 0.0, "max_iter": "max_iter",
+    "check_duality_gap": True, "eps_duality_gap_abs": "gap", "eps_duality_gap_rel": "gap_relative",
+}  # fmt: skip
+SCS = {
+    "eps_abs": "eps", "eps_rel": 0.0, "eps_infeas": 1e-11, "max_iters": "max_iter", "time_limit_secs": "time_limit"
+}  # fmt: skip
+CVXOPT = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "maxiters": "max_iter"}
+ECOS = {"feastol": "eps", "abstol": "gap", "reltol": "gap_relative", "max_iters": "max_iter"}
+GUROBI = {
+    "FeasibilityTol": "eps", "OptimalityTol": "eps", "BarConvTol": "gap", "BarIterLimit": "max_iter",
+    "IterationLimit": "max_iter", "Threads": 1, "TimeLimit": "time_limit",
+}  # fmt: skip
+COPT = {
+    "FeasTol": "eps",
+    "DualTol": "eps",
+    "BarIterLimit": "max_iter",
+    "Threads": 1,
+    "TimeLimit": "time_limit",
+}
+QTQP = {
+    "tol_feas": "eps", "tol_gap_abs": "gap", "tol_gap_rel": "gap_relative", "max_iter": "max_iter",
+    "collect_stats": True,
+}  # fmt: skip
+PYQPMAD = {"tolerance": "eps", "max_iter": "max_iter"}
+QPAX = {"solver_tol": "eps"}
 
 ADMM = "Stellato et al. 2020, OSQP: an operator splitting solver for quadratic programs"
 BACKENDS: tuple[Backend, ...] = (
@@ -83,9 +54,9 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("clarabel", ("clarabel",), "clarabel", "interior point, homogeneous embedding",
             "Goulart, Chen 2024, Clarabel", call=clarabel.call, max_iter=200, stoppable=True),
     Backend("piqp", ("qpsolvers", "piqp"), "piqp", "proximal interior point",
-            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=_proximal, max_iter=250),
+            "Schwan, Jiang, Kuhn, Jones 2023, PIQP", settings=PROXIMAL, max_iter=250),
     Backend("proxqp", ("qpsolvers", "proxsuite"), "proxsuite", "proximal augmented Lagrangian",
-            "Bambade et al. 2022, ProxQP", settings=_proximal, warm=True),
+            "Bambade et al. 2022, ProxQP", settings=PROXIMAL, warm=True),
     Backend("qpalm", ("qpalm",), "qpalm", "proximal augmented Lagrangian, semismooth Newton",
             "Hermans, Themelis, Patrinos 2022, QPALM", call=qpalm.call, warm=True, stoppable=True),
     Backend("daqp", ("daqp",), "daqp", "dual active set", "Arnström, Bemporad, Axehill 2022, DAQP",
@@ -93,27 +64,27 @@ BACKENDS: tuple[Backend, ...] = (
     Backend("highs", ("highspy",), "highspy", "null-space active set", "Huangfu, Hall 2018, HiGHS",
             call=highs.call, max_iter=100_000, stoppable=True, noisy=True),
     Backend("scs", ("qpsolvers", "scs"), "scs", "operator splitting, homogeneous embedding",
-            "O'Donoghue 2021, SCS 3", settings=_scs, max_iter=100_000, warm=True, stoppable=True),
+            "O'Donoghue 2021, SCS 3", settings=SCS, max_iter=100_000, warm=True, stoppable=True),
     Backend("quadprog", ("qpsolvers", "quadprog"), "quadprog", "dual active set, positive definite A",
             "Goldfarb, Idnani 1983", dense=True, definite=True),
     Backend("cvxopt", ("qpsolvers", "cvxopt"), "cvxopt", "interior point", "Vandenberghe 2010, CVXOPT",
-            settings=_cvxopt, max_iter=100),
+            settings=CVXOPT, max_iter=100),
     Backend("kvxopt", ("qpsolvers", "kvxopt"), "kvxopt", "interior point, CVXOPT with more factorisations",
-            "Vandenberghe 2010, CVXOPT", settings=_cvxopt, max_iter=100),
+            "Vandenberghe 2010, CVXOPT", settings=CVXOPT, max_iter=100),
     Backend("ecos", ("qpsolvers", "ecos"), "ecos", "interior point for second-order cones",
-            "Domahidi, Chu, Boyd 2013, ECOS", settings=partial(_cvxopt, count="max_iters"), max_iter=100,
+            "Domahidi, Chu, Boyd 2013, ECOS", settings=ECOS, max_iter=100,
             dense=True, definite=True, linear="equality", finite=True),
     Backend("gurobi", ("qpsolvers", "gurobipy"), "gurobipy", "interior point and simplex", "Gurobi manual",
-            settings=_gurobi, stoppable=True, noisy=True),
+            settings=GUROBI, least=1e-9, stoppable=True, noisy=True),
     Backend("copt", ("qpsolvers", "coptpy"), "coptpy", "interior point", "COPT manual",
-            settings=_copt, stoppable=True, noisy=True),
+            settings=COPT, least=1e-9, stoppable=True, noisy=True),
     Backend("mosek", ("qpsolvers", "cvxopt", "mosek"), "cvxopt mosek", "interior point", "MOSEK manual", noisy=True),
     Backend("qtqp", ("qpsolvers", "qtqp"), "qtqp", "primal-dual interior point", "QTQP manual",
-            settings=_qtqp, max_iter=200, linear=""),
+            settings=QTQP, max_iter=200, linear=""),
     Backend("pyqpmad", ("qpsolvers", "pyqpmad"), "pyqpmad", "dual active set, positive definite A",
-            "Goldfarb, Idnani 1983", settings=_pyqpmad, dense=True, definite=True),
+            "Goldfarb, Idnani 1983", settings=PYQPMAD, least=1e-12, dense=True, definite=True),
     Backend("qpax", ("qpsolvers", "qpax"), "qpax", "interior point in JAX", "Tracy, Manchester 2024, qpax",
-            settings=_qpax, max_iter=30, dense=True, noisy=True),
+            settings=QPAX, least=1e-12, max_iter=30, dense=True, noisy=True),
     Backend("jaxopt_osqp", ("qpsolvers", "jaxopt"), "jaxopt", "operator splitting in JAX", ADMM,
             dense=True, noisy=True),
     Backend("hpipm", ("qpsolvers", "hpipm_python"), "hpipm_python (github.com/giaf/hpipm)", "interior point",
