@@ -72,16 +72,6 @@ PROLOGUE = """\
 #define likely(x) (x)
 #define unlikely(x) (x)
 """
-#: Those words.
-PROVIDED = frozenset(
-    {"CYTHON_INLINE", "CYTHON_UNUSED", "__PYX_EXTERN_C", "likely", "unlikely", "NULL", "DL_IMPORT"}
-)
-KEYWORDS = frozenset(
-    ["auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
-     "for", "goto", "if", "inline", "int", "long", "register", "return", "short", "signed", "sizeof", "static",
-     "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"]
-)  # fmt: skip
-
 TOKEN = re.compile(
     r"""(?P<directive>(?<![^\n])[ \t]*\#(?:\\\n|/\*.*?\*/|[^\n])*)
       |(?P<skip>\n|/\*.*?\*/|//[^\n]*|[^\S\n]+(?=\n|/[/*]|\Z))
@@ -97,6 +87,16 @@ BRACE = re.compile(
     re.DOTALL,
 )
 WORD = re.compile(r"[A-Za-z_]\w*")
+NUMBER = re.compile(r"\d+")
+#: Words that lead nowhere: those of the prologue, and C's.
+PROVIDED = frozenset(
+    WORD.findall(
+        """CYTHON_INLINE CYTHON_UNUSED __PYX_EXTERN_C likely unlikely NULL DL_IMPORT auto break case char const continue
+        default do double else enum extern float for goto if inline int long register return short signed sizeof static
+        struct switch typedef union unsigned void volatile while"""
+    )
+)
+OPENING = ("if", "ifdef", "ifndef")
 MANGLED = re.compile(r"__pyx_(?:f|t|e|fuse_\d+)_(?=\d)")
 
 
@@ -116,7 +116,7 @@ class Token(NamedTuple):
 class Item:
     """One declaration: the names it makes, those it uses, its text."""
 
-    kind: str  # include, macro, type, prototype, variable, function, group
+    kind: str  # macro, type, prototype, variable, function, group
     part: list[Token]
     makes: set[str] = field(default_factory=set)
     origin: str = ""
@@ -153,9 +153,9 @@ class Item:
             used.update(words)
         return {_plain(name, self.kept) for name in used}
 
-    def rename(self, kept: frozenset[str]) -> None:
+    def rename(self, origin: str, kept: frozenset[str]) -> None:
         """Give names as they are written out."""
-        self.kept = kept
+        self.origin, self.kept = origin, kept
         self.makes = {_plain(name, kept) for name in self.makes}
 
 
@@ -194,46 +194,26 @@ def _end_of_block(text: str, at: int) -> int:
     return len(text)
 
 
-def read(text: str, origin: str = "") -> list[Item]:
+def read(text: str) -> list[Item]:
     """The declarations of a C file one by one, those between `#if` and `#endif` together."""
-    stream = list(tokens(text, bodies=True))
-    closing, opened = {}, []
-    for at, token in enumerate(stream):
-        word = _word(token)
-        if word in ("if", "ifdef", "ifndef"):
-            opened.append(at)
-        elif word == "endif" and opened:
-            closing[opened.pop()] = at
-    return list(_declarations(stream, closing, 0, len(stream), origin))
+    guarded = text.partition("\n#ifndef Py_PYTHON_H\n")[2].partition(
+        "\n#else\n"
+    )  # of Cython: all in the last branch
+    return list(_declarations(list(tokens(guarded[2].rpartition("\n#endif")[0] or text, bodies=True))))
 
 
-def _declarations(
-    stream: list[Token], closing: dict[int, int], at: int, end: int, origin: str
-) -> Iterator[Item]:
-    while at < end:
-        token = stream[at]
-        if token.kind == "directive":
-            if at in closing:
-                last = closing[at]
-                if last >= end - 1 and at < 400:  # the guard of the file: its last branch counts
-                    inner = [
-                        i
-                        for i in range(at + 1, last)
-                        if _word(stream[i]) == "else" and _level(closing, at, i)
-                    ]
-                    yield from _declarations(stream, closing, (inner[-1] if inner else at) + 1, last, origin)
-                    return
-                yield _group(stream[at : last + 1], origin)
-                at = last + 1
-                continue
-            if _word(token) == "include":
-                yield Item("include", [token], origin=origin)
-            elif _word(token) == "define":
-                yield _macro(token, origin)
-            at += 1
-            continue
-        stop = _end_of_declaration(stream, at, end)
-        yield _item(stream[at:stop], origin)
+def _declarations(stream: list[Token]) -> Iterator[Item]:
+    at = 0
+    while at < len(stream):
+        word, stop = _word(stream[at]), at + 1
+        if word in OPENING:
+            stop = _end_of_group(stream, at)
+            yield _group(stream[at:stop])
+        elif word == "define":
+            yield Item("macro", [stream[at]], {WORD.findall(stream[at].text)[1]})
+        elif not word:
+            stop = _end_of_declaration(stream, at)
+            yield _item(stream[at:stop])
         at = stop
 
 
@@ -245,14 +225,20 @@ def _word(token: Token) -> str:
     return found.group() if found else ""
 
 
-def _level(closing: dict[int, int], outer: int, at: int) -> bool:
-    """Whether the line at `at` is of the conditional that opens at `outer` itself, not of one inside."""
-    return not any(outer < i < at < j for i, j in closing.items())
-
-
-def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
+def _end_of_group(stream: list[Token], at: int) -> int:
+    """Behind the #endif of the conditional that opens at `at`."""
     depth = 0
-    for i in range(at, end):
+    for i in range(at, len(stream)):
+        word = _word(stream[i])
+        depth += (word in OPENING) - (word == "endif")
+        if depth == 0:
+            return i + 1
+    return len(stream)
+
+
+def _end_of_declaration(stream: list[Token], at: int) -> int:
+    depth = 0
+    for i in range(at, len(stream)):
         if stream[i].kind == "body" and depth == 0:
             return i + 1
         text = stream[i].text if stream[i].kind == "mark" else ""
@@ -262,7 +248,7 @@ def _end_of_declaration(stream: list[Token], at: int, end: int) -> int:
             depth -= 1
         elif text == ";" and depth == 0:
             return i + 1
-    return end
+    return len(stream)
 
 
 def _text(part: list[Token]) -> str:
@@ -277,60 +263,45 @@ def _text(part: list[Token]) -> str:
     return re.sub(r"[ \t]+\n", "\n", "".join(out))
 
 
-def _macro(token: Token, origin: str) -> Item:
-    return Item("macro", [token], {WORD.findall(token.text)[1]}, origin)
-
-
-def _group(part: list[Token], origin: str) -> Item:
-    made = Item("group", part, origin=origin)
-    inside: list[Token] = [token for token in part if token.kind != "directive"]
-    for item in _declarations(inside, {}, 0, len(inside), origin):
+def _group(part: list[Token]) -> Item:
+    made = Item("group", part)
+    for item in _declarations([token for token in part if token.kind != "directive"]):
         made.makes |= item.makes
-    for token in part:
-        if _word(token) == "define":
-            made.makes.add(WORD.findall(token.text)[1])
+    made.makes |= {WORD.findall(token.text)[1] for token in part if _word(token) == "define"}
     return made
 
 
-def _item(part: list[Token], origin: str) -> Item:
+def _item(part: list[Token]) -> Item:
     """One declaration from its tokens: what it is, and what it is called."""
     words = ["{" if token.kind == "body" else token.text for token in part]
-    made = Item("variable", part, origin=origin)
-    names = [i for i, token in enumerate(part) if token.kind == "name" and token.text not in KEYWORDS]
+    names = [i for i, token in enumerate(part) if token.kind == "name"]
     brace = words.index("{") if "{" in words else -1
+    call = words.index("(") if "(" in words else len(words)
     if words[0] == "typedef":
-        made.kind = "type"
         pointers = [i for i in range(len(words) - 2) if words[i : i + 2] == ["(", "*"]]
         if pointers and brace < 0:
-            made.makes = {words[pointers[0] + 2]}
-        else:
-            last = len(words) - 1 - words[::-1].index("}") if brace >= 0 else 0
-            made.makes = {words[i] for i in names if i > last and words[i + 1] in (";", "[", "__attribute__")}
-    elif words[0] in ("struct", "union", "enum") and (brace in (1, 2) or words[2:3] == [";"]):
-        made.kind = "type"
-        made.makes = {words[1]} if brace != 1 else set()
-        if words[0] == "enum":
-            depth = 0
-            for i in range(brace, len(words)):
-                depth += words[i] == "("
-                depth -= words[i] == ")"
-                if depth == 0 and words[i] in ("{", ",") and part[i + 1].kind == "name":
-                    made.makes.add(words[i + 1])
-        if words[2:3] == [";"]:
-            made.kind = "prototype"
-    elif "(" in words and "=" not in words[: words.index("(")]:
-        at = words.index("(")
-        if words[at + 1] == "*":  # a pointer to a function
-            made.makes = {words[i] for i in names if i > at and words[i + 1] in (")", "[")} - {"const"}
-            made.makes = {words[min(i for i in names if i > at)]}
-        else:
-            made.makes = {words[at - 1]}
-            made.kind = "function" if brace > at else "prototype"
-    else:
-        first = words.index("=") if "=" in words else len(words) - 1
-        before = [i for i in names if i < first]
-        made.makes = {words[before[-1]]} if before else set()
-    return made
+            return Item("type", part, {words[pointers[0] + 2]})
+        last = len(words) - 1 - words[::-1].index("}") if brace >= 0 else 0
+        return Item(
+            "type",
+            part,
+            {words[i] for i in names if i > last and words[i + 1] in (";", "[", "__attribute__")},
+        )
+    if words[0] in ("struct", "union", "enum") and (brace in (1, 2) or words[2:3] == [";"]):
+        made = Item("prototype" if words[2:3] == [";"] else "type", part, {words[1]} if brace != 1 else set())
+        depth = 0
+        for i in range(brace, len(words)) if words[0] == "enum" else ():
+            depth += (words[i] == "(") - (words[i] == ")")
+            if depth == 0 and words[i] in ("{", ",") and part[i + 1].kind == "name":
+                made.makes.add(words[i + 1])
+        return made
+    first = words.index("=") if "=" in words else len(words) - 1
+    if call < first and words[call + 1] == "*":  # a pointer to a function
+        return Item("variable", part, {words[min(i for i in names if i > call and words[i] != "const")]})
+    if call < first:
+        return Item("function" if brace > call else "prototype", part, {words[call - 1]})
+    before = [i for i in names if i < first]
+    return Item("variable", part, {words[before[-1]]} if before else set())
 
 
 # -- what is reached ----------------------------------------------------------------------------------------
@@ -341,18 +312,11 @@ class _Table:
 
     RANK: ClassVar = {"function": 3, "type": 3, "group": 2, "macro": 2, "variable": 1, "prototype": 0}
 
-    def __init__(self) -> None:
-        self.by_name: dict[str, Item] = {}
-        self.others: dict[str, list[Item]] = {}
-
-    def add(self, items: Iterable[Item]) -> None:
+    def __init__(self, items: Iterable[Item]) -> None:
+        self.by_name: dict[str, list[Item]] = {}
         for item in items:
             for name in item.makes:
-                held = self.by_name.get(name)
-                if held is None or self.RANK[item.kind] > self.RANK[held.kind]:
-                    self.by_name[name] = item
-                elif held.kind == item.kind == "function":
-                    self.others.setdefault(name, []).append(item)
+                self.by_name.setdefault(name, []).append(item)
 
     def reach(self, roots: Iterable[str]) -> list[Item]:
         """What the names lead to, in an order in which everything stands before its use."""
@@ -362,13 +326,16 @@ class _Table:
         return list(done.values())
 
     def _visit(self, name: str, done: dict[int, Item], path: tuple[str, ...]) -> None:
-        item = self.by_name.get(name)
-        if item is None or name in PROVIDED or id(item) in done:
+        if name not in self.by_name or name in PROVIDED:
+            return
+        every = self.by_name[name]
+        item = max(every, key=lambda item: self.RANK[item.kind])
+        if id(item) in done:
             return
         if name in path:
             raise CutFailed(f"{' > '.join(path)} > {name} comes round")
-        for other in self.others.get(name, ()):
-            if other.part != item.part and other.text != item.text:
+        for other in every:
+            if other.kind == item.kind == "function" and other.part != item.part and other.text != item.text:
                 raise CutFailed(f"{name} is not the same in {item.origin} and {other.origin}")
         if item.kind in ("variable", "prototype"):
             if item.kind == "prototype" and item.text.startswith(("struct", "union")):
@@ -376,7 +343,7 @@ class _Table:
             raise CutFailed(
                 f"{path[-1] if path else 'somebody'} needs {name}, which only Python's side has ({item.origin})"
             )
-        for used in sorted(item.uses - item.makes - KEYWORDS):
+        for used in sorted(item.uses - item.makes):
             self._visit(used, done, (*path, name))
         done[id(item)] = item
 
@@ -398,14 +365,14 @@ def cut(translations: Iterable[tuple[str, str]], front: str = "", roots: Iterabl
     str
     """
     kept = frozenset(roots)
-    table = _Table()
+    items = []
     for name, text in translations:
-        items = read(text, name)
-        for item in items:
-            item.rename(kept)
-        table.add(item for item in items if item.kind != "include")
-    own = read(front, "front")
-    made = set().union(*(item.makes for item in own), KEYWORDS)
+        found = read(text)
+        for item in found:
+            item.rename(name, kept)
+        items += found
+    table, own = _Table(items), read(front)
+    made = set().union(*(item.makes for item in own))
     reached = table.reach(set().union(*(item.uses for item in own), kept) - made)
     missing = sorted(kept - set(table.by_name))
     if missing:
@@ -431,15 +398,12 @@ def _plain(name: str, kept: frozenset[str]) -> str:
     mangled = MANGLED.match(name)
     if mangled:
         at, parts = mangled.end(), []
-        while at < len(name) and name[at].isdigit():
-            number = re.match(r"\d+", name[at:])
-            assert number is not None
-            size = int(number.group())
-            start = at + number.end()
-            if not (size and start + size < len(name) and name[start + size] == "_"):
+        while number := NUMBER.match(name, at):
+            end = number.end() + int(number[0])
+            if end == number.end() or name[end : end + 1] != "_":
                 break  # a number of Cython's own, as in __pyx_t_1
-            parts.append(name[start : start + size])
-            at = start + size + 1
+            parts.append(name[number.end() : end])
+            at = end + 1
         if parts:
             return "_".join([*parts[1:], name[at:]])
     for prefix, form in (("__pyx_v_", "{}_"), ("__pyx_t_", "tmp_{}"), ("__pyx_L", "L{}")):
