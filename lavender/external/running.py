@@ -68,6 +68,22 @@ def proof(
     return (x, zeta) if y is not None and check_certificate(qp.problem, y) is None else (None, None)
 
 
+def set_all(target: Any, settings: Mapping[str, Any], name: str) -> None:
+    """Put settings on an object of the backend `name`; InputError for one that it does not have."""
+    for key, value in settings.items():
+        if not hasattr(target, key):
+            known = sorted(k for k in dir(target) if not k.startswith("_"))
+            raise InputError(f"{name} has no setting {key!r}; known: {', '.join(known)}")
+        setattr(target, key, value)
+
+
+def certificate(y: Any, size: int) -> FloatArray | None:
+    """A proof of infeasibility as the backend gave it, where it is one by its shape."""
+    if y is None or np.size(y) != size or not np.isfinite(y).all() or not np.any(y):
+        return None
+    return np.array(y, float)
+
+
 Call = Callable[[QP, FloatArray, Limits, dict[str, Any]], Answer]
 
 

@@ -224,6 +224,16 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def kept(path: Path, is_current: Callable[[bytes], bool], make: Callable[[], bytes]) -> bytes:
+    """What a file holds where that is current; else what is made now, and kept there if that place may be written."""
+    if path.exists() and is_current(found := path.read_bytes()):
+        return found
+    made = make()
+    with contextlib.suppress(OSError, InputError):
+        write_bytes(path, made)
+    return made
+
+
 def write_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Any]) -> None:
     """`write_atomically` of an archive of arrays (.npz)."""
 

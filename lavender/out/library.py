@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -10,7 +9,7 @@ from tempfile import TemporaryDirectory
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import make_folder, writable, write_bytes, write_text
+from lavender.io.stored import kept, make_folder, writable, write_bytes
 from lavender.out.amalgamate import CutFailed, amalgamate, source_hash
 from lavender.out.header import functions, javascript
 from lavender.sim.web import compile as wasm
@@ -31,22 +30,18 @@ def source() -> str:
     LavenderError
         Neither: the kernels were changed, or come without one, and Cython is not installed.
     """
-    kept = HERE / "c" / "lavender.c"
-    wanted = source_hash(ROOT)
-    if kept.exists():
-        text = kept.read_text(encoding="utf-8")
-        if wanted in text[:1000]:
-            return text
-    try:
-        text = amalgamate(ROOT, ROOT / "build" / "cython")
-    except CutFailed as error:
-        raise LavenderError(
-            f"lavender.c does not lie in {kept.parent} and cannot be made: {str(error)[-500:]}; "
-            "install a wheel, or Cython"
-        ) from None
-    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
-        write_text(kept, text)
-    return text
+    wanted = source_hash(ROOT).encode()
+
+    def make() -> bytes:
+        try:
+            return amalgamate(ROOT, ROOT / "build" / "cython").encode()
+        except CutFailed as error:
+            raise LavenderError(
+                f"lavender.c does not lie in {HERE / 'c'} and cannot be made: {str(error)[-500:]}; "
+                "install a wheel, or Cython"
+            ) from None
+
+    return kept(HERE / "c" / "lavender.c", lambda text: wanted in text[:1000], make).decode()
 
 
 def _files(folder: Path) -> Iterator[Path]:
@@ -97,23 +92,22 @@ def write(
 
 def _module(header: str) -> bytes:
     """The library as a WebAssembly module: the one made of this source before, or a new one, kept beside it."""
-    kept, text = HERE / "js" / "liblavender.wasm", source()
+    path, text = HERE / "js" / "liblavender.wasm", source()
     stamp = wasm.section(wasm.SECTION, hashlib.sha256(text.encode()).hexdigest().encode())
-    if kept.exists() and (made := kept.read_bytes()).endswith(stamp):
-        return made
-    with TemporaryDirectory() as folder:
-        work = Path(folder)
-        (work / "lavender.c").write_text(text, encoding="utf-8")
-        (work / "lavender.h").write_text(header, encoding="utf-8")
-        names = [name for _, name, _ in functions(header)]
-        try:
-            wasm.build_library(work / kept.name, work / "lavender.c", names)
-        except wasm.BuildFailed as error:
-            raise LavenderError(str(error)) from None
-        made = (work / kept.name).read_bytes() + stamp
-    with contextlib.suppress(OSError, LavenderError):  # a package that nobody may write into
-        write_bytes(kept, made)
-    return made
+
+    def make() -> bytes:
+        with TemporaryDirectory() as folder:
+            work = Path(folder)
+            (work / "lavender.c").write_text(text, encoding="utf-8")
+            (work / "lavender.h").write_text(header, encoding="utf-8")
+            names = [name for _, name, _ in functions(header)]
+            try:
+                wasm.build_library(work / path.name, work / "lavender.c", names)
+            except wasm.BuildFailed as error:
+                raise LavenderError(str(error)) from None
+            return (work / path.name).read_bytes() + stamp
+
+    return kept(path, lambda module: module.endswith(stamp), make)
 
 
 def _put(out: Path, made: Mapping[str, str | bytes], replace: bool) -> list[Path]:

@@ -17,8 +17,8 @@ import lavender as lv
 from lavender import bench, cli, io
 from lavender.lab.bench import machine
 from lavender.lab.bench.line import code_of
-from lavender.lab.bench.lock import Lock
 from lavender.lab.bench.record import KINDS, file_name, printable, to_json
+from lavender.lab.bench.store import Lock
 from lavender.lab.report.findings import Report
 from lavender.lab.report.terminal import print_report
 
@@ -128,8 +128,8 @@ def show_all(records):
     from rich.console import Console
 
     from lavender.lab.report.curves import figures
-    from lavender.lab.report.markdown import summary
     from lavender.lab.report.page import page
+    from lavender.lab.report.write import summary
 
     shown = records.latest()
     report = Report(shown, shown)

@@ -9,8 +9,7 @@ import numpy as np
 from lavender.base.arrays import FloatArray
 from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, bound_rows
-from lavender.external.native._shared import set_all
-from lavender.external.running import Answer, Limits
+from lavender.external.running import Answer, Limits, set_all
 from lavender.judge.solution import Status
 
 

@@ -11,8 +11,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import InputError
 from lavender.base.later import sparse as sp
 from lavender.external.as_qp import QP, two_sided
-from lavender.external.native._shared import certificate
-from lavender.external.running import Answer, Limits
+from lavender.external.running import Answer, Limits, certificate
 from lavender.judge.solution import Status
 
 

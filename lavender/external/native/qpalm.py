@@ -8,8 +8,7 @@ import numpy as np
 
 from lavender.base.arrays import FloatArray
 from lavender.external.as_qp import QP, two_sided
-from lavender.external.native._shared import certificate, set_all
-from lavender.external.running import Answer, Limits
+from lavender.external.running import Answer, Limits, certificate, set_all
 from lavender.judge.solution import Status
 
 

@@ -9,7 +9,7 @@ lv.motions(problem).spread                             # m/s that Coulomb's law 
 
 from lavender.lab.motion.bound import Witness
 from lavender.lab.motion.error import MotionError, measure
-from lavender.lab.motion.reference import Reference, adopt, reference
+from lavender.lab.motion.reference import Reference, adopt, load_reference, reference, save_reference
 from lavender.lab.motion.several import (
     Motion,
     Motions,
@@ -20,7 +20,6 @@ from lavender.lab.motion.several import (
     motions_of,
     nearest,
 )
-from lavender.lab.motion.stored import load_reference, save_reference
 from lavender.lab.motion.unique import uniqueness
 
 __all__ = [

@@ -31,8 +31,7 @@ from lavender.lab.suite.families import (
     two_particles,
 )
 from lavender.lab.suite.lots import drawn, wild
-from lavender.lab.suite.robots import LICENCES, missing, package_of, robot, versions
-from lavender.lab.suite.steps import engine_step, walking
+from lavender.lab.suite.steps import LICENCES, engine_step, missing, package_of, robot, versions, walking
 
 __all__ = [
     "FAMILIES",

@@ -17,7 +17,7 @@ from typing import Any
 
 import lavender_ext
 from lavender.base.errors import InputError, LavenderError
-from lavender.io.stored import make_folder, writable, write_bytes, write_text
+from lavender.io.stored import kept, make_folder, writable, write_bytes, write_text
 from lavender.sim.web import compile as wasm
 from lavender.sim.web.scenes import page_scenes
 
@@ -42,23 +42,18 @@ def module(say: Callable[[str], Any] = lambda text: None, name: str = "lavender"
     `say` is told when something takes time.
     """
     shipped = SHIPPED / f"{name}.wasm"
-    if wasm.is_current(shipped, ROOT, wasm.PARTS[name]):
-        return shipped.read_bytes()
-    reason = wasm.why_not()
-    if reason:
-        state = "is of other kernels" if shipped.exists() else "is not in this installation"
-        raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
-    say(f"building the WebAssembly module {name} (some 10 s, kept for the next time)")
-    try:
-        build_module(shipped, name)
-        return shipped.read_bytes()
-    except LavenderError as error:
-        if not str(error).startswith("cannot write"):
-            raise
-    with TemporaryDirectory() as folder:  # the package is read-only
-        out = Path(folder, shipped.name)
-        build_module(out, name)
-        return out.read_bytes()
+
+    def make() -> bytes:
+        if reason := wasm.why_not():
+            state = "is of other kernels" if shipped.exists() else "is not in this installation"
+            raise LavenderError(f"the WebAssembly module {name} {state} and cannot be built: {reason}")
+        say(f"building the WebAssembly module {name} (some 10 s, kept for the next time)")
+        with TemporaryDirectory() as folder:
+            out = Path(folder, shipped.name)
+            build_module(out, name)
+            return out.read_bytes()
+
+    return kept(shipped, lambda _: wasm.is_current(shipped, ROOT, wasm.PARTS[name]), make)
 
 
 def write_page(folder: Path, say: Callable[[str], Any] = lambda text: None) -> Path:
