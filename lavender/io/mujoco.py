@@ -408,7 +408,8 @@ def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = export.JOI
             word = "joint" if of == kinds.mjCNSTR_LIMIT_JOINT else "tendon"
             names.append(f"limit of {_name(mj, model, word.upper(), which, word)}")
         else:
-            name = _contact_name(mj, model, geom[which], which)
+            sides = [_name(mj, model, "GEOM", g, "geom") if g >= 0 else "flex" for g in geom[which].tolist()]
+            name = f"contact {which} ({', '.join(side.removeprefix('geom ') for side in sides)})"
             if of == kinds.mjCNSTR_CONTACT_PYRAMIDAL:
                 size = 2 * (int(dim[which]) - 1)
                 names += [f"{name}, edge {edge}" for edge in range(size)]
@@ -422,9 +423,3 @@ def _words(mj: Any, model: Any, held: IntArray, m: int, joined: int = export.JOI
 def _name(mj: Any, model: Any, kind: str, which: int, word: str) -> str:
     given = mj.mj_id2name(model, getattr(mj.mjtObj, f"mjOBJ_{kind}"), which)
     return f"{word} {given or which}"
-
-
-def _contact_name(mj: Any, model: Any, geom: Any, which: int) -> str:
-    geoms = [int(g) for g in geom]
-    sides = [_name(mj, model, "GEOM", g, "geom").removeprefix("geom ") if g >= 0 else "flex" for g in geoms]
-    return f"contact {which} ({sides[0]}, {sides[1]})"

@@ -122,7 +122,11 @@ def verify(
     missing = [name for name in solvers or () if name not in held]
     if missing:
         raise InputError(f"the submission has no records of {', '.join(missing)}; it has {', '.join(held)}")
-    words = list(cases) or list(dict.fromkeys(_source(info.source) for info in records.cases.values()))
+    # A file of those who submit need not be here; a name of the suite is one everywhere.
+    sources = (
+        Path(info.source) if Path(info.source).suffix else info.source for info in records.cases.values()
+    )
+    words = list(cases) or list(dict.fromkeys(sources))
     items, others = _same(records, words)
     asked = [r for r in records if solvers is None or r.solver in solvers]
     names = [name for name in held if solvers is None or name in solvers]
@@ -133,11 +137,6 @@ def verify(
     found = {r.key: r for r in own}
     lines = tuple(_compared(r, found, reasons, {item.name for item in items}) for r in asked)
     return Submission(theirs, lines, tuple(others))
-
-
-def _source(source: str) -> str | Path:
-    # A file of those who submit need not be here; a name of the suite is one everywhere.
-    return Path(source) if Path(source).suffix else source
 
 
 def _same(records: Records, words: Sequence[Source]) -> tuple[list[Item], list[str]]:

@@ -101,7 +101,9 @@ def _dependent(flint: Any, j: Any, target: FloatArray) -> tuple[list[int], list[
             return None
         if all(held):
             return kept, [k for k in others if left[k]]
-        prime = _next(flint, prime)  # it divides what is not 0
+        prime = next(
+            p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime()
+        )  # this one divides what is not 0
 
 
 def _parted(m: int, pairs: list[tuple[int, int]]) -> list[Any]:
@@ -126,11 +128,6 @@ def _spanned(flint: Any, whole: list[list[int]], rows: list[int], left: dict[int
 def _rank(flint: Any, rows: list[list[int]]) -> int:
     live = [k for k in range(len(rows[0])) if any(row[k] for row in rows)] if rows else []
     return int(flint.fmpz_mat(len(rows), len(live), [row[k] for row in rows for k in live]).rank())
-
-
-def _next(flint: Any, prime: int) -> int:
-    """The prime after a prime."""
-    return next(p for p in count(prime + 2, 2) if flint.fmpz(p).is_prime())
 
 
 def _whole(a: FloatArray) -> list[list[int]]:

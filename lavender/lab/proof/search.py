@@ -313,7 +313,8 @@ class Search:
     def _singular(self, which: Any, slope: Any) -> _Undecided:
         """Names the blocks whose impulses the equations do not fix, if they are singular."""
         rows = which[:0]
-        if len(which) <= NAMED and np.isfinite(slope := _array(slope)).all():
+        slope = slope if isinstance(slope, np.ndarray) else slope.toarray()
+        if len(which) <= NAMED and np.isfinite(slope).all():
             _, size, direction = np.linalg.svd(
                 slope / np.maximum(abs(slope).max(axis=1, keepdims=True), UNIT)
             )
@@ -429,10 +430,6 @@ class Search:
 
 class _Recase(Exception):
     """Cases of blocks were changed before there was a zero."""
-
-
-def _array(a: Any) -> FloatArray:
-    return a if isinstance(a, np.ndarray) else a.toarray()
 
 
 def _listed(names: tuple[str, ...]) -> str:

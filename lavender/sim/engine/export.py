@@ -51,6 +51,10 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         patch_radius=a["patch_radius"][:k].copy(),
         rolling=a["rolling"][:k].copy() if len(a["rolling"]) else np.zeros(k),
     )
+    # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
+    above = np.uint64(0xFFFFFF << 40) + np.arange(kj, dtype=np.uint64)
+    points = (a["key"][:c] & np.uint64(0xFFFF)).tolist()
+    pairs = zip(a["contact_pair"][:c].tolist(), points, strict=True)
     guess = a["impulse"][:m].copy() if state.head[HEAD["warm_start"]] else None
     return Problem(
         a["b"][:m].copy(),
@@ -58,22 +62,11 @@ def problem_of(state: State, bodies: Sequence[str], joints: Sequence[str], name:
         rows=rows,
         compliance=a["compliance"][:m].copy(),
         guess=guess,
-        key=_block_keys(a["key"][:c], kj),
-        names=[*joints, *_contact_names(bodies, a["contact_pair"][:c], a["key"][:c])],
+        key=np.concatenate([above, a["key"][:c]]),
+        names=[*joints, *(f"{bodies[i]} on {bodies[j]}, point {f}" for (i, j), f in pairs)],
         name=name,
         copy=False,
     )
-
-
-def _block_keys(contacts: np.ndarray, joints: int) -> np.ndarray:
-    # joints above all contacts: 24 bits for each body leave the pair (2^24 - 1, ...) free
-    above = np.uint64(0xFFFFFF << 40) + np.arange(joints, dtype=np.uint64)
-    return np.concatenate([above, contacts])
-
-
-def _contact_names(bodies: Sequence[str], pair: np.ndarray, key: np.ndarray) -> list[str]:
-    points = (key & np.uint64(0xFFFF)).tolist()
-    return [f"{bodies[i]} on {bodies[j]}, point {f}" for (i, j), f in zip(pair.tolist(), points, strict=True)]
 
 
 def _any_tangent(normal: FloatArray) -> FloatArray:

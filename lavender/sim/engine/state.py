@@ -141,7 +141,9 @@ class State:
         """The start state of a scene."""
         p, bodies, joints = scene.parameters, scene.bodies, scene.joints
         n = len(bodies)
-        uneven = [not b.is_static and not _is_even(b.inertia) for b in bodies]
+        # the same about every axis, to the bit: then R I R^T is I whatever R
+        even = (np.array_equal(b.inertia, np.eye(3) * b.inertia[0, 0]) for b in bodies)
+        uneven = [not b.is_static and not same for b, same in zip(bodies, even, strict=True)]
         frames = any(uneven) or bool(joints) or any(isinstance(b.shape, Box) for b in bodies)
         mu = np.array([p.friction if b.friction is None else b.friction for b in bodies])
         patch = np.array([p.patch_radius if b.patch_radius is None else b.patch_radius for b in bodies])
@@ -252,11 +254,6 @@ def _put_joints(a: dict[str, Any], joints: Sequence[Joint]) -> None:
         a["joint_body"][i] = [a["dyn"][k] if k >= 0 else -1 for k in (j.a, j.b)]
         row += j.n_rows
         a["ptr"][i + 1] = row
-
-
-def _is_even(inertia: np.ndarray) -> bool:
-    # the same about every axis, to the bit: then R I R^T is I whatever R
-    return bool(np.array_equal(inertia, np.eye(3) * inertia[0, 0]))
 
 
 def _shape(shape: Any) -> tuple[int, list[float]]:

@@ -146,8 +146,10 @@ def campaign(
     this = machine.describe(
         {**plan.as_dict(), "campaign": True}, {m for n in names for m in specs[n].requires}
     )
+    # A name or path is read again by the worker: a cluster shares the files, or the suite.
+    travels = [item.source if item.given is None else replace(item.given, copy=False) for item in items]
     pairs = [
-        Pair(len(names) * i + j, item.name, _travels(item), item.reason, name)
+        Pair(len(names) * i + j, item.name, travels[i], item.reason, name)
         for i, item in enumerate(items)
         for j, name in enumerate(names)
     ]
@@ -209,11 +211,6 @@ def _finished(records: Records, run: str) -> dict[tuple[str, str], list[Any]]:
         if r.run == run and (r.case, r.solver) in closed:
             found[r.case, r.solver][r.key] = r  # written again after a kill: the later one
     return {key: list(entries.values()) for key, entries in found.items()}
-
-
-def _travels(item: Item) -> Any:
-    # A name or path is read again by the worker: a cluster shares the files, or the suite.
-    return item.source if item.given is None else replace(item.given, copy=False)
 
 
 def _hand_out(pairs: list[Pair], order: Order, workers: int, backend: str) -> Iterator[tuple[int, list[Any]]]:

@@ -9,7 +9,7 @@ from lavender.base.arrays import FloatArray
 from lavender.base.errors import CapabilityError
 from lavender.lab.phenomena.engines import Stepping
 from lavender.lab.phenomena.engines.tree import parents, xyzw
-from lavender.sim.scene import Body, Box, Plane, Scene, Sphere
+from lavender.sim.scene import Box, Plane, Scene, Sphere
 from lavender.sim.scene.arithmetic import frame_quaternion
 from lavender.sim.scene.parts import rotation
 
@@ -74,8 +74,9 @@ class Engine(Stepping):
                 rotation=xyzw(frame_quaternion(turn)),
                 **self.material,
             )
+        turn = frame_quaternion(self.frame @ rotation(body.quaternion))
         more = {
-            "mass": body.mass, "position": self.frame @ body.position, "rotation": self._turned(body),
+            "mass": body.mass, "position": self.frame @ body.position, "rotation": xyzw(turn),
             "linear_velocity": self.frame @ body.velocity, "collision": not jointed,
             "angular_velocity": self.frame @ body.angular_velocity, **self.material,
         }  # fmt: skip
@@ -84,9 +85,6 @@ class Engine(Stepping):
         if isinstance(body.shape, Box):
             return made.box(f"b{i}", size=body.shape.size, **more)
         raise CapabilityError(f"{body.name} has no shape that lavendersim could be given")
-
-    def _turned(self, body: Body) -> list[float]:
-        return xyzw(frame_quaternion(self.frame @ rotation(body.quaternion)))
 
     def state(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """See `Stepping.state`."""
