@@ -11,6 +11,8 @@ from lavender.base.errors import InputError
 from lavender.cli.measuring import progress, show_sheet
 from lavender.cli.options import (
     EXIT_UNMET,
+    FILE,
+    FOLDER,
     one_thread,
     precision_option,
     threshold_option,
@@ -21,7 +23,7 @@ from lavender.io.stored import writable
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("model", metavar="MODEL.xml", type=FILE)
 @worlds_options(worlds=4096, steps=200)
 @click.option(
     "--engine",
@@ -36,7 +38,7 @@ from lavender.io.stored import writable
 @precision_option
 @click.option("--workers", type=int, default=-1, help="Processes, for mujoco; -1: one for each core.")
 @click.option("--backend", default="loky", show_default=True, help="A backend of joblib, such as dask.")
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("lavender-audit"),
+@click.option("--out", type=FOLDER, default=Path("lavender-audit"),
               show_default=True, help="Folder of the page, the records and the worst worlds.")  # fmt: skip
 @click.pass_context
 def audit(context: click.Context, /, model: Path, out: Path, accept: float | None, **asked: Any) -> None:

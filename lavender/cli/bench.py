@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError, LavenderError
-from lavender.cli.options import EXIT_UNMET, one_thread, say
+from lavender.cli.options import EXIT_UNMET, PATH, one_thread, say
 from lavender.io.stored import writable, write_text
 
 
@@ -19,7 +19,7 @@ def bench() -> None:
 
 
 @bench.command("mujoco")
-@click.argument("models", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("models", nargs=-1, required=True, type=PATH)
 @click.option(
     "--steps", type=click.IntRange(0), default=10, show_default=True, help="Problems of each model."
 )
@@ -37,9 +37,7 @@ def bench() -> None:
     show_default=True,
     help="Also measure this many consecutive steps of each model, warm-started.",
 )
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Write the numbers of every problem as JSON lines."
-)
+@click.option("--out", type=PATH, help="Write the numbers of every problem as JSON lines.")
 def mujoco(models: tuple[Path, ...], steps: int, every: int, warm: int, out: Path | None) -> None:
     """Measure lavender's `newton` beside MuJoCo's Newton solver on steps of your own models (MJCF files).
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import refuse_unused, say
+from lavender.cli.options import FOLDER, refuse_unused, say
 from lavender.io.stored import writable
 
 VECTORS = 4  # problems in the test vectors, at most
@@ -14,7 +14,7 @@ VECTORS = 4  # problems in the test vectors, at most
 
 @click.command()
 @click.argument("kind", type=click.Choice(["c", "npm"]))
-@click.argument("folder", type=click.Path(file_okay=False, path_type=Path))
+@click.argument("folder", type=FOLDER)
 @click.option(
     "--for", "records", type=click.Path(exists=True, path_type=Path), metavar="RECORDS",
     help="records.jsonl of a report or its folder: add the recommended solver, settings and test vectors (c only).",

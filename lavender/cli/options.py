@@ -29,6 +29,9 @@ EXIT_BAD_INPUT = 2  # or a folder that another process writes
 EXIT_INFEASIBLE = 3  # with a certificate that the judge confirms
 EXIT_INTERRUPTED = 130
 LEAST_WIDTH = 60  # columns of a terminal
+PATH = click.Path(path_type=Path)
+FILE = click.Path(dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
 Option = tuple[tuple[str, ...], dict[str, Any]]  # names, and what click is told of it
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from lavender.cli.options import parameters_of, refuse_unused
+from lavender.cli.options import PATH, parameters_of, refuse_unused
 from lavender.io.stored import writable, write_text
 from lavender.lab.bench.machine import cpu_name, versions
 from lavender.lab.phenomena import WAYS, Record, chosen, run
@@ -26,11 +26,7 @@ def _names(text: str | None) -> list[str] | None:
 
 @click.command("phenomena")
 @click.argument("names", nargs=-1, metavar="[NAMES]...")
-@click.option(
-    "--steppers",
-    default=None,
-    help="Steppers of lavender, separated by commas; default: all; none: no stepper.",
-)
+@click.option("--steppers", help="Steppers of lavender, separated by commas; default: all; none: no stepper.")
 @click.option(
     "--engines", default="none", show_default=True, help="Other engines, separated by commas, or all."
 )
@@ -45,7 +41,7 @@ def _names(text: str | None) -> list[str] | None:
     "--limit", type=click.FloatRange(min=1.0), default=120.0, show_default=True, metavar="S",
     help="Limit of the wall time of one case in another engine.",
 )  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path), default=None, help="Write every measurement as JSON.")
+@click.option("--out", type=PATH, help="Write every measurement as JSON.")
 @click.option(
     "--list",
     "listed",

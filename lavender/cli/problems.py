@@ -7,15 +7,13 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, console, one_thread, refuse_unused, say
+from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, console, one_thread, refuse_unused, say
 from lavender.io.stored import make_folder, writable, write_text
 
 
 @click.command()
 @click.argument("groups", nargs=-1, metavar="[@SET | FILE | FOLDER]...")
-@click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), help="Write every problem as a file here."
-)
+@click.option("--out", type=FOLDER, help="Write every problem as a file here.")
 @click.option(
     "--check", is_flag=True, help="Make every problem again and compare its numbers with the manifest."
 )
@@ -25,12 +23,10 @@ from lavender.io.stored import make_folder, writable, write_text
 @click.option("--count", default=50, show_default=True, help="How many a secret draws.")
 @click.option(
     "--certify",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=FILE,
     help="Prove what can be proved of each and write this manifest: minutes, with the extra `proof`.",
 )
-@click.option(
-    "--page", type=click.Path(dir_okay=False, path_type=Path), help="Write the catalogue as markdown."
-)
+@click.option("--page", type=FILE, help="Write the catalogue as markdown.")
 @click.pass_context
 def problems(
     context: click.Context,

@@ -7,15 +7,20 @@ from typing import Any
 
 import click
 
-from lavender.cli.options import precision_option, recording_options, refuse_unused_recording, say
+from lavender.cli.options import (
+    FILE,
+    FOLDER,
+    precision_option,
+    recording_options,
+    refuse_unused_recording,
+    say,
+)
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("model", metavar="MODEL.xml", type=FILE)
 @recording_options
-@click.option(
-    "--out", required=True, type=click.Path(file_okay=False, path_type=Path), help="Folder for the problems."
-)
+@click.option("--out", required=True, type=FOLDER, help="Folder for the problems.")
 @click.option(
     "--replace", is_flag=True, help="First delete the problems of an earlier recording in the folder."
 )

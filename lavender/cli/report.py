@@ -16,6 +16,7 @@ from lavender.cli.measuring import Measured, measure, run_campaign
 from lavender.cli.options import (
     EXIT_INTERRUPTED,
     EXIT_UNMET,
+    PATH,
     RECORDING,
     ManyValues,
     Numbers,
@@ -36,11 +37,7 @@ from lavender.lab.bench.record import file_name
 @click.argument("files", nargs=-1, metavar="[FILES | FOLDERS | NAMES]...")
 @plan_options
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("lavender-report"),
-    show_default=True,
-    help="Folder of the report.",
+    "--out", type=PATH, default=Path("lavender-report"), show_default=True, help="Folder of the report."
 )
 @click.option(
     "--sequence/--no-sequence",
@@ -64,11 +61,7 @@ from lavender.lab.bench.record import file_name
 @click.option(
     "--backend", default="loky", show_default=True, help="With --campaign: a backend of joblib, such as dask."
 )
-@click.option(
-    "--compare",
-    type=click.Path(path_type=Path),
-    help="Compare with earlier records (.jsonl, or their folder).",
-)
+@click.option("--compare", type=PATH, help="Compare with earlier records (.jsonl, or their folder).")
 @click.option(
     "--time-budgets",
     type=Numbers(),

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from pathlib import Path
 from typing import Any
 
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import going_on, parameters_of, refuse_unused, say
+from lavender.cli.options import PATH, going_on, parameters_of, refuse_unused, say
 
 FILES = ("trace", "plot", "film", "record")  # options that leave them
 OF_THE_SCENE = (
@@ -26,11 +25,7 @@ OF_THE_SCENE = (
 @click.argument("scene")
 @click.option("--steps", type=int, default=240, show_default=True, help="Number of steps.")
 @click.option(
-    "--iterations",
-    "solver_iterations",
-    type=int,
-    default=None,
-    help="Sweeps per solve, 4 to 64 (other steppers: 1 to 64).",
+    "--iterations", "solver_iterations", type=int, help="Sweeps per solve, 4 to 64 (other steppers: 1 to 64)."
 )
 @click.option(
     "--warm-start/--no-warm-start",
@@ -39,12 +34,11 @@ OF_THE_SCENE = (
 )
 @click.option(
     "--order",
-    default=None,
     help="Order in which a sweep visits the blocks: given, reverse, bottom_up, top_down, alternating, ... "
     "Default: the stepper's.",
 )
-@click.option("--solver", default=None, help="Solver of each step, by name. Default: sequential_impulses.")
-@click.option("--stepper", default=None, help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
+@click.option("--solver", help="Solver of each step, by name. Default: sequential_impulses.")
+@click.option("--stepper", help="Time stepping: impulses (default), soft_step, xpbd or avbd.")
 @click.option(
     "--set",
     "parameters",
@@ -53,26 +47,16 @@ OF_THE_SCENE = (
     help="Set a parameter of the scene, e.g. n=20 or friction=0.3; may be repeated.",
 )
 @click.option("--residual", is_flag=True, help="Also measure the judge's residual of all rows in every step.")
-@click.option(
-    "--plot", type=click.Path(path_type=Path), default=None, help="Write a figure of the run (.svg, .png)."
-)
-@click.option(
-    "--trace", type=click.Path(path_type=Path), default=None, help="Write the values of every step (.csv)."
-)
-@click.option(
-    "--record",
-    type=click.Path(path_type=Path),
-    default=None,
-    help="Write the problem of every step (.npz) to this folder.",
-)
+@click.option("--plot", type=PATH, help="Write a figure of the run (.svg, .png).")
+@click.option("--trace", type=PATH, help="Write the values of every step (.csv).")
+@click.option("--record", type=PATH, help="Write the problem of every step (.npz) to this folder.")
 @click.option(
     "--replace", is_flag=True, help="With --record: first delete the problems of an earlier recording."
 )
 @click.option("--view", is_flag=True, help="Show the run live in a web page on this machine, until Ctrl-C.")
 @click.option(
     "--film",
-    type=click.Path(path_type=Path),
-    default=None,
+    type=PATH,
     help="Write a film of the run: .gif, .mp4, .png pictures, or a file for `lavender view`.",
 )
 @click.pass_context

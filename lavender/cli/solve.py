@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, one_thread, say
+from lavender.cli.options import EXIT_INFEASIBLE, EXIT_INTERRUPTED, EXIT_UNMET, PATH, one_thread, say
 from lavender.io.stored import writable, write_atomically
 
 RESIDUAL = ("error", "relative", "energy", "velocity", "floor")  # what is written of it
@@ -26,16 +26,11 @@ RESIDUAL = ("error", "relative", "energy", "velocity", "floor")  # what is writt
     show_default=True,
     help="Relative residual to reach; 0 runs exactly --max-iter iterations.",
 )
-@click.option("--max-iter", type=int, default=None, help="The most iterations; default: the solver's.")
-@click.option("--time-limit", type=float, default=None, metavar="S", help="Limit of the solve time.")
-@click.option("--order", default=None, help="Sweep order, for solvers that take one.")
-@click.option("--seed", type=int, default=None, help="Seed of a random order.")
-@click.option(
-    "--output",
-    type=click.Path(path_type=Path),
-    default=None,
-    help="Write impulse, slack, status and residual to this .npz file.",
-)
+@click.option("--max-iter", type=int, help="The most iterations; default: the solver's.")
+@click.option("--time-limit", type=float, metavar="S", help="Limit of the solve time.")
+@click.option("--order", help="Sweep order, for solvers that take one.")
+@click.option("--seed", type=int, help="Seed of a random order.")
+@click.option("--output", type=PATH, help="Write impulse, slack, status and residual to this .npz file.")
 def solve(
     file: str,
     solver: str,

@@ -8,17 +8,17 @@ from typing import Any
 import click
 
 from lavender.cli.measuring import progress, show_sheet
-from lavender.cli.options import one_thread, threshold_option, worlds_options
+from lavender.cli.options import FILE, FOLDER, one_thread, threshold_option, worlds_options
 from lavender.io.stored import writable
 
 
 @click.command()
-@click.argument("model", metavar="MODEL.xml", type=click.Path(dir_okay=False, path_type=Path))
+@click.argument("model", metavar="MODEL.xml", type=FILE)
 @worlds_options(worlds=16, steps=200)
 @click.option("--ahead", default=10, show_default=True, help="Steps after which the motion is compared.")
 @click.option("--rounds", default=5, show_default=True, help="In which the settings are timed in turns.")
 @threshold_option
-@click.option("--out", type=click.Path(file_okay=False, path_type=Path), default=Path("lavender-tune"),
+@click.option("--out", type=FOLDER, default=Path("lavender-tune"),
               show_default=True, help="Folder of the page.")  # fmt: skip
 def tune(model: Path, out: Path, **asked: Any) -> None:
     """Measure MuJoCo's settings on worlds of a model (MJCF): time of a step beside error.

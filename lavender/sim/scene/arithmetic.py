@@ -19,20 +19,8 @@ BITS = 256
 #: Largest angle [rad]; as many bits of PI go into telling its turns.
 LARGEST = 2.0**64
 
-
-def _pi() -> int:
-    # pi 2^BITS by Machin's formula, 16 atan(1/5) - 4 atan(1/239), with 32 bits to spare
-    def atan(n: int) -> int:
-        term = total = (1 << BITS + 32) // n
-        for k in range(1, BITS):
-            term //= -n * n
-            total += term // (2 * k + 1)
-        return total
-
-    return (16 * atan(5) - 4 * atan(239)) >> 32
-
-
-PI = _pi()
+#: pi 2^BITS.
+PI = 0x3243F6A8885A308D313198A2E03707344A4093822299F31D0082EFA98EC4E6C89
 
 
 def sine_cosine(angle: float) -> tuple[float, float]:

@@ -143,52 +143,42 @@ def _own() -> list[Way]:
 
 
 _PATCHES = {"spin": NO_SPIN, "rolling": NO_ROLLING}
-_JOLT = {"engine": "jolt", "sweeps": 10}
-_RAPIER, _VBD = {"engine": "rapier"}, {"solver": "VBD", "iterations": 10}
-#: Engines of others: name, file, settings and their words, what a scene may not ask of it.
-_OTHERS: tuple[tuple[str, str, dict[str, Any], str, dict[str, str]], ...] = (
+_JOLT, _RAPIER = PACKAGES_OF_NODE["jolt"], PACKAGES_OF_NODE["rapier"]
+#: Engines of others.
+_OTHERS = (
     *(
-        (
-            f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", {"cone": cone, "noslip": noslip},
-            "2 ms, Newton to 1e-8" + (f", {noslip} iterations of noslip" if noslip else ""), {},
+        Way(
+            f"mujoco {cone}{' noslip' if noslip else ''}", "mujoco", "mujoco", {"cone": cone, "noslip": noslip},
+            "2 ms, Newton to 1e-8" + (f", {noslip} iterations of noslip" if noslip else ""),
         )
         for cone in ("pyramidal", "elliptic") for noslip in (0, 10)
     ),
-    ("pybullet", "bullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps", {}),
-    ("pybullet 4x100", "bullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps", {}),
-    ("drake", "drake", {"approximation": "lagged", "hydroelastic": False}, "1 ms, point contacts: its defaults",
-     _PATCHES),
-    ("drake lagged", "drake", {"approximation": "lagged", "hydroelastic": True}, "1 ms, hydroelastic bodies of 1e8 Pa",
-     _PATCHES),
-    ("drake sap", "drake", {"approximation": "sap", "hydroelastic": True}, "1 ms, SAP, hydroelastic bodies of 1e8 Pa",
-     _PATCHES),
-    ("lavendersim", "lavender_sim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps", {}),
-    ("lavendersim 64", "lavender_sim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps", {}),
-    ("rapier", "node", {**_RAPIER, "iterations": 4}, "1/60 s, 4 iterations: its defaults", NO_TORSION),
-    ("rapier 16", "node", {**_RAPIER, "iterations": 16}, "1/60 s, 16 iterations", NO_TORSION),
-    ("jolt", "node", {**_JOLT, "substeps": 1, "gyroscopic": False}, "1/60 s, 10 sweeps: its defaults", NO_TORSION),
-    ("jolt 4", "node", {**_JOLT, "substeps": 4, "gyroscopic": True}, "1/60 s in 4 of 10 sweeps, gyroscopic torques",
-     NO_TORSION),
-    ("newton xpbd", "newton", {"solver": "XPBD", "iterations": 2}, "1/60 s in 4 of 2 iterations, its default", {}),
-    ("newton xpbd 20", "newton", {"solver": "XPBD", "iterations": 20}, "1/60 s in 4 of 20 iterations", {}),
-    ("newton vbd", "newton", _VBD, "1/60 s in 4 of 10 iterations, its default", NO_TORSION),
+    Way("pybullet", "bullet", "pybullet", {"sweeps": 50, "substeps": 1}, "1/240 s, 50 sweeps"),
+    Way("pybullet 4x100", "bullet", "pybullet", {"sweeps": 100, "substeps": 4}, "1/240 s in 4 of 100 sweeps"),
+    Way("drake", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": False},
+        "1 ms, point contacts: its defaults", cannot=_PATCHES),
+    Way("drake lagged", "drake", "pydrake", {"approximation": "lagged", "hydroelastic": True},
+        "1 ms, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
+    Way("drake sap", "drake", "pydrake", {"approximation": "sap", "hydroelastic": True},
+        "1 ms, SAP, hydroelastic bodies of 1e8 Pa", cannot=_PATCHES),
+    Way("lavendersim", "lavender_sim", "lavendersim", {"sweeps": 22}, "1/60 s in 4 of 22 sweeps"),
+    Way("lavendersim 64", "lavender_sim", "lavendersim", {"sweeps": 64}, "1/60 s in 4 of 64 sweeps"),
+    Way("rapier", "node", _RAPIER, {"engine": "rapier", "iterations": 4}, "1/60 s, 4 iterations: its defaults",
+        cannot=NO_TORSION),
+    Way("rapier 16", "node", _RAPIER, {"engine": "rapier", "iterations": 16}, "1/60 s, 16 iterations",
+        cannot=NO_TORSION),
+    Way("jolt", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 1, "gyroscopic": False},
+        "1/60 s, 10 sweeps: its defaults", cannot=NO_TORSION),
+    Way("jolt 4", "node", _JOLT, {"engine": "jolt", "sweeps": 10, "substeps": 4, "gyroscopic": True},
+        "1/60 s in 4 of 10 sweeps, gyroscopic torques", cannot=NO_TORSION),
+    Way("newton xpbd", "newton", "newton", {"solver": "XPBD", "iterations": 2},
+        "1/60 s in 4 of 2 iterations, its default"),
+    Way("newton xpbd 20", "newton", "newton", {"solver": "XPBD", "iterations": 20}, "1/60 s in 4 of 20 iterations"),
+    Way("newton vbd", "newton", "newton", {"solver": "VBD", "iterations": 10},
+        "1/60 s in 4 of 10 iterations, its default", cannot=NO_TORSION),
 )  # fmt: skip
-PACKAGES = {
-    "bullet": "pybullet",
-    "drake": "pydrake",
-    "lavender_sim": "lavendersim",
-}  # file -> module, of another name
-
-
-def _package(module: str, options: Mapping[str, Any]) -> str:
-    return PACKAGES_OF_NODE[options["engine"]] if module == "node" else PACKAGES.get(module, module)
-
-
 #: Name -> way; ours first.
-WAYS: dict[str, Way] = {way.name: way for way in _own()} | {
-    name: Way(name, module, _package(module, options), options, text, cannot=cannot)
-    for name, module, options, text, cannot in _OTHERS
-}
+WAYS: dict[str, Way] = {way.name: way for way in (*_own(), *_OTHERS)}
 
 
 def engine(module: str, scene: Scene, **options: Any) -> Stepping:
