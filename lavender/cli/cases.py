@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from lavender.cli.options import console
+from lavender.cli.options import say
 
 
 @click.command()
@@ -25,10 +25,9 @@ def cases(pattern: str) -> None:
     }
     if not found:
         raise UnknownName("family of cases", pattern, FAMILIES)
-    out = console()
     for name, f in found.items():
         given = {n: f.preset.get(n, p.default) for n, p in f.signature.parameters.items()}
         words = ", ".join(n if v is p.empty else f"{n}={spell(v)}" for (n, v), p in
                           zip(given.items(), f.signature.parameters.values(), strict=True))  # fmt: skip
-        out.print(f"{name}({words})", style="bold", highlight=False, markup=False, soft_wrap=True)
-        out.print(f"    {f.summary}", highlight=False, markup=False, soft_wrap=True)
+        say(f"{name}({words})", style="bold")
+        say(f"    {f.summary}")

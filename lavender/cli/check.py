@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import click
 
 from lavender.base.errors import InputError
@@ -10,11 +12,10 @@ from lavender.cli.options import (
     ManyValues,
     Names,
     Reading,
-    console,
     one_thread,
-    plain,
     precision_option,
     refuse_unused,
+    say,
     threshold_option,
     was_given,
 )
@@ -59,16 +60,15 @@ def check(
     from lavender.lab.check import cross_check
 
     one_thread()
-    out = console()
     if files and files[0].endswith(".jsonl"):
         refuse_unused(
             context, ["reference", "tol", "precision", "threshold"], "with a records.jsonl, which has its own"
         )
         submission = bench.verify(bench.read(files[0]), files[1:], solvers)
-        out.print(plain(str(submission)), highlight=False, soft_wrap=True)
+        say(str(submission))
         raise click.exceptions.Exit(0 if submission.ok else EXIT_UNMET)
     contradicted = untaken = answers = above = unmet = 0
-    reading = Reading(lambda line: out.print(plain(line), style="yellow", highlight=False))
+    reading = Reading(partial(say, style="yellow"))
     asked = precision is not None or was_given(context, "threshold")
     bench.solver_names([*(solvers or ()), reference])
     number("tol", tol, low=0.0)
@@ -77,23 +77,22 @@ def check(
         with reading(item):
             found = cross_check(item.problem, solvers=solvers, reference=reference, tol=tol)
             stored = item.judged(precision, threshold)
-            out.print(f"[bold]{plain(item.name)}[/]", highlight=False)
-            out.print(plain(str(found)), highlight=False)
+            say(item.name, style="bold")
+            say(str(found))
             if stored is not None:
                 answers += 1
                 above += stored.verdict != AT_FLOOR
                 unmet += stored.verdict not in (AT_FLOOR, CLOSE)
-                said = f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}"
-                out.print(plain(said), highlight=False)
+                say(f"stored answer: {stored.verdict_in_words} of {stored.precision}; {stored}")
             contradicted += len(found.contradicted)
             untaken += len(found.refused) == len(found.rows)
     if contradicted:
-        out.print(f"[bold red]{contradicted} claims are contradicted[/]")
+        say(f"{contradicted} claims are contradicted", style="bold red")
     if untaken:
-        out.print(f"[bold red]{untaken} problems are taken by none of these solvers[/]")
+        say(f"{untaken} problems are taken by none of these solvers", style="bold red")
     if asked and not answers:
         raise InputError("--precision, --threshold: no file holds an answer to judge (an entry `impulse`)")
     if answers:
         shares = f"{above} of {answers} above their floor, {unmet} also more than {threshold:g} m/s off"
-        out.print(f"stored answers: {shares}", highlight=False, markup=False)
+        say(f"stored answers: {shares}")
     reading.end(contradicted or untaken or (asked and unmet))

@@ -19,6 +19,7 @@ from lavender.cli.options import (
     going_on,
     one_thread,
     refuse_unused,
+    say,
     was_given,
 )
 
@@ -161,9 +162,9 @@ def show_sheet(sheet: Sheet, folder: Path, stopped: bool) -> None:
     page = sheet.write(folder)
     with going_on():
         sheet.show(console())
-        console().print(f"\npage: {page}", highlight=False, markup=False, soft_wrap=True)
+        say(f"\npage: {page}")
     if stopped:
-        console().print("[yellow]Stopped: of what was done until then.[/]")
+        say("Stopped: of what was done until then.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
 
 

@@ -315,11 +315,14 @@ def plain(text: str) -> str:
     return escape(printable(text, lines=True))
 
 
-def say(text: str, err: bool = False) -> None:
+def say(text: str, err: bool = False, style: str = "") -> None:
     """Print what names of files and problems are part of: what a terminal would obey is written as its code."""
     from lavender.lab.bench.record import printable
 
-    click.echo(printable(text, lines=True), err=err)
+    if style:
+        console(err).print(plain(text), style=style, highlight=False, soft_wrap=True)
+    else:
+        click.echo(printable(text, lines=True), err=err)
 
 
 class Reading:

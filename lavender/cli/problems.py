@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, console, one_thread, refuse_unused, say
+from lavender.cli.options import EXIT_UNMET, FILE, FOLDER, one_thread, refuse_unused, say
 from lavender.io.stored import make_folder, writable, write_text
 
 
@@ -105,7 +105,5 @@ def problems(
     elif secret is not None:
         click.echo("\n".join(chosen))
     elif page is None:
-        to = console()
         for e in found:
-            line = f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}"
-            to.print(line, highlight=False, markup=False, soft_wrap=True)
+            say(f"@{e.group} {e.name}: {e.rows} rows, {e.law}, {collection.told(e)}")

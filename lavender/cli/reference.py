@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lavender.base.errors import InputError
-from lavender.cli.options import Reading, console, going_on, one_thread, plain
+from lavender.cli.options import Reading, going_on, one_thread, say
 
 
 @click.command()
@@ -32,11 +32,10 @@ def reference(files: tuple[str, ...], proven: bool) -> None:
     one_thread()
     if proven:
         require()
-    out = console()
 
-    def tell(text: str, style: str | None = None) -> None:
+    def tell(text: str, style: str = "") -> None:
         with going_on():
-            out.print(plain(text), style=style, highlight=False, soft_wrap=True)
+            say(text, style=style)
 
     unmet, reading = False, Reading(partial(tell, style="yellow"))
     for item in bench.resolve(files):

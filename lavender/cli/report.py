@@ -27,6 +27,7 @@ from lavender.cli.options import (
     refuse_idle,
     refuse_unused,
     refuse_unused_recording,
+    say,
     was_given,
 )
 from lavender.io.stored import writable, write_text
@@ -130,24 +131,20 @@ def report(context: click.Context, /, files: tuple[str, ...], out: Path, **asked
         paper = write_paper(found, out / "paper")
     print_report(found, console(), whole=asked["tables"])
     if paper is not None:
-        _say(f"figures, tables and method of a paper: {paper}")
-    _say(f"\n{count(len(done.records), 'run')}; page: {index}")
+        say(f"figures, tables and method of a paper: {paper}")
+    say(f"\n{count(len(done.records), 'run')}; page: {index}")
     if done.note:
-        _say(done.note)
+        say(done.note)
     if done.stopped:
-        console().print("[yellow]Stopped; the same command continues from here.[/]")
+        say("Stopped; the same command continues from here.", style="yellow")
         raise click.exceptions.Exit(EXIT_INTERRUPTED)
     if not (again or done.records.records):
         why = "; ".join(dict.fromkeys(skip.reason for skip in done.records.skips))
-        _say(f"nothing was measured: {why}", style="yellow")
+        say(f"nothing was measured: {why}", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
     if done.lost and not again:
-        _say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")
+        say(f"{count(done.lost, 'case')} of a folder left out of every number", style="yellow")
         raise click.exceptions.Exit(EXIT_UNMET)
-
-
-def _say(text: str, **more: Any) -> None:
-    console().print(text, highlight=False, markup=False, soft_wrap=True, **more)
 
 
 def _refuse_unused(context: click.Context, files: tuple[str, ...], solvers: tuple[str, ...] | None) -> None:
@@ -197,8 +194,7 @@ def _recorded(word: str, out: Path, taken: set[Path], fresh: bool, how: Mapping[
     asked = json.dumps({"model": model, "changed": _ages(path, how["control"]), **how})
     if fresh or not kept.is_file() or kept.read_text(encoding="utf-8") != asked:
         kept.unlink(missing_ok=True)  # a recording that is stopped on the way is none
-        told = str(record_file(path, folder, **how, replace=True))
-        console().print(told, highlight=False, markup=False)
+        say(str(record_file(path, folder, **how, replace=True)))
         write_text(kept, asked)
     return str(folder)
 
